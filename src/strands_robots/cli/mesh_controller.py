@@ -12,11 +12,14 @@ from strands_robots.safety.answers import Answer
 from strands_robots.safety.controller import OnProgress, Press, Progress, StopReport
 from strands_robots.safety.orders import new_epoch
 from strands_robots.safety.peer_answers import enrolled_peers, stop_distrust
+from strands_robots.safety.roster_inbox import OnReport
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
+from strands_robots.safety.silence import Sending
 from strands_robots.safety.statements import ALARM
 from strands_robots.safety.stop_roster import robots_known_at
 from strands_robots.safety.stopping import explain
-from strands_robots.tools.networks import stop_outcome
+from strands_robots.tools.mesh_roster import MeshReports, mesh_network
+from strands_robots.tools.roster_verdict import stop_outcome
 
 if TYPE_CHECKING:
     from strands_robots.mesh import Mesh
@@ -35,7 +38,11 @@ class MeshController:
         self._key = signing_key
         self._press = ("", Press(0.0, 0.0))
         self._keys = enrolled_peers()
-        self.controller_id = mesh.peer_id
+        self._named: frozenset[str] = frozenset()
+        self.controller_id, self.network = mesh.peer_id, mesh_network()
+        self.sending = Sending(signed=signing_key is not None)
+        self._reports = MeshReports(mesh)
+        self._reports.listen()
 
     @property
     def link_up(self) -> bool:
@@ -56,15 +63,16 @@ class MeshController:
         reason: str = "",
         *,
         estop_id: str = "",
+        more: bool = False,
         on_progress: OnProgress = lambda progress: None,
+        on_report: OnReport = lambda report: None,
         scope: Scope = EVERY_ROBOT,
     ) -> StopReport:
         """Stop every peer of the mesh, or those of ``scope``, and wait at most 3 s.
 
         Where no robot in the scope is there, every robot is stopped.
         """
-        from strands_robots.mesh.session import network  # noqa: PLC0415 - loaded when it is used
-
+        self._named = frozenset(expected) | scope.only
         epoch = estop_id or new_epoch()
         if self._press[0] != epoch:
             self.press(epoch)
@@ -72,7 +80,6 @@ class MeshController:
         answers: dict[str, Answer] = {}
         alarms: dict[str, str] = {}
         widened: list[bool] = []
-        expected = frozenset(expected) | scope.only
 
         def note(replies: list[dict[str, Any]]) -> None:
             for reply in replies:
@@ -81,7 +88,7 @@ class MeshController:
                     alarms[name] = why
                 elif name not in answers or answers[name].stopped is not True or answers[name].claimed:
                     answers[name] = _answer(name, reply, (time.monotonic() - pressed.at) * 1000, claimed=bool(why))
-            silent = tuple(sorted(set(expected) - answers.keys()))
+            silent = tuple(sorted(self._named - answers.keys()))
             elapsed = (time.monotonic() - pressed.at) * 1000
             on_progress(
                 Progress(
@@ -96,26 +103,27 @@ class MeshController:
                 )
             )
 
-        note([])
         up = self.link_up
+        self._reports.inbox.open(epoch, on_report)
         note(
             self._mesh.emergency_stop(
                 self._key,
                 estop_id=epoch,
                 on_answers=note,
                 scope=scope,
-                remembers=robots_known_at(network),
+                remembers=robots_known_at(mesh_network),
                 on_widened=lambda: widened.append(True),
             )
         )
-        robots = {*expected, *lockable_peers(self._mesh)}
+        self._reports.inbox.close(epoch)
+        robots = {*self._named, *lockable_peers(self._mesh)}
         told = {name: each for name, each in answers.items() if name in robots}
         return StopReport(
             epoch,
             {name: each for name, each in told.items() if each.stopped is True and not each.claimed},
             {name: each for name, each in told.items() if each.stopped is not True},
             {},
-            tuple(sorted(set(expected) - told.keys() - alarms.keys())),
+            tuple(sorted(self._named - told.keys() - alarms.keys())),
             up,
             (time.monotonic() - pressed.at) * 1000,
             claimed={name: each for name, each in told.items() if each.stopped is True and each.claimed},
@@ -123,6 +131,11 @@ class MeshController:
             scope=scope,
             widened=bool(widened),
         )
+
+    def expect(self, estop_id: str, names: Collection[str], *, more: bool = False) -> bool:
+        """Name further robots that must answer; the mesh asks those in reach by itself."""
+        self._named |= frozenset(names)
+        return True
 
     def review(self, report: StopReport) -> StopReport:
         """Return the report as it is: a peer answers a stop once."""

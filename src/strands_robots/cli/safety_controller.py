@@ -26,11 +26,14 @@ from strands_robots.cli.mesh_controller import MeshController
 from strands_robots.cli.network import Network, mesh_peer
 from strands_robots.cli.output import CliError, Exit, Screen, captured_log, label, table
 from strands_robots.cli.resume import ask_robots, lockable_robots
-from strands_robots.cli.stop_report import LATE_MS, SLOW_MS, style_of, summary
+from strands_robots.cli.stop_report import LATE_MS, SLOW_MS, outcome_lines, style_of, summary
 from strands_robots.safety.answers import Answer
 from strands_robots.safety.controller import Progress, SafetyController, StopReport
 from strands_robots.safety.lockout import utc
 from strands_robots.safety.orders import new_epoch
+from strands_robots.safety.roster_search import RosterSearch
+from strands_robots.safety.stop_roster import StopOutcome, StopRoster
+from strands_robots.tools.mesh_roster import stand_on_mesh
 from strands_robots.utils import device_id, number
 
 if TYPE_CHECKING:
@@ -88,20 +91,26 @@ def safety_controller(
         signer = None if key is None else signing_key(key, passphrase_file)
         with mesh_peer(None, source, "controller") as mesh:
             controls = MeshController(mesh, signer)
-            if every is not None:
-                controls.check_in_every(every)
-            _run(screen, controls, FleetScreen(controls, controls.reports, every), reason)
+            fleet = FleetScreen(controls, controls.reports, every)
+            with contextlib.closing(stand_on_mesh(mesh, signer, fleet.known)):
+                if every is not None:
+                    controls.check_in_every(every)
+                _run(screen, controls, fleet, reason)
         screen.say(f"{source} is off. The robots it stopped stay locked.")
         return
     link = network.link()
     signer = None if key is None else signing_key(key, passphrase_file)
     from strands_robots.device_connect import safety_controller as network_side  # noqa: PLC0415 - loaded when it is used
 
-    controller = network_side.safety_controller(source, link, signing_key=signer, require_signed=signer is not None)
+    controller = network_side.safety_controller(
+        source, link, signing_key=signer, require_signed=signer is not None, stands=True
+    )
     with contextlib.closing(controller):
-        if every is not None:
-            controller.check_in_every(every)
-        _run(screen, controller, FleetScreen(controller, link, every), reason)
+        fleet = FleetScreen(controller, link, every)
+        with contextlib.closing(network_side.stand(controller, link, fleet.known)):
+            if every is not None:
+                controller.check_in_every(every)
+            _run(screen, controller, fleet, reason)
     screen.say(f"{source} is off. The robots it stopped stay locked.")
 
 
@@ -173,6 +182,9 @@ class StopButton:
     ) -> None:
         self.progress: Progress | None = None
         self.report: StopReport | None = None
+        self.outcome: StopOutcome | None = None
+        """The report measured by the roster; None before the first, or where the network has no roster."""
+        self._roster: StopRoster | None = None
         self._controller, self._expected, self._reason = controller, expected, reason
         self._guard = threading.Lock()
         self._id, self._running, self._last = "", False, float("-inf")
@@ -203,9 +215,12 @@ class StopButton:
             if report is None or self._running:
                 return
         later = self._controller.review(report)
+        if later is report:
+            return
+        outcome = self._measured(self._roster, later)
         with self._guard:
-            if later is not report and report is self.report and not self._running:
-                self.report = later
+            if report is self.report and not self._running:
+                self.report, self.outcome = later, outcome
                 if progress is not None:
                     self.progress = replace(progress, answered=later.answered)
 
@@ -214,21 +229,41 @@ class StopButton:
         self._closing.set()
 
     def _stop(self, estop_id: str) -> None:
+        network = self._controller.network
+        search = None if network is None else RosterSearch(self._controller, estop_id, network)
+
         def note(progress: Progress) -> None:
             if estop_id == self._id:
                 self.progress = progress
+            if search is not None:
+                search.begin(progress)
 
+        recorded = False
         while True:
-            report = self._controller.stop(self._expected(), self._reason, estop_id=estop_id, on_progress=note)
-            unfinished = not report.link or bool(report.unanswered)
+            expected = self._expected()
+            options: dict[str, Any] = {} if search is None else {"more": not search.begun, "on_report": search.take}
+            report = self._controller.stop(expected, self._reason, estop_id=estop_id, on_progress=note, **options)
+            roster = None if search is None else search.roster
+            outcome = self._measured(roster, report)
+            if outcome is not None and not recorded:
+                recorded = True
+                outcome.record(self._controller.controller_id)
+            # The roster's rows that no screen shows have had their time: a robot that is back asks by itself.
+            unfinished = not report.link or not {*expected}.isdisjoint(report.unanswered)
             with self._guard:
                 if estop_id != self._id:
                     return
+                self.outcome, self._roster = outcome, roster
                 self.report, self._running = report, unfinished and not self._closing.is_set()
                 if not self._running:
                     # A robot that was resumed meanwhile acts only on a stop with a new id.
                     self._id = "" if report.refused else self._id
                     return
+
+    def _measured(self, roster: StopRoster | None, report: StopReport) -> StopOutcome | None:
+        if roster is None:
+            return None
+        return roster.outcome(report, replace(self._controller.sending, left=report.link))
 
 
 class FleetScreen:
@@ -256,6 +291,10 @@ class FleetScreen:
         """Return the robots that must answer a stop: seen and not forgotten."""
         # A stop asks for them: what each reports of itself is read anew.
         self._all_since = time.monotonic()
+        return tuple(self._robots)
+
+    def known(self) -> Collection[str]:
+        """Return the robots that were seen and not forgotten."""
         return tuple(self._robots)
 
     def forget(self) -> None:
@@ -415,7 +454,12 @@ def _outcome(button: StopButton) -> Text:
         return label(f"STOPPING{age}: {len(button.progress.answered)} answered{waiting}{link}", "bold red")
     if button.report is None:
         return label("")
-    report = button.report
-    silent_names = f" No answer: {', '.join(report.silent)}." if report.silent else ""
+    outcome = button.outcome
+    report = button.report if outcome is None else outcome.report
+    reasons = {} if outcome is None else outcome.reasons
+    missing = [f"{name}{f' ({reasons[name]})' if name in reasons else ''}" for name in report.silent]
+    silent_names = f" No answer: {', '.join(missing)}." if missing else ""
     alarms = " ".join(f" ALARM: {name}: {why}." for name, why in report.alarms.items())
-    return label(f"{summary(report)}{silent_names}{alarms}", "bold red" if alarms else style_of(report))
+    told = "" if outcome is None else f"\n{' '.join([outcome.sentence, *outcome_lines(outcome)])}"
+    doubtful = alarms or (outcome is not None and outcome.problems)
+    return label(f"{summary(report)}{silent_names}{alarms}{told}", "bold red" if doubtful else style_of(report))

@@ -31,7 +31,8 @@ from strands_robots.safety.controller import DEADLINE_S, Progress
 from strands_robots.safety.stop_roster import StopOutcome
 from strands_robots.serving.robot_verbs import WORLD_VERBS
 from strands_robots.serving.stop_arguments import stop_reason, stop_robot, stop_scope
-from strands_robots.tools.networks import NativeMesh, stop_outcome
+from strands_robots.tools.networks import NativeMesh
+from strands_robots.tools.roster_verdict import stop_outcome
 from strands_robots.utils import ValidationError, device_id, number
 
 LOCKED = "They are locked until they are resumed:"

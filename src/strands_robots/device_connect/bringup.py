@@ -155,6 +155,8 @@ async def init_device_connect(  # noqa: PLR0917 - the documented signature
         if registered is not None:
             # In its presence from the first one on: a robot that states a cell, or none, reads the scope of a stop.
             runtime.status["cell"] = registered.cell
+            if registered.signed_only:
+                runtime.status["signed_stops"] = True
 
     try:
         # Before the link: a worker and the loop that take the interpreter from one another would both take longer.

@@ -130,6 +130,9 @@ class SafetyRegistration:
         name = local_name(tenant, device_id)
         self._name = name
         self.driver: Any = None
+        self._network = None if link is None else network_of(link)
+        self.was_here_s = None if self._network is None else sightings().was_here(self._network, device_id)
+        """Seconds since this robot was last served from this machine; None where over ten minutes, or never."""
         self.entry: Registered = plane().register(name, robot, key=key, wire_id=device_id, cell=cell)
         self._held: Registered | None = self.entry
         self._network = None if link is None else network_of(link)
@@ -164,8 +167,18 @@ class SafetyRegistration:
         Until then the runtime's handler and every RPC ``stop`` stop the robot.
         """
         # No answer that this link sends waits for the key.
-        self.identity  # noqa: B018
+        identity = self.identity
         self._listener.open()
+        if self._network is not None:
+            public = None if identity is None else identity.public
+            sightings().serve(
+                self._network, self.device_id, cell=self.cell, signed_only=self.signed_only, public=public
+            )
+
+    @property
+    def signed_only(self) -> bool:
+        """True where only signed stops count."""
+        return estop_listener().signed
 
     @property
     def up(self) -> bool:
@@ -220,6 +233,8 @@ class SafetyRegistration:
     def leave(self) -> None:
         """Leave listener and plane; block while a link closes. Safe to call twice."""
         self._listener.close()
+        if self._network is not None:
+            sightings().leave(self._network, self.device_id)
         if getattr(self.driver, "registration", None) is self:
             # Whatever serves the driver next registers it anew.
             self.driver.registration = None

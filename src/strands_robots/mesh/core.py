@@ -127,7 +127,7 @@ class Mesh(SensorLoopsMixin):
         self._context = context = Context(
             peer, parts.registry, parts.recorder(peer), Identity(), parts.clock, parts.monotonic
         )
-        context.pacer = parts.pacer
+        context.pacer, context.has_robot = parts.pacer, robot is not None
         context.console, context.consoles = ConsoleSigner(parts.clock), ConsoleTrust(parts.clock)
         self._hardware = hardware
         self._handles: list[Declaration] = []
@@ -221,6 +221,7 @@ class Mesh(SensorLoopsMixin):
                 return
             try:
                 self._adapter.open()
+                self._adapter.serve(session.network())
                 self._begin(transport)
             except BaseException:
                 # A peer that cannot join gives back the session and its subscribers.
@@ -242,6 +243,7 @@ class Mesh(SensorLoopsMixin):
     def _leave(self) -> None:
         self._end(LOOP_JOIN_TIMEOUT_S)
         self._parts.release()
+        self._adapter.leave()
         if not self._adapter.epochs():
             self._adapter.close()
         self._compose()

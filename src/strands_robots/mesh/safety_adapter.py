@@ -11,11 +11,13 @@ from strands_robots.envelope import is_error
 from strands_robots.safety.checkin import CheckInRules
 from strands_robots.safety.gate import MotionGate
 from strands_robots.safety.identity import robot_identity
+from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.orders import StopOrder, StopRules
 from strands_robots.safety.peer_answers import LockoutAnnouncer, with_lockout_statement, with_resume_statement
 from strands_robots.safety.plane import Registered, SafetyPlane, Stoppable, plane
 from strands_robots.safety.resume import REJECTED
 from strands_robots.safety.scope import EVERY_ROBOT, SCOPE, Scope
+from strands_robots.safety.sightings import sightings
 from strands_robots.safety.statements import Purpose
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import StopVerdict
@@ -65,6 +67,9 @@ class SafetyAdapter:
         self._announcer = LockoutAnnouncer(self.identity)
         self._key, self._cell = key, cell
         self._entry: Registered | None = None
+        self._network: NetworkKey | None = None
+        self.was_here_s: float | None = None
+        """Seconds since this robot was last served from this machine; None where over ten minutes, or never."""
         self._decision = StopRules()
         self._check_ins = CheckInRules(self._decision if self._decision.required else StopRules(keys=()))
         if robot is not None:
@@ -94,7 +99,24 @@ class SafetyAdapter:
     def announced(self, peer_id: str = "") -> dict[str, Any]:
         """Return :meth:`facts`, signed, and the cell; of a robot of its world by its id."""
         facts = self.facts()
-        return {**self._announcer.of(peer_id or self._peer_id, facts), "cell": self._cell} if facts else {}
+        if not facts:
+            return {}
+        wants = {"signed_stops": True} if self._decision.required else {}
+        return {**self._announcer.of(peer_id or self._peer_id, facts), "cell": self._cell, **wants}
+
+    def serve(self, network: NetworkKey) -> None:
+        """Have this machine remember that the robot is served, until :meth:`leave`."""
+        if not isinstance(self._robot, NoRobot):
+            self._network, public = network, None if self.identity is None else self.identity.public
+            self.was_here_s = sightings().was_here(network, self._peer_id)
+            wants = self._decision.required
+            sightings().serve(network, self._peer_id, cell=self._cell, signed_only=wants, public=public)
+
+    def leave(self) -> None:
+        """Have this machine remember that the robot left in good order."""
+        network, self._network = self._network, None
+        if network is not None:
+            sightings().leave(network, self._peer_id)
 
     def lockouts(self) -> list[dict[str, Any]]:
         """Return each lockout with its source, reason and time."""

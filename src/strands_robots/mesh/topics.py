@@ -46,6 +46,7 @@ TABLE: tuple[Topic, ...] = (
     Topic("resume", "strands/safety/resume", 0, None, 4 * KIB, True, True, 1, True, True),
     Topic("checkin", "strands/*/checkin", 0, None, 4 * KIB, True, True, 1, False, True),
     Topic("checkin_answer", "strands/*/checkin/answer", 0, None, 4 * KIB, True, False, 1, False, True),
+    Topic("missed_roster", "strands/*/missed/roster", 0, None, 16 * KIB, True, False, 1, False, True),
     Topic("broadcast", "strands/broadcast", 0, None, 16 * KIB, True, True, 1, False, True),
     Topic("cmd", "strands/*/cmd", 0, None, 16 * KIB, True, True, 1, False, True),
     Topic("response", "strands/*/response/**", 0, None, 1024 * KIB, True, True, 1, False, True),
@@ -93,6 +94,10 @@ def check_in(controller: str) -> str:
 
 def check_in_answer(robot: str) -> str:
     return f"{ROOT}/{robot}/checkin/answer"
+
+
+def missed_roster(controller: str) -> str:
+    return f"{ROOT}/{controller}/missed/roster"
 
 
 def response(requester: str, responder: str, turn: str) -> str:

@@ -24,6 +24,7 @@ from strands_robots.safety.originals import Original, Originals
 from strands_robots.safety.persistence import LockoutStore, ResumedEpochs, StoredLockout
 from strands_robots.safety.reporting import UNPACED, OnReport, Reporter, StopRun
 from strands_robots.safety.resume import REJECTED, Admitted, ResumeVerifier
+from strands_robots.safety.sightings import sightings
 from strands_robots.safety.state_files import uptime
 from strands_robots.safety.stop_count import StopCount
 from strands_robots.safety.stop_executor import StopExecutor, stop_executor
@@ -652,6 +653,7 @@ class SafetyPlane:
 
     def _chore(self) -> None:
         self._keep_again()
+        sightings().refresh()
         if any(entry.locked for entry in self._robots.values()):
             self._clearance.look()
 

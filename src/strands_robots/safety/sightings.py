@@ -48,6 +48,9 @@ T = TypeVar("T")
 AGAIN_S = 10.0
 """Seconds in which a robot that was heard is not written again."""
 
+FACTS_S = 1.0
+"""The same for a robot whose facts have changed."""
+
 REFRESH_S = 30.0
 """Seconds after which the rows of served robots are written again."""
 
@@ -62,6 +65,9 @@ READ_S = 1.0
 
 ENDING_S = 0.5
 """Seconds that the end of the process waits for the last write."""
+
+Facts = tuple[str | None, bool | None, bool | None]
+NEVER: tuple[float, Facts] = (float("-inf"), (None, None, None))
 
 NAME_MAX = 256
 ANSWERS_MAX = 1024
@@ -93,7 +99,7 @@ class Sightings:
         """Empty, or the reason why the last write did not succeed."""
         self._clock = clock
         self._lock = threading.Condition()
-        self._noted: dict[tuple[NetworkKey, str], float] = {}
+        self._noted: dict[tuple[NetworkKey, str], tuple[float, Facts]] = {}
         self._tidied = float("-inf")
         self._notes: dict[tuple[NetworkKey, str], Note] = {}
         self._answers: list[_Answer] = []
@@ -124,7 +130,11 @@ class Sightings:
         key, now = (network, name), time.monotonic()
         if not _storable(name):
             return
-        if not departing and now - self._noted.get(key, float("-inf")) < AGAIN_S:
+        facts = (cell, signed_only, stoppable)
+        since, stated = self._noted.get(key, NEVER)
+        # Facts that are new are written earlier, so that a presence right after a heartbeat counts.
+        known = facts in (stated, (None, None, None))
+        if now - since < (AGAIN_S if known and not departing else FACTS_S):
             return
         heard = Note(
             network,
@@ -137,10 +147,10 @@ class Sightings:
             departing,
         )
         with self._lock:
-            if not self._admitted(key, now):
+            if not self._admitted(key, now, stated if facts == (None, None, None) else facts):
                 return
-            known = self._notes.get(key)
-            self._notes[key] = heard if known is None else known.merged(heard)
+            waiting = self._notes.get(key)
+            self._notes[key] = heard if waiting is None else waiting.merged(heard)
             self._start()
 
     def note_answer(
@@ -264,16 +274,16 @@ class Sightings:
     def _waiting(self) -> bool:
         return bool(self._notes or self._answers or self._changed)
 
-    def _admitted(self, key: tuple[NetworkKey, str], now: float) -> bool:
+    def _admitted(self, key: tuple[NetworkKey, str], now: float, facts: Facts) -> bool:
         """Return True where a name has a place in memory; longest heard first."""
         if key not in self._noted and len(self._noted) >= ROWS_MAX:
             if now - self._tidied < AGAIN_S:
                 return False
             self._tidied = now
-            self._noted = {each: at for each, at in self._noted.items() if now - at < RECENT_S}
+            self._noted = {each: noted for each, noted in self._noted.items() if now - noted[0] < RECENT_S}
             if len(self._noted) >= ROWS_MAX:
                 return False
-        self._noted[key] = now
+        self._noted[key] = now, facts
         return True
 
     def _start(self) -> bool:

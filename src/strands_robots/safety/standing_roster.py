@@ -46,6 +46,11 @@ VERDICTS_MAX_BYTES = 4 * 2**20
 
 EACH_MAX = 4
 
+Unanswered = Callable[[str, Mapping[str, RosterRow]], Collection[str]]
+"""Returns those of the rows that are not known to have received the stop of this id."""
+
+ReadStop = Callable[[str, bytes], tuple[str, Mapping[str, Any]]]
+
 Publish = Callable[[Mapping[str, Any]], object]
 """Sends the fields of a report under the controller's name."""
 
@@ -73,6 +78,8 @@ class StandingRoster:
         keys: reads the enrolled public keys by robot.
         identity: signs the reports; None where there is no key.
         also: names that the controller shows besides.
+        read: returns the source and the fields of a stop, from what the topic names and the message.
+        unanswered: where the answers of robots are not for all to hear; by default they are.
     """
 
     def __init__(
@@ -84,9 +91,12 @@ class StandingRoster:
         keys: Callable[[], Mapping[str, bytes]],
         identity: Callable[[], SigningIdentity | None],
         also: Callable[[], Collection[str]] = tuple,
+        read: ReadStop = lambda source, payload: (source, params_of(payload)),
+        unanswered: Unanswered | None = None,
     ) -> None:
         self._source, self._publish = source, publish
         self._roster, self._keys, self._identity, self._also = roster, keys, identity, also
+        self._read, self._unanswered = read, unanswered
         self._pending: dict[str, bytes] = {}
         self._answers: dict[str, tuple[bytes, ...]] = {}
         self._bytes = 0
@@ -140,8 +150,10 @@ class StandingRoster:
     def _take_stops(self) -> None:
         pending, self._pending = self._pending, {}
         now = time.monotonic()
-        for source, payload in list(pending.items()):
-            params = params_of(payload)
+        for sender, payload in list(pending.items()):
+            source, params = self._read(sender, payload)
+            if source == self._source:
+                continue
             estop_id = stated_epoch(source, params)
             last = self._followed.get(source)
             # A stop of some robots may be widened to one of all, under its id.
@@ -187,6 +199,8 @@ class StandingRoster:
         rows |= {name: RosterRow(name, Known.HEARD) for name in self._also() if name not in rows and name not in marked}
         scope = followed.scope
         rows = {name: row for name, row in rows.items() if scope.covers(name, {row.cell} - {""})}
+        if self._unanswered is not None:
+            return [rows[name] for name in self._unanswered(followed.estop_id, rows)]
         graded = Answers(keys, required=False, pressed_at=0.0)
         for name in rows:
             for payload in self._answers.get(name, ()):

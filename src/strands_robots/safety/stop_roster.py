@@ -93,7 +93,7 @@ class StopOutcome:
         """Return what a script reads besides the report's own fields."""
         return {
             "roster": {"size": self.size, "still": len(self.report.stopped), "enrolled": self.roster.enrolled},
-            "reasons": dict(self.reasons),
+            "reasons": dict(list(self.reasons.items())[:NAMED_MAX]),
             "retired": [row.name for row in self.roster.exempt if row.exemption and row.exemption.state == "retired"],
             "off": [row.name for row in self.roster.exempt if row.exemption and row.exemption.state == "off"],
             "elsewhere": self.roster.elsewhere,
@@ -140,7 +140,7 @@ class StopRoster:
     def __init__(self, network: NetworkKey, named: Collection[str] = (), scope: Scope = EVERY_ROBOT) -> None:
         self._network, self._pressed = network, uptime()
         self._lock, self._is_read = threading.Lock(), threading.Event()
-        self._named, self._scope = frozenset(named) | scope.only, scope
+        self._named, self._asked, self.scope = frozenset(named) | scope.only, scope, scope
         self._roster = Roster(network, problems=("the roster was not read in time",))
         self._found: dict[str, bool] = {}
         self._cells: dict[str, str | None] = {}
@@ -170,7 +170,7 @@ class StopRoster:
     def widen(self) -> None:
         """Have every robot answer: the stop has become one of all."""
         with self._lock:
-            self._scope = EVERY_ROBOT
+            self.scope = EVERY_ROBOT
 
     def take(self, report: RosterReport) -> bool:
         """Take a controller's report in place of its last; False where nothing changed."""
@@ -211,12 +211,14 @@ class StopRoster:
         sending = sending or Sending(report.link)
         if report.widened:
             self.widen()
+        report = replace(report, scope=self._asked, widened=self.scope != self._asked)
         # The stop is over; a disk that hangs is given this long.
         self._is_read.wait(READ_WITHIN_S)
         with self._lock:
             roster, found = self._whole(report.answered.items()), dict(self._found)
             unproven = _missed_by(self._unproven, roster)
             problems = [*roster.problems, *([problem] if problem else [])]
+            problems += [f"no robot was there for {self._asked}: every robot was stopped"] if report.widened else []
             problems += [
                 f"{each.source} misses {each.more} more robots than it names"
                 for each in self._trusted.values()
@@ -265,7 +267,7 @@ class StopRoster:
 
     def _covers(self, row: RosterRow) -> bool:
         cell = self._cells.get(row.name, row.cell)
-        return self._scope.everything or cell is None or self._scope.covers(row.name, {cell} - {""})
+        return self.scope.everything or cell is None or self.scope.covers(row.name, {cell} - {""})
 
     def _elsewhere(self, silent: Collection[str]) -> dict[str, tuple[NetworkKey, float]]:
         """Return where else robots of these names were heard last, and seconds since."""

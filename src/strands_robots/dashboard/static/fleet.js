@@ -77,7 +77,7 @@ export function verdictTone(stop) {
   if (stop.alarm) return "bad";
   // It says nothing about the present any more, so it is not green.
   if (stop.freed && ["stopped", "claimed"].includes(stop.state)) return "quiet";
-  return { stopped: "good", claimed: "warn", waiting: "warn" }[stop.state] || "bad";
+  return { stopped: "good", claimed: "warn", waiting: "warn", heard_only: "quiet" }[stop.state] || "bad";
 }
 
 export function lockText(row) {

@@ -36,6 +36,7 @@ export const S = {
     claimed: "claimed, not proven",
     waiting: "not answered yet",
     stopped: "stopped",
+    heard_only: "only heard",
   },
   verdict: {
     not_stopped: "DID NOT STOP",
@@ -46,6 +47,7 @@ export const S = {
     claimed: "claimed to have stopped",
     waiting: "has not answered yet",
     stopped: "stopped",
+    heard_only: "no answer. It was only heard and is not enrolled, so it does not count",
   },
   unproven: "; it did not sign",
   freed: "; not locked by it any more",
