@@ -18,6 +18,7 @@ from collections.abc import Callable, Collection, Hashable, Mapping
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from strands_robots.audit import audit_head, own_log_id, queue_safety_event
+from strands_robots.safety.awake import AWAKE
 from strands_robots.safety.checkin import CheckInRules
 from strands_robots.safety.head_witness import CheckInAnswers, HeadWitness
 from strands_robots.safety.identity import SigningIdentity
@@ -395,6 +396,7 @@ class EstopListener:
         self._queue: FairQueue | None = None
         self._thread: threading.Thread | None = None
         self._end_short_turns: Callable[[], None] = lambda: None
+        self._end_watch: Callable[[], None] = lambda: None
 
     @property
     def registrations(self) -> tuple[ListenerRegistration, ...]:
@@ -457,6 +459,7 @@ class EstopListener:
         if missed is not None:
             missed.close()
         if events is not None:
+            self._end_watch()
             self._end_short_turns()
             events.close()
         if thread is not None and thread is not threading.current_thread():
@@ -559,6 +562,7 @@ class EstopListener:
         self._check_ins = CheckInRules(self._rules)
         audit_head(), own_log_id()  # read from the disk now, so that no stop waits for it
         self._end_short_turns = shorten_turns()
+        self._end_watch = AWAKE.watch(self.awake)
         self._queue = FairQueue()
         self._thread = threading.Thread(target=self._run, args=(self._queue,), name="estop-listener", daemon=True)
         self._thread.start()

@@ -535,6 +535,9 @@ class SafetyPlane:
 
     def hold(self, seconds: float) -> None:
         """Hold the motions of every robot for so long; return at once."""
+        for entry in self._robots.values():
+            for gate in entry.gates:
+                gate.hold(seconds)
 
     def _clear_one(self, who: str, robot_id: str) -> str:
         entry = self._robots.get(robot_id)

@@ -166,7 +166,7 @@ class RobotsPort:
 
 
 class ControllerPort:
-    """A safety controller, which answers with the stops that it sent and asks nothing.
+    """A safety controller, which answers with the stops that it sent.
 
     A stop is told until each robot that must answer it has; one without such robots for as long as there is the
     controller.
