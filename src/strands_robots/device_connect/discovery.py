@@ -110,6 +110,12 @@ class Peer:
         names = {str(each.get("name", "")) for each in self.functions}
         return next((verb for verb in ("stop", "stopMotion") if verb in names), None)
 
+    @property
+    def cell(self) -> str | None:
+        """Its cell, "" for none; None where it states neither, and reads no scope."""
+        cell = self.status.get("cell")
+        return cell if isinstance(cell, str) else None
+
     @classmethod
     def of(cls, description: Mapping[str, Any]) -> Peer:
         """Read a presence message or a registration; a field that it lacks is empty."""
