@@ -132,10 +132,15 @@ def test_yesterdays_code_reads_the_file_of_today(enrolled: EnrolledKeys) -> None
     assert {name: each["key"] for name, each in data["robots"].items()} == {"arm-1": encode(ARM)}
 
 
-def test_a_robot_on_both_networks_is_enrolled_on_both(store: Sightings, enrolled: EnrolledKeys) -> None:
-    enrolled.enroll({"arm-1": ARM}, network=HERE)
-    enrolled.enroll({"arm-1": ARM}, network=ON_MESH)
-    enrolled.enroll({"arm-1": ARM}, network=THERE)
+def test_a_robot_is_expected_on_every_network_on_which_it_was_enrolled(
+    store: Sightings, enrolled: EnrolledKeys
+) -> None:
+    for network in (HERE, ON_MESH, THERE):
+        enrolled.enroll({"arm-1": ARM}, network=network)
+    for network in (HERE, ON_MESH, THERE):
+        assert names(Roster.of(network, store=store).must_answer) == ["arm-1"]
+    # It has moved: --replace says so.
+    enrolled.enroll({"arm-1": ARM}, network=THERE, replace=True)
     assert Roster.of(HERE, store=store).rows == ()
     assert names(Roster.of(THERE, store=store).rows) == names(Roster.of(ON_MESH, store=store).rows) == ["arm-1"]
 

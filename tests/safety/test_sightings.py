@@ -16,6 +16,8 @@ import pytest
 from fixtures.waiting import eventually, signalled
 
 from strands_robots.audit import read_audit_log
+from strands_robots.device_connect.backends import LinkConfig, loopback_config
+from strands_robots.device_connect.enrollment import network_of
 from strands_robots.safety import sighting_file
 from strands_robots.safety.identity import ROBOTS, EnrolledKeys, Exemption, KeyFile, SigningIdentity
 from strands_robots.safety.network_key import DEVICE_CONNECT, MESH, NetworkKey
@@ -491,6 +493,20 @@ def test_a_network_key_has_no_credentials() -> None:
     assert NetworkKey.parse(key.text) == key
     assert key.meets(NetworkKey.of(DEVICE_CONNECT, ["nats://broker:4222"], "fleet"))
     assert not key.meets(NetworkKey.of(DEVICE_CONNECT, ["nats://broker:4222"]))
+
+
+@pytest.mark.parametrize(
+    ("link", "where"),
+    [
+        (loopback_config(12345), ("127.0.0.1:12345",)),
+        (LinkConfig(transport="nats"), ("127.0.0.1:4222",)),
+        (LinkConfig(), ("multicast",)),
+        (LinkConfig(mode="peer", listen=("tcp/0.0.0.0:7000",), multicast=True), ("127.0.0.1:7000", "multicast")),
+        (LinkConfig(mode="peer", connect=("tcp/router:7447",), listen=("tcp/0.0.0.0:0",)), ("router:7447",)),
+    ],
+)
+def test_a_link_names_its_network(link: LinkConfig, where: tuple[str, ...]) -> None:
+    assert network_of(link) == NetworkKey(DEVICE_CONNECT, where)
 
 
 @pytest.mark.parametrize("text", ["", "mesh", "mesh default", "sea default a:1", "mesh default " + "a" * 5000])
