@@ -134,7 +134,7 @@ class ArmMixin:
         """
         import numpy as np  # noqa: PLC0415 - loaded with the first motion
 
-        arm, body = self.arm(robot_name), self.body(robot_name)
+        arm, body = self.arm(robot_name).whole(), self.body(robot_name)
         age_s, observed = _observed(body)
         state = arm.state(observed)
         pose = arm.chain.forward(state.joints)
@@ -165,7 +165,7 @@ class ArmMixin:
         """Move joints to positions in degrees, by name; the others stay."""
         from strands_robots.kinematics import moves  # noqa: PLC0415 - loaded with the first motion
 
-        return self._move("moveJoints", partial(moves.move_joints, degrees=joints), speed, wait, robot_name)
+        return self._move("moveJoints", partial(moves.move_joints, degrees=joints), speed, wait, robot_name, whole=True)
 
     @planned
     def move_to(
@@ -310,12 +310,13 @@ class ArmMixin:
         from strands_robots.kinematics import moves  # noqa: PLC0415 - loaded with the first motion
 
         name = identifier("place", place)
-        arm = self.arm(robot_name)
+        arm = self.arm(robot_name).whole()
         places: dict[str, dict[str, float]] = {HOME: _degrees(arm, arm.chain.rest)}
         places |= self._saved_places(self.body(robot_name).name)
         if name not in places:
             raise ValidationError(f"place must be one of {', '.join(places)}, not {shown(name)}.")
-        return self._move("goTo", partial(moves.go_to, place=name, degrees=places[name]), speed, wait, robot_name)
+        plan = partial(moves.go_to, place=name, degrees=places[name])
+        return self._move("goTo", plan, speed, wait, robot_name, whole=True)
 
     @planned
     def save_place(self, place: str, robot_name: str = "") -> Envelope:
@@ -325,7 +326,7 @@ class ArmMixin:
         """
         from strands_robots.kinematics.places import save_places  # noqa: PLC0415 - with the first place
 
-        name, body, arm = identifier("place", place), self.body(robot_name), self.arm(robot_name)
+        name, body, arm = identifier("place", place), self.body(robot_name), self.arm(robot_name).whole()
         if name == HOME:
             raise ValidationError(f"place must not be {HOME}, which is that of the model.")
         joints = _degrees(arm, arm.state(_observed(body)[1]).joints)
@@ -419,11 +420,13 @@ class ArmMixin:
         wait: bool,
         robot_name: str,
         *,
+        whole: bool = False,
         started: Callable[[], object] = lambda: None,
     ) -> Envelope:
         from strands_robots.kinematics.moves import Start  # noqa: PLC0415 - loaded with the first motion
 
         body, arm = self.body(robot_name), self.arm(robot_name)
+        arm = arm.whole() if whole else arm
         planned: list[Motion] = []
 
         def planned_at(hz: float) -> Motion:
@@ -537,4 +540,5 @@ def _degrees(arm: Arm, joints: Any) -> dict[str, float]:
     return {
         joint.name: float(np.degrees(at)) if joint.turns else float(at)
         for joint, at in zip(arm.chain.joints, joints, strict=True)
+        if not joint.refusal
     }

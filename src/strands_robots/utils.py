@@ -54,6 +54,11 @@ class MissingExtraError(StrandsRobotsError, ImportError):
     """An optional dependency is missing; the message names its extra."""
 
 
+def joint_name(key: str) -> str:
+    """Return the joint of a key, without what drivers and older datasets add."""
+    return key.removeprefix("main_").removesuffix(".pos")
+
+
 def install_line(extra: str) -> str:
     """Return the command that adds an extra to this clone or installation."""
     if (Path(__file__).resolve().parents[2] / "pyproject.toml").is_file():

@@ -92,6 +92,15 @@ async def test_jog_moves_with_the_lease_and_stops_when_it_is_released(page: Page
     assert page.feed.stops >= 1
 
 
+async def test_jog_of_a_key_of_a_real_arm_moves_the_joint_of_its_model(page: Page) -> None:
+    await page.take()
+    await page.jog(axis="pan.pos")
+    await page.beating(lambda: page.feed.asked("moveJoints"))
+    assert page.feed.asked("moveJoints")[0]["joints"] == {"pan": 55.0}
+    page.control.release(KEY)
+    await until(page.jogged)
+
+
 async def test_jog_without_a_beat_for_200_ms_is_stopped(page: Page) -> None:
     await page.take()
     began = time.monotonic()

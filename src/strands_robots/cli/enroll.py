@@ -15,6 +15,7 @@ from strands_robots.cli.network import Network, describe
 from strands_robots.cli.output import CliError, Exit, Screen, label, plain, table
 from strands_robots.cli.resume import ask_mesh, ask_robots, lockable_robots, operator
 from strands_robots.safety import ed25519
+from strands_robots.safety.consoles import enrolled_consoles
 from strands_robots.safety.identity import DEFAULT_TENANT, EnrolledKeys, KeyFileError, fingerprint, local_name
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.statements import Purpose, own_key
@@ -119,8 +120,6 @@ def _enroll_robots(
 
 def _enroll_console(screen: Screen, text: str) -> None:
     """Keep the key of a console on another machine, for the robots of this one."""
-    from strands_robots.mesh.console_keys import enrolled_consoles  # noqa: PLC0415 - loaded when it is used
-
     public = ed25519.decode(text, 32)
     if public is None:
         raise CliError(f"--console must be the key that `strands-robots keys console` prints there, not {shown(text)}.")

@@ -26,7 +26,7 @@ from strands_robots.cli.mesh_controller import MeshController
 from strands_robots.cli.network import Network, mesh_peer
 from strands_robots.cli.output import CliError, Exit, Screen, captured_log, label, table
 from strands_robots.cli.resume import ask_robots, lockable_robots
-from strands_robots.cli.stop import LATE_MS, SLOW_MS, style_of, summary
+from strands_robots.cli.stop_report import LATE_MS, SLOW_MS, style_of, summary
 from strands_robots.safety.answers import Answer
 from strands_robots.safety.controller import Progress, SafetyController, StopReport
 from strands_robots.safety.lockout import utc

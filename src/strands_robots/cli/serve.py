@@ -147,8 +147,9 @@ def serve(
     if serial_port is not None and mode == "sim":
         raise ValidationError(f"--mode must be real with the serial port {serial_port}, not sim.")
     chosen |= _arm_options(mode, model, detector)
-    if policies is not None:
-        warm_profiles()
+    loading = [] if policies is None else warm_profiles()
+    if loading:
+        screen.say(f"Loading the policies {', '.join(loading)}.")
     body = Robot(robot, mode="real" if robot == "reachy_mini" else mode, **chosen)
     try:
         with record_robot(screen, body, peer_id or str(body.tool_name_str), record, record_cameras):

@@ -19,7 +19,7 @@ from strands_robots.safety.stopping import grade
 from strands_robots.serving.control import HUMAN
 from strands_robots.serving.take_assertion import sign_take
 from strands_robots.serving.verbs import LEASE_ID
-from strands_robots.utils import ValidationError, choice, number, shown, text
+from strands_robots.utils import ValidationError, choice, joint_name, number, shown, text
 
 BEAT_S = 0.2
 """Longest time without a beat of the page after which a jog is stopped."""
@@ -94,10 +94,12 @@ class JogAxis:
         common |= {"speed": self.speed, "wait": False}
         if self.kind == "tip":
             return [("moveBy", {f"d{self.name}": self.direction * each, **common}) for each in METRES]
-        if self.name not in joints:
+        # The page has the robot's own key, such as pan.pos, where getPose and moveJoints have the model's joint.
+        name = next((each for each in joints if joint_name(each) == joint_name(self.name)), None)
+        if name is None:
             raise ValidationError(f"axis must be one of {', '.join(joints)}, not {shown(self.name)}.")
-        start = joints[self.name]
-        return [("moveJoints", {"joints": {self.name: start + self.direction * each}, **common}) for each in DEGREES]
+        start = joints[name]
+        return [("moveJoints", {"joints": {name: start + self.direction * each}, **common}) for each in DEGREES]
 
 
 @dataclass(slots=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from strands_robots.device_connect.backends import LinkConfig
@@ -22,8 +23,12 @@ def safety_controller(controller_id: str, link: LinkConfig | None = None, **opti
     return SafetyController(controller_id, lambda: stop_link(link), **options)
 
 
-def envelope(report: StopReport) -> Envelope:
-    """Return the report as an answer, an error unless every robot stopped."""
+def envelope(report: StopReport, reasons: Mapping[str, str] | None = None) -> Envelope:
+    """Return the report as an answer, an error unless every robot stopped.
+
+    Args:
+        reasons: of silent robots.
+    """
     fields: dict[str, Any] = {
         "estop_id": report.estop_id,
         "stopped": {name: round(each.latency_ms, 3) for name, each in report.stopped.items()},
@@ -44,7 +49,8 @@ def envelope(report: StopReport) -> Envelope:
     failures += [f"{name} did not act on it" for name in report.refused]
     failures += [f"ALARM: {name}: {report.alarms[name]}" for name in report.alarmed]
     failures += [f"{name} is only claimed to have stopped: it did not sign" for name in report.claimed]
-    failures += [f"{name} gave no answer" for name in report.silent]
+    why = reasons or {}
+    failures += [f"{name} gave no answer{f' ({why[name]})' if name in why else ''}" for name in report.silent]
     if not report.link:
         failures.append("the stop was not sent: the link is down")
     if report.widened:

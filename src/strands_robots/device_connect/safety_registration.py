@@ -142,6 +142,8 @@ class SafetyRegistration:
                 lambda: NoStopLink() if link is None else stop_link(link),
                 lambda: self.identity,
                 opened=False,
+                network=self._network,
+                was_here=self.was_here_s is not None,
             )
         except BaseException:
             self.entry.close()
@@ -185,7 +187,9 @@ class SafetyRegistration:
     def runtime_estop(self, source: object, params: object, raw: bytes | int | None = None) -> None:
         """Act on an emergency stop of the runtime's handler; return at once."""
         if isinstance(source, str):
-            estop_listener().accept_params(source, params if isinstance(params, Mapping) else {}, "runtime", raw)
+            estop_listener().accept_params(
+                source, params if isinstance(params, Mapping) else {}, "runtime", raw, self._network
+            )
 
     def raise_estop(self, params: Mapping[str, Any]) -> None:
         """Lock and halt on this device's own emergency stop; return at once.

@@ -12,12 +12,13 @@ import importlib
 import importlib.util
 import os
 import sys
-import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib.machinery import ModuleSpec
 from types import ModuleType
 from typing import Any
+
+from strands_robots.policies.lerobot_imports import LEROBOT_IMPORTS
 
 _STANDINS: Mapping[str, tuple[str, ...]] = {
     "torch": ("device", "dtype", "Tensor"),
@@ -28,8 +29,6 @@ _STANDINS: Mapping[str, tuple[str, ...]] = {
     "lerobot.processor": ("RobotAction", "RobotObservation"),
 }
 """Names that LeRobot's drivers import, by module. None of them is called by a driver."""
-
-_importing = threading.Lock()
 
 
 def light() -> bool:
@@ -43,7 +42,7 @@ def lerobot_module(name: str) -> ModuleType:
     Raises:
         ModuleNotFoundError: LeRobot, or something the module really needs, is not installed.
     """
-    with _importing:
+    with LEROBOT_IMPORTS:
         if not light():
             return importlib.import_module(name)
         with _standing_in():

@@ -58,6 +58,11 @@ class Context:
         """
         return stamp < self.began and self.monotonic() - self._began_at <= wire.FRESH_S + wire.AHEAD_S
 
+    @property
+    def age_s(self) -> float:
+        """Seconds since this peer began."""
+        return self.monotonic() - self._began_at
+
     def running(self) -> bool:
         return self.transport is not None and self.transport.is_alive()
 

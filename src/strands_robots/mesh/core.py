@@ -23,11 +23,13 @@ from strands_robots.mesh.context import Context
 from strands_robots.mesh.executor import BoundedExecutor
 from strands_robots.mesh.hearing import Hearing
 from strands_robots.mesh.input_receiver import InputReceiver
+from strands_robots.mesh.missed import MeshMissedStops
 from strands_robots.mesh.older_peers import Pacer
 from strands_robots.mesh.presence import DESCRIBE_S, PresencePublisher
 from strands_robots.mesh.registry import PeerRegistry
 from strands_robots.mesh.rpc import Requester
-from strands_robots.mesh.safety import FleetSafety, OnAnswers, SafetyAdapter, status_of
+from strands_robots.mesh.safety import FleetSafety, OnAnswers, status_of
+from strands_robots.mesh.safety_adapter import SafetyAdapter
 from strands_robots.mesh.scheduler import Scheduler
 from strands_robots.mesh.security import validate_peer_id
 from strands_robots.mesh.sensors import CameraPublisher, SensorLoopsMixin, SensorPublisher
@@ -42,7 +44,7 @@ from strands_robots.mesh.wire_identity import Identity, signature_policy
 from strands_robots.recording.cameras import frames_of
 from strands_robots.safety.persistence import simulation_key
 from strands_robots.safety.plane import SafetyPlane
-from strands_robots.safety.scope import own_cell
+from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope, none_known, own_cell
 from strands_robots.serving.pipeline import Own, Pipeline
 from strands_robots.serving.robot_verbs import served
 from strands_robots.utils import number, text
@@ -130,6 +132,7 @@ class Mesh(SensorLoopsMixin):
         context.console, context.consoles = ConsoleSigner(parts.clock), ConsoleTrust(parts.clock)
         self._hardware = hardware
         self._handles: list[Declaration] = []
+        self._missed: MeshMissedStops | None = None
         self._inputs: dict[str, dict[str, Any]] = {}
         self._scheduler = Scheduler(peer)
         self._sensors = SensorPublisher(context, self._scheduler)
@@ -163,6 +166,8 @@ class Mesh(SensorLoopsMixin):
             before_stop=self._teleop.void,
             after_stop=self._teleop.reap,
             robot_key=self._adapter.identity,
+            lock=self._lock_of(peer),
+            epochs=self._adapter.epochs,
         )
         self._safety = FleetSafety(
             context, self._adapter, self._requester, self._pipeline.shares.urgent, robot=robot is not None
@@ -178,12 +183,17 @@ class Mesh(SensorLoopsMixin):
                 report=self._adapter.report,
                 own=lambda child: {"ping": own["ping"], "resume": self._resume_of(child)},
                 robot_key=self._adapter.identity,
+                lock_of=self._lock_of,
+                epochs=self._adapter.epochs,
                 teleop=self._teleop,
                 audit=parts.recorder,
             )
 
     def _safety_facts(self, peer_id: str = "") -> dict[str, Any]:
         return {**self._adapter.announced(peer_id), **self._hearing.facts()}
+
+    def _lock_of(self, peer_id: str) -> Callable[[object, Sample, str], str | None]:
+        return lambda estop, sample, sender: self._safety.on_own_estop(estop, sample, sender, peer_id)
 
     def _resume_of(self, peer_id: str) -> Own:
         return lambda arguments: self._safety.on_resume_command(arguments.get("assertion"), peer_id)
@@ -255,6 +265,7 @@ class Mesh(SensorLoopsMixin):
             (topics.check_in_answer("*"), self._safety.on_check_in_answer),
         ):
             self._handles.append(transport.declare_subscriber(key, receive))
+        self._missed = missed = MeshMissedStops.joined_by(context, self._adapter)
         if self.robot is not None:
             if self._adapter.needs_check_in:
                 controllers = topics.check_in("*")
@@ -271,6 +282,7 @@ class Mesh(SensorLoopsMixin):
             every("children", rates["presence"].rate_hz, self.children.refresh)
             every("children's presence", rates["presence"].rate_hz, self.children.announce, quick=True)
         every("tokens", TOKENS_HZ, self._presence.look, quick=True)
+        every("missed stops", TOKENS_HZ, lambda: missed.look(context), quick=True)
         every("hearing", HEARING_HZ, self._hearing.look, quick=True)
         # A stop that is published again may wait for its turn, and behind no robot.
         every("late peers", LATE_HZ, self._safety.late.look, queue="late peers")
@@ -302,6 +314,8 @@ class Mesh(SensorLoopsMixin):
         if dropped:
             logger.info("%s left the mesh and dropped %d subscriptions.", self.peer_id, dropped)
         self._presence.stop()
+        if self._missed is not None:
+            self._missed.left_by(self._context, self._adapter)
         if self.children is not None:
             self.children.close()
         for handle in self._handles:
@@ -508,9 +522,16 @@ class Mesh(SensorLoopsMixin):
         return next(iter(self._adapter.epochs()), None)
 
     def emergency_stop(
-        self, signing_key: Any = None, *, estop_id: str = "", on_answers: OnAnswers = lambda replies: None
+        self,
+        signing_key: Any = None,
+        *,
+        estop_id: str = "",
+        on_answers: OnAnswers = lambda replies: None,
+        scope: Scope = EVERY_ROBOT,
+        remembers: Remembers = none_known,
+        on_widened: Callable[[], None] = lambda: None,
     ) -> list[dict[str, Any]]:
-        """Stop and lock this robot and every peer; return the answers.
+        """Stop and lock every robot, this one too, or those of ``scope``.
 
         A peer that did not stop or did not answer is named at CRITICAL.
 
@@ -518,6 +539,9 @@ class Mesh(SensorLoopsMixin):
             signing_key: for fleets that act on signed stops only.
             estop_id: 32 hex digits, the same for one press; a fresh one by default.
             on_answers: called with the replies so far.
+            scope: the robots that it is for. Where none of them is there, every robot is stopped.
+            remembers: says whether this machine knows a robot in the scope.
+            on_widened: called where every robot is stopped for that.
 
         Raises:
             RuntimeError: this peer is not on the mesh.
@@ -525,7 +549,14 @@ class Mesh(SensorLoopsMixin):
         # A link that is down must not keep this robot from stopping; the fleet gets the stop later.
         if self._context.transport is None:
             raise RuntimeError(f"{self.peer_id} is not on the mesh: no peer would hear the emergency stop.")
-        return self._safety.emergency_stop(signing_key, estop_id=estop_id, on_answers=on_answers)
+        return self._safety.emergency_stop(
+            signing_key,
+            estop_id=estop_id,
+            on_answers=on_answers,
+            scope=scope,
+            remembers=remembers,
+            on_widened=on_widened,
+        )
 
     def check_in_every(self, interval_s: float, signing_key: Any = None) -> None:
         """Check in with robots that need a live controller, while this peer is joined.

@@ -37,6 +37,7 @@ PURPOSES = {"status": Purpose.LOCKOUT_STATE, "resume": Purpose.RESUME_ANSWER, "s
 """Actions whose answer a robot signs, with the purpose of the signature."""
 
 _NO_ID = frozenset("/*$?#")
+LOOK_S = 0.02
 REPEAT_S = 0.5
 """Seconds after which an unanswered stop is sent again: its message or its answer may be lost."""
 
@@ -158,6 +159,44 @@ class Requester:
             return self._collect(turn, clean, seconds, missing)
         finally:
             self._close(turn)
+
+    def stop_each(
+        self,
+        stops: Callable[[], Mapping[str, dict[str, Any]]],
+        seconds: float,
+        goes_on: Callable[[list[dict[str, Any]]], bool],
+    ) -> list[dict[str, Any]]:
+        """Send each peer a stop of its own, and collect the replies.
+
+        Args:
+            stops: returns the stop of each peer that has to answer. It is asked, and a peer without a result gets the
+                stop again, every ``ASK_AGAIN_S``.
+            goes_on: ends the collection; it gets the replies so far, many times a second. A peer's result replaces an
+                error of it.
+        """
+        turn, replies = Turn(BROADCAST_RESPONDER), dict[str, dict[str, Any]]()
+        now = again = time.monotonic()
+        deadline = now + seconds
+        try:
+            while now < deadline:
+                if now >= again:
+                    again = now + ASK_AGAIN_S
+                    for peer, command in stops().items():
+                        if replies.get(peer, {}).get("type") != "response":
+                            self._publish(topics.command(peer), command, turn)
+                if not goes_on(list(replies.values())):
+                    break
+                with contextlib.suppress(Empty):  # no answer in this interval
+                    reply = turn.next(LOOK_S)
+                    if reply is None:
+                        break
+                    peer = str(reply["responder_id"])
+                    if peer not in replies or (replies[peer]["type"], reply["type"]) == ("error", "response"):
+                        replies[peer] = reply
+                now = time.monotonic()
+        finally:
+            self._close(turn)
+        return list(replies.values())
 
     def _collect(
         self,

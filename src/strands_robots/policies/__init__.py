@@ -86,12 +86,14 @@ def create_policy(provider: str, **options: Any) -> Policy:
     return policy
 
 
-def warm_profiles() -> None:
-    """Begin to load the policy of every profile; raise as :func:`create_policy`."""
-    for name in profiles():
-        policy = create_policy(name)
-        if hasattr(policy, "warm"):
-            policy.warm()
+def warm_profiles() -> list[str]:
+    """Begin to load the policy of every profile; raise as :func:`create_policy`.
+
+    Returns:
+        The profiles that are not loaded yet.
+    """
+    made = {name: create_policy(name) for name in profiles()}
+    return [name for name, policy in made.items() if hasattr(policy, "warm") and policy.warm() is not None]
 
 
 def _profiled(profile: Profile) -> Policy:

@@ -15,7 +15,7 @@ from typing import Literal
 
 from strands_robots.policies.checkpoint import ACTION, STATE, Size, Statement, checkpoint_statements, dataset_statement
 from strands_robots.policies.profiles import CameraMap, Profile
-from strands_robots.utils import ValidationError
+from strands_robots.utils import ValidationError, joint_name
 
 Outcome = Literal["ok", "confirmed", "unverified", "refused"]
 
@@ -153,7 +153,7 @@ def _vector(
     yield _row(f"{name} names", mine, ", ".join(present), not (unknown or missing), change)
     for source, names, size in stated:
         if names is not None:
-            same = [_bare(key) for key in names] == [_bare(key) for key in chosen]
+            same = [joint_name(key) for key in names] == [joint_name(key) for key in chosen]
             change = f"put {name} into the order of {source}"
             yield _row(f"{name} order", f"{', '.join(names)} ({source})", mine, same, change)
         if size is not None:
@@ -166,11 +166,6 @@ def _environment(profile: Profile, statements: Sequence[Statement], robot: Robot
     stated = [(s.source, s.environment, s.environment_size) for s in statements]
     if profile.environment or any(size or names for _, names, size in stated):
         yield from _vector("environment", profile.environment, stated, list(robot.state))
-
-
-def _bare(key: str) -> str:
-    """Return a joint's name without what older data sets and the robot add to it."""
-    return key.removeprefix("main_").removesuffix(".pos")
 
 
 def _values(profile: Profile, statements: Sequence[Statement], robot: RobotFacts) -> Iterator[CheckRow]:

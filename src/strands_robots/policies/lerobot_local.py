@@ -8,11 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from strands_robots.policies.base import Action, PolicyError, Ranges
 from strands_robots.policies.decoding import read_json
+from strands_robots.policies.lerobot_imports import LEROBOT_IMPORTS, lerobot_import
 from strands_robots.policies.profiles import Profile
 from strands_robots.policies.warm import WarmModels
 from strands_robots.utils import ValidationError, missing_extra, shown
@@ -39,10 +41,9 @@ class LeRobotPolicy:
     """
 
     def __init__(self, profile: Profile | None = None, pretrained_name_or_path: str = "") -> None:
-        try:
-            import_module("lerobot")
-        except ModuleNotFoundError as exc:
-            raise missing_extra("The policy lerobot_local", "lerobot") from exc
+        # Another thread may be importing it for seconds.
+        if find_spec("lerobot") is None:
+            raise missing_extra("The policy lerobot_local", "lerobot")
         if profile is None or not profile.checkpoint:
             raise ValidationError(
                 f"policy_provider lerobot_local needs a profile for {shown(pretrained_name_or_path)}, because a "
@@ -59,7 +60,7 @@ class LeRobotPolicy:
 
     def warm(self) -> str | None:
         """Load the checkpoint on a thread; see :class:`Warmable`."""
-        return _MODELS.warm(self._key, self._load)
+        return _MODELS.warm(self._key, self._load, self._profile.name)
 
     def reset(self, instruction: str, ranges: Ranges) -> None:
         """Take the loaded checkpoint, or load it."""
@@ -99,12 +100,16 @@ class LeRobotPolicy:
         Raises:
             PolicyError: the checkpoint does not fit its profile, or answers no finite numbers.
         """
-        factory = import_module("lerobot.policies.factory")
-        config = import_module("lerobot.configs.policies").PreTrainedConfig.from_pretrained(self._checkpoint)
+        with LEROBOT_IMPORTS:
+            factory = lerobot_import("lerobot.policies.factory")
+            lerobot_import("lerobot.policies.utils")
+            config = lerobot_import("lerobot.configs.policies").PreTrainedConfig.from_pretrained(self._checkpoint)
+            # It imports the model's code.
+            kind = factory.get_policy_class(config.type)
         if self._profile.device:
             config.device = self._profile.device
         # Strictly: a weight that is missing would be a random one, with a line in the log.
-        model = factory.get_policy_class(config.type).from_pretrained(self._checkpoint, config=config, strict=True)
+        model = kind.from_pretrained(self._checkpoint, config=config, strict=True)
         if self.continues:
             _enable_rtc(model, config)
         # A checkpoint that was saved on CUDA has processors that ask for it.
@@ -166,7 +171,7 @@ def _enable_rtc(model: Any, config: Any) -> None:
     """
     if not hasattr(config, "rtc_config") or not hasattr(model, "init_rtc_processor"):
         raise PolicyError(f"a policy of the type {config.type} has no real-time chunking; leave rtc out")
-    config.rtc_config = import_module("lerobot.policies.rtc.configuration_rtc").RTCConfig(enabled=True)
+    config.rtc_config = lerobot_import("lerobot.policies.rtc.configuration_rtc").RTCConfig(enabled=True)
     model.init_rtc_processor()
 
 

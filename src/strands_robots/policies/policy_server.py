@@ -120,7 +120,7 @@ class ServedPolicy:
 
     def warm(self) -> str | None:
         """Connect, and let the server compile; see :class:`Warmable`."""
-        return self.connections.warm(self._key, self._warmed)
+        return self.connections.warm(self._key, self._warmed, self.profile.name)
 
     def reset(self, instruction: str, ranges: Ranges) -> None:
         self._task = instruction

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections.abc import Callable, Hashable
 from typing import Any, Protocol, runtime_checkable
 
@@ -34,8 +35,14 @@ class WarmModels:
         self._loading: set[Hashable] = set()
         self._failed: dict[Hashable, str] = {}
 
-    def warm(self, key: Hashable, load: Callable[[], Any]) -> str | None:
-        """Load a model on a thread unless one is idle; as :meth:`Warmable.warm`."""
+    def warm(self, key: Hashable, load: Callable[[], Any], profile: str = "") -> str | None:
+        """Load a model on a thread unless one is idle; as :meth:`Warmable.warm`.
+
+        Args:
+            key: of the model.
+            load: makes it.
+            profile: that it is loaded for, for the log.
+        """
         with self._lock:
             if self._idle.get(key):
                 return None
@@ -45,7 +52,8 @@ class WarmModels:
             if failed:
                 return failed
             self._loading.add(key)
-        threading.Thread(target=self._load, args=(key, load), name="policy-loader", daemon=True).start()
+        loader = threading.Thread(target=self._load, args=(key, load, profile), name="policy-loader", daemon=True)
+        loader.start()
         return ""
 
     def take(self, key: Hashable, load: Callable[[], Any]) -> Any:
@@ -61,16 +69,20 @@ class WarmModels:
         with self._lock:
             self._idle.setdefault(key, []).append(model)
 
-    def _load(self, key: Hashable, load: Callable[[], Any]) -> None:
+    def _load(self, key: Hashable, load: Callable[[], Any], profile: str) -> None:
+        what = f"the policy {profile}".rstrip()
+        logger.info("Loading %s.", what)
+        began = time.monotonic()
         try:
-            with computing("The loading of a policy"):
+            with computing(f"The loading of {what}"):
                 model = load()
         except BaseException as exc:  # noqa: BLE001 - whatever a loader raises is told to the next caller
-            logger.warning("A policy could not be loaded: %s: %s", type(exc).__name__, exc)
+            logger.warning("Loading %s failed: %s: %s", what, type(exc).__name__, exc)
             with self._lock:
                 self._failed[key] = f"{type(exc).__name__}: {exc}"
                 self._loading.discard(key)
             return
+        logger.info("Loaded %s in %.1f s.", what, time.monotonic() - began)
         with self._lock:
             self._idle.setdefault(key, []).append(model)
             self._loading.discard(key)

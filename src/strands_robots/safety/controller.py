@@ -22,14 +22,29 @@ from strands_robots.safety.estop_listener import (
     ESTOP,
     VERDICT,
     FailureBudget,
+    OnEvent,
     RenewableLink,
+    ReportingLink,
     StopLink,
     notification,
 )
 from strands_robots.safety.head_witness import HeadWitness
 from strands_robots.safety.identity import KeyFileError
+from strands_robots.safety.missed_stops import ANSWER, QUESTION, MissedStops
 from strands_robots.safety.orders import REASON_MAX, answered_field, new_epoch, params_of, signed_stop
-from strands_robots.safety.scope import EVERY_ROBOT, Scope
+from strands_robots.safety.question_ports import ControllerPort
+from strands_robots.safety.roster_inbox import OnReport, RosterInbox
+from strands_robots.safety.roster_report import STOP_ROSTER
+from strands_robots.safety.scope import (
+    EVERY_ROBOT,
+    WIDEN_S,
+    KnownRobots,
+    Remembers,
+    Scope,
+    none_known,
+    report_widened,
+)
+from strands_robots.safety.silence import Sending
 from strands_robots.safety.statements import Proof, Purpose, proof_of
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.turns import shorten_turns
@@ -57,9 +72,6 @@ RENEW_S = 6.0
 
 SETTLE_S = 1.0
 """A stop goes on for at least so long before it has the connection made anew."""
-
-WIDEN_S = 0.2
-"""Seconds after which a stop of some robots becomes one of every robot, where none of them answered or is known."""
 
 DEADLINE_S = 3.0
 INBOX_PER_ROBOT = 16
@@ -155,6 +167,7 @@ class SafetyController:
         on_link: called at once when the link is lost or back.
         enrolled: gives the public keys of robots, read when this is made and once each stop has left.
         require_signed: count a robot that is not enrolled as *claimed* only.
+        stands: receive the stops of other controllers, too, for :meth:`hear_others`.
         remembers: says whether this machine knows a robot in a scope; asked on a thread once such a stop has left.
     """
 
@@ -167,7 +180,8 @@ class SafetyController:
         on_link: Callable[[bool], None] = lambda up: None,
         enrolled: Callable[[], Mapping[str, bytes]] = dict,
         require_signed: bool = False,
-        remembers: Callable[[Scope], bool] = lambda scope: False,
+        stands: bool = False,
+        remembers: Remembers = none_known,
     ) -> None:
         self.controller_id = device_id("controller_id", controller_id)
         self._key = signing_key
@@ -184,14 +198,42 @@ class SafetyController:
         self._check_in: threading.Thread | None = None
         self._unanswered_s = 0.0
         self._witness, self._heads = HeadWitness(always=True), FailureBudget()
-        self._link = make_link()
+        self._reports = RosterInbox()
+        self._others: OnEvent | None = None
+        self._link, self._linked = make_link(), False
         self._end_short_turns = shorten_turns()
-        self._link.open((VERDICT, CHECK_IN_ANSWER), self._receive, self._link_changed)
+        self._sent = ControllerPort(self.controller_id, signing_key, lambda: self._keys, self._publish)
+        self._missed = MissedStops(self._sent)
+        events = (VERDICT, CHECK_IN_ANSWER, QUESTION, ANSWER, STOP_ROSTER, *((ESTOP,) if stands else ()))
+        self._link.open(events, self._receive, self._link_changed)
 
     @property
     def link_up(self) -> bool:
         """True while the link reaches a peer."""
         return self._link.up
+
+    @property
+    def sending(self) -> Sending:
+        """The way its stops leave: signed or not, and the broker's refusal."""
+        tells = isinstance(self._link, ReportingLink)
+        denied = self._link.denied if isinstance(self._link, ReportingLink) else ""
+        return Sending(signed=self._key is not None, denied=denied, tells=tells)
+
+    @property
+    def signing_key(self) -> Any:
+        """The key that signs its stops, or None."""
+        return self._key
+
+    def hear_others(self, hear: OnEvent) -> None:
+        """Give the stops of others, and the answers of robots, to ``hear``.
+
+        It is called on a thread of the link: it returns at once, parses nothing and may not raise.
+        """
+        self._others = hear
+
+    def publish(self, event: str, payload: bytes) -> bool:
+        """Send an event under this controller's name; False when the link is down."""
+        return self._link.publish(self.controller_id, event, payload)
 
     def wait_link(self, timeout: float) -> bool:
         """True when the link is up within ``timeout`` seconds."""
@@ -205,7 +247,9 @@ class SafetyController:
         *,
         deadline_s: float = DEADLINE_S,
         estop_id: str = "",
+        more: bool = False,
         on_progress: OnProgress = lambda progress: None,
+        on_report: OnReport = lambda report: None,
         scope: Scope = EVERY_ROBOT,
     ) -> StopReport:
         """Stop every robot of the tenant, or those of ``scope``; wait for answers.
@@ -222,7 +266,9 @@ class SafetyController:
             reason: for the robots and their logs, at most 200 characters.
             deadline_s: seconds until silence is reported as silence.
             estop_id: 32 hex digits; a fresh one by default.
+            more: :meth:`expect` will name further robots, so the stop goes on until then.
             on_progress: called at each answer, when the link changes, and once 100 ms have passed.
+            on_report: called with what standing controllers say they miss, on a thread of its own.
             scope: the robots that it is for; those that read no scope stop all the same.
         """
         number("deadline_s", deadline_s, above=0, high=3600)
@@ -230,15 +276,18 @@ class SafetyController:
             raise ValidationError(f"expected must be a collection of robot ids, not the text {expected!r}.")
         estop_id = estop_id or new_epoch()
         press = self.press(estop_id)
-        run = _Running(estop_id, frozenset(expected) | scope.only, time.monotonic(), press, reason[:REASON_MAX], scope)
+        run = _Running(
+            estop_id, frozenset(expected) | scope.only, time.monotonic(), press, reason[:REASON_MAX], scope, more=more
+        )
         deadline_s = deadline_s if scope.everything else max(deadline_s, 2 * WIDEN_S)
         with self._changed:
             self._stops[run.estop_id] = run
         try:
             # The first one is sent before anything else is done.
             self._send(run)
+            self._reports.open(run.estop_id, on_report)
             if not scope.everything:
-                threading.Thread(target=self._remember, args=(run,), name="stop scope", daemon=True).start()
+                run.known = KnownRobots(scope, self._remembers)
             self._load_keys()
             run.graded = Answers(self._keys, required=self._require_signed, pressed_at=press.wall)
             self._repeat(run, deadline_s, on_progress)
@@ -246,6 +295,9 @@ class SafetyController:
             with self._changed:
                 del self._stops[run.estop_id]
                 self._ended = run
+            self._reports.close(run.estop_id)
+            if run.complete:
+                self._sent.answered(run.estop_id)
         return self._report(run)
 
     def review(self, report: StopReport) -> StopReport:
@@ -273,28 +325,17 @@ class SafetyController:
                 del self._presses[next(iter(self._presses))]
         return press
 
-    def _remember(self, run: _Running) -> None:
-        """Find out whether this machine knows a robot in the scope."""
-        try:
-            run.remembered = self._remembers(run.scope)
-        except Exception:
-            logger.critical("The robots known here cannot be read, so none counts as known.", exc_info=True)
+    def expect(self, estop_id: str, names: Collection[str], *, more: bool = False) -> bool:
+        """Name further robots that must answer ``estop_id``; False when it is over.
 
-    def _widen(self, run: _Running) -> None:
-        """Make it a stop of every robot: none in its scope is there."""
-        run.widened = True
-        logger.critical(
-            "Emergency stop %s was for %s. None of these has answered or is known here: EVERY ROBOT IS STOPPED.",
-            run.estop_id,
-            run.scope,
-        )
-
-    def expect(self, estop_id: str, names: Collection[str]) -> bool:
-        """Name further robots that must answer ``estop_id``; False when it is over."""
+        Args:
+            more: further ones will be named, so the stop goes on until then.
+        """
         with self._changed:
             run = self._stops.get(estop_id)
             if run is not None:
                 run.expected |= frozenset(names)
+                run.more = more
                 self._changed.notify_all()
         return run is not None
 
@@ -318,6 +359,8 @@ class SafetyController:
         if self._check_in is not None:
             self._check_in.join(2.0)
         self._link.close()
+        self._reports.end()
+        self._missed.close()
         self._end_short_turns()
 
     def _send(self, run: _Running) -> None:
@@ -329,6 +372,9 @@ class SafetyController:
         payload, now = self._signed(ESTOP, Purpose.EMERGENCY_STOP, fields), time.monotonic()
         if self._link.publish(self.controller_id, ESTOP, payload) and run.left is None:
             run.left = now
+        if run.sent != run.widened:
+            run.sent = run.widened
+            self._sent.sent(run.estop_id, payload)
 
     def _repeat(self, run: _Running, deadline_s: float, on_progress: OnProgress) -> None:
         quick_first = REPEAT_S if self._key is None else REPEAT_SIGNED_S
@@ -345,7 +391,8 @@ class SafetyController:
             with self._changed:
                 finished = run.complete or now - run.started >= deadline_s
                 if run.widens_at <= now and not run.settled_scope:
-                    self._widen(run)
+                    run.widened = True
+                    report_widened(run.estop_id, run.scope)
                     pauses, next_send, finished = iter(quick_first), 0.0, False
                 state = hash((run.changes, len(run.expected), late, run.widened, self._link.up))
             if state != reported or finished:
@@ -367,9 +414,9 @@ class SafetyController:
             marks = [next_send, run.started + deadline_s, *([] if late else [run.started + UNCONFIRMED_S])]
             marks += [run.widens_at] if run.widens_at > now else []
             with self._changed:
-                seen = (self._link.up, len(run.expected))
+                seen = (self._link.up, len(run.expected), run.more)
                 self._changed.wait_for(
-                    lambda seen=seen: run.inbox or seen != (self._link.up, len(run.expected)),  # type: ignore[misc]
+                    lambda seen=seen: run.inbox or seen != (self._link.up, len(run.expected), run.more),  # type: ignore[misc]
                     max(0.0, min(marks) - time.monotonic()),
                 )
                 if self._link.up and not seen[0]:
@@ -420,6 +467,16 @@ class SafetyController:
 
     def _receive(self, event: str, source: str, payload: bytes | int) -> None:
         at, wall = time.monotonic(), time.time()
+        if event == STOP_ROSTER:
+            self._reports.put(source, payload)
+            return
+        if self._others is not None and event in (ESTOP, VERDICT) and source != self.controller_id:
+            self._others(event, source, payload)
+        if event in (QUESTION, ANSWER):
+            self._missed.receive(event, source, payload)
+            return
+        if event == ESTOP:
+            return
         params = params_of(payload)
         if "estop_id" not in params:
             logger.warning("An answer of %s is not to be read; it counts as none.", shown(source))
@@ -449,13 +506,18 @@ class SafetyController:
     def _link_changed(self, up: bool) -> None:
         with self._changed:
             self._changed.notify_all()
-        self._on_link(up)
+            changed, self._linked = up != self._linked, up
+        if changed:
+            self._on_link(up)
 
     def _check_in_loop(self, interval_s: float) -> None:
         due = time.monotonic()
         while not self._closing.wait(max(0.0, due - time.monotonic())):
             due = max(due + interval_s, time.monotonic())
             self.check_in()
+
+    def _publish(self, event: str, source: str, fields: Mapping[str, Any]) -> bool:
+        return self._link.publish(source, event, notification(event, fields))
 
     def _signed(self, event: str, purpose: Purpose, params: Mapping[str, Any]) -> bytes:
         stated: dict[str, Any] = {**params, "purpose": purpose, "t": time.time(), "nonce": secrets.token_hex(16)}
@@ -472,12 +534,14 @@ class _Running:
     press: Press
     reason: str
     scope: Scope = EVERY_ROBOT
-    remembered: bool = False
+    known: KnownRobots | None = None
     widened: bool = False
     inbox: dict[str, deque[Received]] = field(default_factory=dict)
     graded: Answers = field(default_factory=lambda: Answers({}, required=True, pressed_at=0.0))
     left: float | None = None
+    sent: bool | None = None
     changes: int = 0
+    more: bool = False
 
     def receive(self, source: str, received: Received) -> None:
         """Take a verdict; a flood in a robot's name pushes out only that robot's own."""
@@ -497,7 +561,9 @@ class _Running:
     @property
     def widens_at(self) -> float:
         """Monotonic s at which it widens, unless a robot in its scope answers."""
-        scoped = self.left is not None and not (self.scope.everything or self.widened or self.remembered)
+        scoped = self.left is not None and not (
+            self.scope.everything or self.widened or (self.known is not None and self.known.known)
+        )
         return self.left + WIDEN_S if scoped and self.left is not None else float("inf")
 
     @property
@@ -513,7 +579,7 @@ class _Running:
 
     @property
     def complete(self) -> bool:
-        return bool(self.expected) and not self.graded.unsettled(self.expected)
+        return bool(self.expected) and not self.more and not self.graded.unsettled(self.expected)
 
     @property
     def unanswered(self) -> bool:

@@ -23,6 +23,9 @@ MAX_EPOCHS = 64
 SEEN_MAX = 256
 """Ids of emergency stops remembered besides those that lock; a forgotten one would halt again, on the safe side."""
 
+RESUMED_MAX = 4096
+"""Epochs that a robot was resumed from, and never locks by again. Only a resume adds one; the oldest go first."""
+
 OVERFLOW = "overflow"
 """Name of the epoch that stands for every stop beyond the first 64; no 32-hex id equals it."""
 
@@ -111,10 +114,12 @@ class LockoutLatch:
         state: LockoutState | None = None,
         seen: Iterable[str] = (),
         clock: Callable[[], float] = time.time,
+        resumed: Iterable[str] = (),
     ) -> None:
         self.robot_id = robot_id
         self._state = state or LockoutState()
         self._seen: dict[str, None] = dict.fromkeys([*seen, *self._state.resumable])
+        self._resumed = dict.fromkeys(resumed)
         self._clock = clock
         self._writing = threading.Lock()
 
@@ -129,6 +134,15 @@ class LockoutLatch:
         with self._writing:
             return tuple(self._seen)
 
+    @property
+    def resumed(self) -> Mapping[str, None]:
+        """Epochs that it was resumed from, oldest first; replaced when one is new."""
+        return self._resumed
+
+    def knows(self, epoch: str) -> bool:
+        """Return True for a stop that no longer engages."""
+        return epoch in self._seen or epoch in self._resumed
+
     def refusal(self, verb: str) -> Envelope | None:
         """Return the refusal of ``verb`` while locked, or None while free."""
         return refusal(self._state, self.robot_id, verb)
@@ -136,7 +150,7 @@ class LockoutLatch:
     def engage(self, epoch: str, source: str, reason: str, scope: Scope = EVERY_ROBOT) -> bool:
         """Lock under ``epoch``; False, without a change, when it was seen before."""
         with self._writing:
-            if epoch in self._seen:
+            if self.knows(epoch):
                 return False
             self._seen[epoch] = None
             self._state = self._state.engage(Lockout(epoch, source, reason, self._clock(), scope))
@@ -147,12 +161,23 @@ class LockoutLatch:
         """Clear ``epoch`` after its resume was verified."""
         with self._writing:
             self._state = self._state.resume(epoch)
+            self._add_resumed([epoch])
 
     def clear(self) -> tuple[Lockout, ...]:
         """Clear every lockout, for an operator at this machine; return them."""
         with self._writing:
             cleared, self._state = self._state.all, LockoutState()
+            # Those that the overflow stood for are among the seen.
+            self._add_resumed(self._seen)
             return cleared
+
+    def forgo(self, epochs: Iterable[str]) -> None:
+        """Never lock by these again, as after their resume."""
+        with self._writing:
+            self._add_resumed(epochs)
+
+    def _add_resumed(self, epochs: Iterable[str]) -> None:
+        self._resumed = with_resumed(self._resumed, epochs)
 
     def _forget(self) -> None:
         if len(self._seen) <= SEEN_MAX + MAX_EPOCHS:
@@ -160,6 +185,12 @@ class LockoutLatch:
         active = set(self._state.resumable)
         oldest = next(epoch for epoch in self._seen if epoch not in active)
         del self._seen[oldest]
+
+
+def with_resumed(resumed: dict[str, None], epochs: Iterable[str]) -> dict[str, None]:
+    """Return the latest resumed epochs with these; the same where all are known."""
+    new = [each for each in epochs if each not in resumed and each != OVERFLOW]
+    return dict.fromkeys([*resumed, *new][-RESUMED_MAX:]) if new else resumed
 
 
 def refusal(state: LockoutState, robot_id: str, verb: str) -> Envelope | None:

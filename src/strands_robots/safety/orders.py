@@ -19,6 +19,7 @@ from strands_robots.safety import ed25519
 from strands_robots.safety.authorization import caller_name, entries, estop_refusal, matcher
 from strands_robots.safety.clocks import ObservedClocks, seconds_of
 from strands_robots.safety.lockout import OVERFLOW
+from strands_robots.safety.originals import ORIGINAL_MAX_BYTES
 from strands_robots.safety.resume import is_epoch
 from strands_robots.safety.scope import EVERY_ROBOT, SCOPE, SCOPE_SIGNATURE, Scope
 from strands_robots.safety.statements import Purpose, covered
@@ -52,6 +53,9 @@ ANSWERED_MAX_BYTES = 8 * 2**10
 LISTENER = "lane"
 """``path`` of a stop that the e-stop listener received."""
 
+MISSED = "missed"
+"""``path`` of a stop that another process answered with, see :mod:`.missed_stops`."""
+
 REQUIRE_SIGNED = "STRANDS_ESTOP_REQUIRE_SIGNED"
 ALLOW = "DEVICE_CONNECT_ESTOP_ALLOW"
 
@@ -81,6 +85,9 @@ class StopOrder:
         received_at: this process's wall-clock seconds at receipt.
         clock_ahead_s: seconds by which this process's clock is ahead of the issuer's, or None where not measured.
         answered: devices whose answer the issuer has; one that stopped does not repeat it.
+        original: the message, where it can be passed on: it states its id, and is not too long.
+        network: where it was received.
+        age_s: seconds since the first process received it; not 0 for a missed stop only.
         scope: the robots that it is for.
     """
 
@@ -96,6 +103,9 @@ class StopOrder:
     clock_ahead_s: float | None = None
     answered: frozenset[str] = field(default=frozenset(), compare=False)
     scope: Scope = EVERY_ROBOT
+    original: bytes | None = field(default=None, compare=False, repr=False)
+    network: str = field(default="", compare=False)
+    age_s: float = 0.0
 
     def delay_s(self, now: float) -> float | None:
         """Return the seconds from the press to wall-clock ``now``; None if not stated.
@@ -290,6 +300,11 @@ class StopRules:
         """True when a stop needs a signature; else its source is what it says it is."""
         return bool(self._keys)
 
+    @property
+    def keys(self) -> tuple[bytes, ...]:
+        """The public keys of which one must have signed."""
+        return self._keys
+
     def source_refusal(self, source: str) -> str | None:
         """Return the reason why this source may not stop, or None; costs next to nothing."""
         if self._may_stop(source):
@@ -306,6 +321,9 @@ class StopRules:
         path: str,
         raw: bytes | int | None = None,
         received: float | None = None,
+        *,
+        network: str = "",
+        age_s: float = 0.0,
     ) -> StopOrder | StopRefused:
         """Decide on the parameters of an ``emergencyStop``.
 
@@ -321,7 +339,9 @@ class StopRules:
             return StopOrder(epoch, source, why, path, remote=True, received=received)
         reason = params.get("reason")
         received_at, issued = self._clock() - (time.monotonic() - received), seconds_of(params.get("t"))
-        ahead = self._clocks.note(source, received_at - issued, received) if issued is not None else None
+        compared = issued is not None and path != MISSED
+        ahead = self._clocks.note(source, received_at - issued, received) if compared and issued is not None else None
+        stated = raw is not None and len(raw) <= ORIGINAL_MAX_BYTES and stated_epoch(source, params) != ""
         return StopOrder(
             self._epoch(source, params, received),
             source,
@@ -335,6 +355,9 @@ class StopRules:
             clock_ahead_s=ahead,
             answered=_names(params.get(ANSWERED)),
             scope=self.scope(source, params) if SCOPE in params else EVERY_ROBOT,
+            original=raw if stated else None,
+            network=network,
+            age_s=age_s,
         )
 
     def _epoch(self, source: str, params: Mapping[str, Any], received: float) -> str:

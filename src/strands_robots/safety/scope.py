@@ -6,12 +6,16 @@ counts as *every robot*.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+import threading
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from strands_robots import settings
+from strands_robots.safety.stop_log import stop_logger
 from strands_robots.utils import ValidationError, identifier
+
+logger = stop_logger(__name__)
 
 SCOPE, SCOPE_SIGNATURE = "scope", "scope_sig"
 """Fields of an emergency stop: its scope, and the signature over it."""
@@ -90,6 +94,44 @@ class Scope:
 
 
 EVERY_ROBOT = Scope()
+
+WIDEN_S = 0.2
+"""Seconds after which a stop of some robots becomes one of every robot, where none of them answered or is known."""
+
+Remembers = Callable[[Scope], bool]
+"""Says whether this machine knows a robot that a scope means; it may read the disk."""
+
+
+def none_known(scope: Scope) -> bool:
+    """Return False: no robot is known."""
+    return False
+
+
+class KnownRobots:
+    """Search on a thread for a robot in a scope that this machine knows.
+
+    Make it once the stop has left: a disk that hangs delays no stop, and counts as *none is known*.
+    """
+
+    def __init__(self, scope: Scope, remembers: Remembers) -> None:
+        self.known = False
+        self._scope, self._remembers = scope, remembers
+        threading.Thread(target=self._ask, name="stop scope", daemon=True).start()
+
+    def _ask(self) -> None:
+        try:
+            self.known = self._remembers(self._scope)
+        except Exception:
+            logger.critical("The robots known here cannot be read, so none counts as known.", exc_info=True)
+
+
+def report_widened(epoch: str, scope: Scope) -> None:
+    """Log that a stop of some robots has become one of every robot."""
+    logger.critical(
+        "Emergency stop %s was for %s. None of these has answered or is known here: EVERY ROBOT IS STOPPED.",
+        epoch,
+        scope,
+    )
 
 
 def own_cell(cell: str | None) -> str:

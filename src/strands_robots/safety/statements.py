@@ -28,6 +28,8 @@ class Purpose(StrEnum):
     STOP_VERDICT = "stop-verdict"
     LOCKOUT_STATE = "lockout-state"
     RESUME_ANSWER = "resume-answer"
+    STOP_ROSTER = "stop-roster"
+    MISSED_STOPS = "missed-stops"
 
 
 def covered(purpose: Purpose, source: str, fields: Mapping[str, Any]) -> bytes:

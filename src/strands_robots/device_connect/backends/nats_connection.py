@@ -56,6 +56,8 @@ class NatsConnection:
         self._declaring = asyncio.Lock()
         self._topics: dict[str, _Topic] = {}
         self._log = Throttled(logger)
+        self.denied: dict[str, str] = {}
+        """What the server said to refuse a message, by its subject; the last ones."""
 
     async def enter(self, user: object, on_link: OnLink) -> None:
         """Add a user; the first one connects, and the others wait for it.
@@ -133,6 +135,7 @@ class NatsConnection:
         async def on_error(error: Exception) -> None:
             problems.append(str(error))
             del problems[:-PROBLEMS_KEPT]
+            self._note_denied(str(error))
             self._log.warning("NATS: %s", error)
 
         options: dict[str, Any] = {
@@ -164,6 +167,14 @@ class NatsConnection:
             await self._abandon()
             raise
 
+    def _note_denied(self, problem: str) -> None:
+        """Keep a refusal to publish; the server names the subject in quotes."""
+        subject = problem.partition(DENIED)[2].strip().strip('"')
+        if subject:
+            self.denied[subject[:SUBJECT_MAX]] = problem[:SUBJECT_MAX]
+            while len(self.denied) > PROBLEMS_KEPT:
+                del self.denied[next(iter(self.denied))]
+
     async def _abandon(self) -> None:
         self._closing = True
         await self.client.close()
@@ -190,6 +201,11 @@ class _Topic:
         for sink in self.sinks:
             sink(message)
 
+
+DENIED = "Permissions Violation for Publish to"
+"""Words of a NATS server before the subject that a client may not publish to."""
+
+SUBJECT_MAX = 300
 
 PROBLEMS_KEPT = 8
 """Errors of a connection that are kept, to name the last one where it cannot be made."""
