@@ -12,7 +12,7 @@ FEW = 5
 
 
 def stop_notes(outcome: StopOutcome) -> list[str]:
-    """Return a sentence each on problems, what the roster is worth, groups and other networks."""
+    """Return sentences on problems, the roster's limit, groups, other networks."""
     notes = [f"{each[:1].upper()}{each[1:].rstrip('.')}." for each in outcome.problems]
     notes += [outcome.worth] if outcome.worth else []
     notes += [each for each in (_others(outcome), _unproven(outcome), _no_stop(outcome), _exempt(outcome)) if each]
