@@ -74,8 +74,9 @@ def Robot(  # the factory reads as the class it stands for
         peer_id: its id on the networks.
         mesh: True joins the native mesh now, False never; None asks ``STRANDS_MESH``.
         cell: the cell that it is in, for stops of one cell; None asks ``STRANDS_CELL``, "" is none.
-        options: ``sim``: arguments of ``Simulation`` (``timestep``, ``gravity``, ``realtime``), and ``scene``
-            (``tabletop``: a table with a red cube and a plate). ``real``:
+        options: ``sim``: arguments of ``Simulation`` (``timestep``, ``gravity``, ``realtime``), ``scene``
+            (``tabletop``: a table with a red cube and a plate), and ``tip``, the site or body of the model that
+            motions place. ``real``:
             ``control_hz``, ``joint_ranges``, ``stop_level``, ``rest_pose``, ``model``, ``speed_limit``, ``detector``
             (an object with ``detect(frames)``, see ``kinematics.detector``), and every other one goes to the
             LeRobot configuration of the robot, such as ``port="/dev/ttyACM0"`` and ``id="left"``, with ``cameras`` as
@@ -168,9 +169,9 @@ def _simulated(name: str, tool_name: str | None, options: dict[str, Any]) -> Any
     from strands_robots.simulation import Simulation  # noqa: PLC0415 - loads MuJoCo
     from strands_robots.simulation.tabletop import furnish  # noqa: PLC0415 - simulation only
 
-    label, scene = _label(name), options.pop("scene", None)
+    label, scene, tip = _label(name), options.pop("scene", None), options.pop("tip", "")
     simulation = _construct(_networked(Simulation), tool_name=tool_name or label, **options)
-    answer = simulation.add_robot(label, model=name)
+    answer = simulation.add_robot(label, model=name, tip=tip)
     if is_error(answer):
         simulation.cleanup()
         raise ValidationError(str(answer["reason"]), NO_SUCH_MODEL)

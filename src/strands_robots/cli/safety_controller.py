@@ -32,6 +32,7 @@ from strands_robots.safety.controller import Progress, SafetyController, StopRep
 from strands_robots.safety.lockout import utc
 from strands_robots.safety.orders import new_epoch
 from strands_robots.safety.roster_search import RosterSearch
+from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.safety.stop_roster import StopOutcome, StopRoster
 from strands_robots.tools.mesh_roster import stand_on_mesh
 from strands_robots.utils import device_id, number
@@ -118,11 +119,15 @@ def _run(screen: Screen, controller: SafetyController | MeshController, fleet: F
     from rich.live import Live  # noqa: PLC0415 - loaded when a screen is redrawn
 
     done = threading.Event()
-    button = StopButton(controller, fleet.expected, reason)
+    buttons = StopButtons(lambda scope: StopButton(controller, lambda: fleet.expected(scope), reason, scope))
 
     def pressed(key: str) -> None:
         if key == " ":
-            button.press()
+            buttons.press()
+        elif key in "jk":
+            fleet.choose(1 if key == "j" else -1)
+        elif key in "oc":
+            buttons.press(fleet.chosen_scope(cell=key == "c"))
         elif key in "qQ":
             done.set()
         elif key in "fF":
@@ -130,12 +135,12 @@ def _run(screen: Screen, controller: SafetyController | MeshController, fleet: F
 
     with captured_log() as lines, fleet.polling(), _keys(pressed, done.set):
         try:
-            with Live(fleet.draw(button, lines), console=screen.out, screen=True, auto_refresh=False) as live:
+            with Live(fleet.draw(buttons.latest, lines), console=screen.out, screen=True, auto_refresh=False) as live:
                 while not done.wait(DRAW_S):
-                    button.review()
-                    live.update(fleet.draw(button, lines), refresh=True)
+                    buttons.review()
+                    live.update(fleet.draw(buttons.latest, lines), refresh=True)
         finally:
-            button.close()
+            buttons.close()
 
 
 @contextmanager
@@ -175,10 +180,15 @@ class StopButton:
         controller: sends.
         expected: returns the robots that must answer; called at each press.
         reason: sent to the robots.
+        scope: the robots that it is for.
     """
 
     def __init__(
-        self, controller: SafetyController | MeshController, expected: Callable[[], Collection[str]], reason: str
+        self,
+        controller: SafetyController | MeshController,
+        expected: Callable[[], Collection[str]],
+        reason: str,
+        scope: Scope = EVERY_ROBOT,
     ) -> None:
         self.progress: Progress | None = None
         self.report: StopReport | None = None
@@ -186,6 +196,7 @@ class StopButton:
         """The report measured by the roster; None before the first, or where the network has no roster."""
         self._roster: StopRoster | None = None
         self._controller, self._expected, self._reason = controller, expected, reason
+        self._scope = scope
         self._guard = threading.Lock()
         self._id, self._running, self._last = "", False, float("-inf")
         self._closing = threading.Event()
@@ -230,7 +241,7 @@ class StopButton:
 
     def _stop(self, estop_id: str) -> None:
         network = self._controller.network
-        search = None if network is None else RosterSearch(self._controller, estop_id, network)
+        search = None if network is None else RosterSearch(self._controller, estop_id, network, scope=self._scope)
 
         def note(progress: Progress) -> None:
             if estop_id == self._id:
@@ -238,11 +249,13 @@ class StopButton:
             if search is not None:
                 search.begin(progress)
 
-        recorded = False
+        recorded, scope = False, self._scope
         while True:
             expected = self._expected()
             options: dict[str, Any] = {} if search is None else {"more": not search.begun, "on_report": search.take}
+            options |= {} if scope.everything else {"scope": scope}
             report = self._controller.stop(expected, self._reason, estop_id=estop_id, on_progress=note, **options)
+            scope = EVERY_ROBOT if report.widened else scope
             roster = None if search is None else search.roster
             outcome = self._measured(roster, report)
             if outcome is not None and not recorded:
@@ -266,6 +279,44 @@ class StopButton:
         return roster.outcome(report, replace(self._controller.sending, left=report.link))
 
 
+class StopButtons:
+    """Stop button of all robots, and one for each robot or cell that was pressed.
+
+    Each press of another one is a stop of its own, so that none waits for another or narrows it.
+
+    Args:
+        make: makes the button of a scope.
+    """
+
+    def __init__(self, make: Callable[[Scope], StopButton]) -> None:
+        self._make = make
+        self.latest = make(EVERY_ROBOT)
+        """The button that was pressed last."""
+        self._buttons = {EVERY_ROBOT: self.latest}
+
+    def press(self, scope: Scope = EVERY_ROBOT) -> None:
+        """Stop the robots of a scope; returns at once."""
+        if scope not in self._buttons:
+            self._buttons = {**self._buttons, scope: self._make(scope)}
+        self.latest = self._buttons[scope]
+        self.latest.press()
+
+    @property
+    def running(self) -> bool:
+        """True while a stop waits for answers."""
+        return any(each.running for each in self._buttons.values())
+
+    def review(self) -> None:
+        """Take what robots have said since the stops ended."""
+        for each in self._buttons.values():
+            each.review()
+
+    def close(self) -> None:
+        """Give up stops that wait for the link."""
+        for each in self._buttons.values():
+            each.close()
+
+
 class FleetScreen:
     """Table of robots, polled on a thread and a connection of its own.
 
@@ -280,6 +331,7 @@ class FleetScreen:
     ) -> None:
         self._controller, self._link, self._check_in_s = controller, link, check_in_s
         self._robots: dict[str, LockoutReport] = {}
+        self._chosen = ""
         self._beats: dict[str, float] = {}
         self._asked: dict[str, float] = {}
         self._unanswered: set[str] = set()
@@ -287,11 +339,31 @@ class FleetScreen:
         self._problem = "Looking for robots..."
         self._closed = threading.Event()
 
-    def expected(self) -> Collection[str]:
-        """Return the robots that must answer a stop: seen and not forgotten."""
+    def expected(self, scope: Scope = EVERY_ROBOT) -> Collection[str]:
+        """Return the robots that must answer a stop: seen, in its scope, not forgotten.
+
+        A robot that states no cell reads no scope, and stops whatever it is.
+        """
         # A stop asks for them: what each reports of itself is read anew.
         self._all_since = time.monotonic()
-        return tuple(self._robots)
+        cells = {name: last.facts.get("cell") for name, last in self._robots.items()}
+        return tuple(
+            name for name, cell in cells.items() if not isinstance(cell, str) or scope.covers(name, {cell} - {""})
+        )
+
+    def choose(self, step: int) -> None:
+        """Choose the next robot of the table, or the one before."""
+        names = sorted(self._robots)
+        if names:
+            at = names.index(self._chosen) + step if self._chosen in names else min(step, 0)
+            self._chosen = names[at % len(names)]
+
+    def chosen_scope(self, *, cell: bool) -> Scope:
+        """Return the scope of the chosen robot, or of its cell; every robot without one."""
+        last = self._robots.get(self._chosen)
+        if last is None:
+            return EVERY_ROBOT
+        return Scope.read({"cell": last.facts.get("cell")}) if cell else Scope.named([last.name])
 
     def known(self) -> Collection[str]:
         """Return the robots that were seen and not forgotten."""
@@ -389,10 +461,14 @@ class FleetScreen:
         columns = ("robot", "lockout", "since, by whom", "last stop", "status", "last seen", "check-in")
         robots = sorted(self._robots.items())
         silent = self._unanswered
-        rows = (_row(name, last, self._seen_at(last), name in silent, answers.get(name)) for name, last in robots)
+        rows = (
+            _row(name, last, self._seen_at(last), name in silent, answers.get(name), chosen=name == self._chosen)
+            for name, last in robots
+        )
         return Group(
             label(head, "bold green" if up else "bold white on red"),
             label("SPACE stops everything    f forgets robots that are gone    q quits", "bold"),
+            label("j k choose a robot    o stops that one alone    c stops its cell, and robots without one"),
             table("", columns, rows),
             *([label(self._problem, "yellow")] if self._problem else []),
             _outcome(button),
@@ -404,7 +480,9 @@ def _epochs(report: LockoutReport) -> set[str]:
     return {each.epoch for each in report.lockouts}
 
 
-def _row(name: str, last: LockoutReport, seen_at: float, unanswered: bool, answer: Answer | None) -> tuple[Any, ...]:
+def _row(
+    name: str, last: LockoutReport, seen_at: float, unanswered: bool, answer: Answer | None, *, chosen: bool = False
+) -> tuple[Any, ...]:
     now, lockouts, trip_ms = time.monotonic(), last.lockouts, last.round_trip_ms
     age, report_age = now - seen_at, now - last.at
     locked = f"LOCKED x{len(lockouts)}" if len(lockouts) > 1 else "LOCKED"
@@ -412,10 +490,13 @@ def _row(name: str, last: LockoutReport, seen_at: float, unanswered: bool, answe
     seen = f"GONE, {age:.0f} s"
     if age < GONE_S:
         seen = f"beats, NO ANSWER for {report_age:.0f} s" if unanswered and old else f"{age:.0f} s ago"
+    cell = last.facts.get("cell")
+    place = f", {cell}" if isinstance(cell, str) and cell else "" if isinstance(cell, str) else ", stops always"
+    scope = f" for {lockouts[0].scope}" if lockouts and not lockouts[0].scope.everything else ""
     return (
-        name,
+        label(f"{'> ' if chosen else ''}{name}{place}", "reverse" if chosen else ""),
         label(locked + old, "bold red") if lockouts else label("free" + old),
-        f"{utc(lockouts[0].at)} {lockouts[0].source} {lockouts[0].reason}" if lockouts else "",
+        f"{utc(lockouts[0].at)} {lockouts[0].source}{scope} {lockouts[0].reason}" if lockouts else "",
         _stop_cell(answer),
         label(f"{trip_ms:.1f} ms", "red" if trip_ms > SLOW_MS else ""),
         label(seen, "" if seen.endswith("ago") else "bold red"),

@@ -12,6 +12,7 @@ from strands_robots.dashboard.feed import FleetFeed
 from strands_robots.dashboard.fleet_model import FleetModel
 from strands_robots.safety.answers import Answer
 from strands_robots.safety.controller import UNCONFIRMED_S, Progress, StopReport
+from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.safety.statements import Proof
 from strands_robots.safety.stop_notes import stop_notes
 from strands_robots.safety.stop_roster import StopOutcome
@@ -35,7 +36,8 @@ class FleetStop:
         self._buttons = {
             feed.network: StopButton(feed.controller, _expected(model, feed.network), REASON) for feed in self._feeds
         }
-        self._seen: dict[str, tuple[object, bool, frozenset[str]]] = {}
+        self._some: dict[tuple[str, Scope], StopButton] = {}
+        self._seen: dict[tuple[str, Scope], tuple[object, bool, frozenset[str]]] = {}
         self._pressed_at: float | None = None
         self._by = ""
 
@@ -49,28 +51,44 @@ class FleetStop:
             button.press()
         self._pressed_at, self._by = time.time(), who
 
+    def press_one(self, network: str, robot: str) -> None:
+        """Stop and lock one robot; returns at once. Every robot where it is none."""
+        feed = next((each for each in self._feeds if each.network == network), None)
+        scope = Scope.named([robot])
+        if feed is None or scope.everything:
+            self.press(robot)
+            return
+        button = self._some.get((network, scope))
+        if button is None:
+            button = StopButton(feed.controller, lambda: scope.only, REASON, scope)
+            self._some = {**self._some, (network, scope): button}
+        button.press()
+        self._pressed_at, self._by = time.time(), robot
+
     def close(self) -> None:
         """Give up a stop that waits for the link."""
-        for button in self._buttons.values():
+        for button in (*self._buttons.values(), *self._some.values()):
             button.close()
 
     @property
     def running(self) -> bool:
         """True while a stop waits for answers."""
-        return any(button.running for button in self._buttons.values())
+        return any(button.running for button in (*self._buttons.values(), *self._some.values()))
 
     def refresh(self) -> None:
         """Put the answers that came since into the model; called repeatedly."""
-        for network, button in self._buttons.items():
+        everything = {(network, EVERY_ROBOT): button for network, button in self._buttons.items()}
+        for (network, scope), button in {**everything, **self._some}.items():
             button.review()
             running, progress, report = button.running, button.progress, button.report
-            expected = frozenset(self._model.expected(network))
             outcome = button.outcome
             latest = report if report is not None and not running else progress
+            some = scope.only if latest is None or not latest.widened else ()
+            expected = frozenset(some or self._model.expected(network))
             seen = (latest, running, expected)
-            if latest is None or self._seen.get(network) == seen:
+            if latest is None or self._seen.get((network, scope)) == seen:
                 continue
-            self._seen[network] = seen
+            self._seen[network, scope] = seen
             measured = outcome if latest is report else None
             for name, verdict in self._verdicts(latest, expected, measured).items():
                 self._model.verdict(network, name, verdict)

@@ -16,15 +16,18 @@ from strands_robots.safety.estop_listener import notification
 from strands_robots.safety.roster import Roster
 from strands_robots.safety.roster_report import STOP_ROSTER
 from strands_robots.safety.standing_roster import StandingRoster, controllers_identity
+from strands_robots.safety.stop_roster import robots_known_at
 
 
 def safety_controller(controller_id: str, link: LinkConfig | None = None, **options: Any) -> SafetyController:
     """Return a :class:`SafetyController` on ``link``, else on the environment's.
 
-    Further arguments are those of :class:`SafetyController`. The robots enrolled at this machine have to sign.
+    Further arguments are those of :class:`SafetyController`. The robots enrolled at this machine have to sign, and its
+    roster says whether a stop of some robots means one that is known.
     """
     link = link or usual_link()
     options.setdefault("enrolled", lambda: enrolled_robots(link))
+    options.setdefault("remembers", robots_known_at(lambda: network_of(link)))
     options.setdefault("network", network_of(link))
     return SafetyController(controller_id, lambda: stop_link(link), **options)
 

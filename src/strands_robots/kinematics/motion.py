@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from strands_robots.kinematics.arm import Action, Arm, ArmState
-from strands_robots.kinematics.chain import Floats
+from strands_robots.kinematics.chain import Floats, TipPose
 from strands_robots.policies.base import Ranges, numbers
 from strands_robots.utils import shown
 
@@ -26,6 +26,9 @@ STILL_STEPS = 5
 
 NEAR_MM = 15.0
 """A motion that ends further from its goal has failed."""
+
+NEAR_RAD = 0.1
+"""A joint that ends further from where it was told to go has failed, in radians; of a slide :data:`NEAR_MM`."""
 
 FRESH = 0.9
 """Share of a control step by which the body's own time must have advanced between two looks."""
@@ -51,6 +54,8 @@ class Motion:
         verb: what was asked for.
         asked: the caller's goal, as it is answered.
         goal: where the tip shall be in the end (m), None for a motion of the gripper alone.
+        end_joints: where the joints shall be in the end (rad); empty for a motion of the gripper alone.
+        wanted: where joints shall be in the end, by name (rad or m).
         told: the last opening that the gripper is told, None for none.
         grasps: something shall be between the jaws in the end.
         clock: the body's own time in seconds; a simulation's stands still with it.
@@ -64,6 +69,8 @@ class Motion:
     segments: Sequence[Segment]
     hz: float
     goal: Floats | None = None
+    end_joints: Floats = field(default_factory=lambda: np.zeros(0))
+    wanted: Mapping[str, float] = field(default_factory=dict)
     told: float | None = None
     grasps: bool = False
     clock: Callable[[], float] = time.monotonic
@@ -94,6 +101,11 @@ class Motion:
         return frames / self.hz + SETTLE_S * sum(segment.settles for segment in self.segments) + MARGIN_S
 
     @property
+    def end(self) -> TipPose:
+        """Return the pose of the tip in the end."""
+        return self.arm.chain.forward(self.end_joints)
+
+    @property
     def finished(self) -> bool:
         """True once every setpoint was played."""
         return not self._left and not self._frames
@@ -102,8 +114,22 @@ class Motion:
         """Return why a motion that was played did not do what was asked; empty if it did."""
         if self.grasps and not holding:
             return "the jaws closed on nothing"
+        stopped_short = self._stopped_short()
+        if stopped_short:
+            return stopped_short
         if error_mm is not None and error_mm > NEAR_MM:
             return f"the tip is {error_mm:.0f} mm from where it was told to go"
+        return ""
+
+    def _stopped_short(self) -> str:
+        """Name the first joint that is far from where it was told to go; empty for none."""
+        joints = self.arm.chain.joints if self.state is not None else ()
+        for joint, at in zip(joints, () if self.state is None else self.state.joints, strict=True):
+            off = abs(self.wanted.get(joint.name, at) - at)
+            if joint.turns and off > NEAR_RAD:
+                return f"{joint.name} is {np.degrees(off):.0f} degrees from where it was told to go"
+            if not joint.turns and 1000 * off > NEAR_MM:
+                return f"{joint.name} is {1000 * off:.0f} mm from where it was told to go"
         return ""
 
     def reset(self, instruction: str, ranges: Ranges) -> None:

@@ -260,7 +260,7 @@ class CommandReceiver:
             audit(event, request.sender_id, action=verb.name, turn_id=request.turn_id)
 
     def _lock_first(self, request: wire.Request, sample: Sample) -> None:
-        """Lock where the stop holds the envelope of an emergency stop; its answer says so."""
+        """Lock where a stop holds the envelope of an emergency stop, and answer so."""
         estop = request.command.get(ESTOP)
         if estop is None:
             return

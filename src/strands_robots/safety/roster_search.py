@@ -10,10 +10,14 @@ from strands_robots.safety.answers import Answer
 from strands_robots.safety.controller import Progress
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.roster_report import RosterReport
+from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stop_roster import StopRoster
 
 logger = stop_logger(__name__)
+
+
+LookUp = Callable[[], Mapping[str, tuple[bool, str | None]]]
 
 
 class Expecting(Protocol):
@@ -30,7 +34,9 @@ class RosterSearch:
         controller: that sends the stop.
         estop_id: of the stop.
         network: whose roster it is.
-        look_up: finds devices and whether each has a stop, on a thread of its own; the stop goes on until then.
+        look_up: finds devices, whether each has a stop, and its cell or None, on a thread of its own; the stop goes on
+            until then.
+        scope: the robots that the stop is for.
     """
 
     def __init__(
@@ -38,9 +44,10 @@ class RosterSearch:
         controller: Expecting,
         estop_id: str,
         network: NetworkKey,
-        look_up: Callable[[], Mapping[str, bool]] | None = None,
+        look_up: LookUp | None = None,
+        scope: Scope = EVERY_ROBOT,
     ) -> None:
-        self.roster, self.begun = StopRoster(network), False
+        self.roster, self.begun = StopRoster(network, scope=scope), False
         self._controller, self._id, self._look_up = controller, estop_id, look_up
         self._answered: Mapping[str, Answer] = {}
         self._lock = threading.Lock()
@@ -49,6 +56,9 @@ class RosterSearch:
     def begin(self, progress: Progress) -> None:
         """Take the answers so far; start the search at the first call."""
         self._answered = progress.answered
+        if progress.widened and not self.roster.scope.everything:
+            self.roster.widen()
+            self._expect(0)
         if not self.begun:
             self.begun = True
             threading.Thread(target=self._read, name="stop roster", daemon=True).start()
@@ -64,13 +74,15 @@ class RosterSearch:
         self.roster.read()
         self._expect(1)
 
-    def _find(self, look_up: Callable[[], Mapping[str, bool]]) -> None:
+    def _find(self, look_up: LookUp) -> None:
         try:
             found = look_up()
         except Exception as exc:  # noqa: BLE001 - the caller looks at it; the stop goes on to its deadline
             logger.warning("The search for robots failed: %s", exc)
             return
-        self.roster.find(found)
+        self.roster.find(
+            {name: stops for name, (stops, _) in found.items()}, {name: cell for name, (_, cell) in found.items()}
+        )
         self._expect(1)
 
     def _expect(self, done: int) -> None:

@@ -18,6 +18,7 @@ from strands_robots.safety.identity import SigningIdentity
 from strands_robots.safety.orders import StopRules, params_of, stated_epoch
 from strands_robots.safety.roster import Roster, RosterRow
 from strands_robots.safety.roster_report import report_fields
+from strands_robots.safety.scope import EVERY_ROBOT, SCOPE, Scope
 from strands_robots.safety.sightings import Known
 from strands_robots.safety.statements import Purpose, signed
 from strands_robots.safety.stop_log import stop_logger
@@ -60,6 +61,7 @@ class _Followed:
 
     estop_id: str
     due: list[float]
+    scope: Scope = EVERY_ROBOT
     last: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -99,7 +101,7 @@ class StandingRoster:
         self._answers: dict[str, tuple[bytes, ...]] = {}
         self._bytes = 0
         self._followed: dict[str, _Followed] = {}
-        self._done: dict[str, None] = {}
+        self._done: dict[tuple[str, Scope], None] = {}
         self._wake, self._closed = threading.Event(), False
         self._rules = StopRules(allow=())
         self._thread = threading.Thread(target=self._run, name="standing roster", daemon=True)
@@ -154,17 +156,20 @@ class StandingRoster:
                 continue
             estop_id = stated_epoch(source, params)
             last = self._followed.get(source)
-            if not estop_id or estop_id in self._done or (last is not None and last.estop_id == estop_id):
+            # A stop of some robots may be widened to one of all, under its id.
+            scope = self._rules.scope(source, params) if SCOPE in params else EVERY_ROBOT
+            mark = (estop_id, scope)
+            if not estop_id or mark in self._done or (last is not None and (last.estop_id, last.scope) == mark):
                 continue
             if last is None and len(self._followed) >= SOURCES_MAX:
                 continue
             if self._rules.signature_refusal(source, params, Purpose.EMERGENCY_STOP) is None:
-                self._note_done(estop_id)
+                self._note_done(mark)
                 spread = random.random() * SPREAD_S
-                self._followed[source] = _Followed(estop_id, [now + at + spread for at in REPORT_AT_S])
+                self._followed[source] = _Followed(estop_id, [now + at + spread for at in REPORT_AT_S], scope)
 
-    def _note_done(self, estop_id: str) -> None:
-        self._done[estop_id] = None
+    def _note_done(self, mark: tuple[str, Scope]) -> None:
+        self._done[mark] = None
         while len(self._done) > 4 * SOURCES_MAX:
             del self._done[next(iter(self._done))]
 
@@ -178,7 +183,7 @@ class StandingRoster:
             followed = self._followed[source]
             while followed.due and followed.due[0] <= now:
                 followed.due.pop(0)
-            fields = report_fields(followed.estop_id, self._missing(followed.estop_id, roster, keys))
+            fields = report_fields(followed.estop_id, self._missing(followed, roster, keys))
             # A controller that missed robots says when it misses none any more.
             if fields != followed.last and (fields["missing"] or followed.last):
                 followed.last = fields
@@ -188,17 +193,19 @@ class StandingRoster:
         if not self._followed:
             self._answers, self._bytes = {}, 0
 
-    def _missing(self, estop_id: str, roster: Roster, keys: Mapping[str, bytes]) -> list[RosterRow]:
+    def _missing(self, followed: _Followed, roster: Roster, keys: Mapping[str, bytes]) -> list[RosterRow]:
         rows = {row.name: row for row in roster.rows if row.stoppable is not False or counts(roster, row)}
         marked = {row.name for row in roster.exempt}
         rows |= {name: RosterRow(name, Known.HEARD) for name in self._also() if name not in rows and name not in marked}
+        scope = followed.scope
+        rows = {name: row for name, row in rows.items() if scope.covers(name, {row.cell} - {""})}
         if self._unanswered is not None:
-            return [rows[name] for name in self._unanswered(estop_id, rows)]
+            return [rows[name] for name in self._unanswered(followed.estop_id, rows)]
         graded = Answers(keys, required=False, pressed_at=0.0)
         for name in rows:
             for payload in self._answers.get(name, ()):
                 params = params_of(payload)
-                if params.get("estop_id") == estop_id:
+                if params.get("estop_id") == followed.estop_id:
                     graded.take(name, Received(params, 0.0, 0.0))
         return [rows[name] for name in graded.unsettled(rows)]
 

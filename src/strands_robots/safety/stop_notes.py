@@ -7,13 +7,16 @@ from collections.abc import Sequence
 from strands_robots.safety.silence import UNTOLD
 from strands_robots.safety.stop_roster import StopOutcome
 
+STOPS_ANYWAY = "Bare devices and robots of earlier releases stop all the same."
 FEW = 5
 """Names of a group that are printed."""
 
 
 def stop_notes(outcome: StopOutcome) -> list[str]:
     """Return sentences on problems, the roster's limit, groups, other networks."""
-    notes = [f"{each[:1].upper()}{each[1:].rstrip('.')}." for each in outcome.problems]
+    scoped = not (outcome.report.scope.everything or outcome.report.widened)
+    notes = [f"This stop was for {outcome.report.scope}. {STOPS_ANYWAY}"] if scoped else []
+    notes += [f"{each[:1].upper()}{each[1:].rstrip('.')}." for each in outcome.problems]
     notes += [outcome.worth] if outcome.worth else []
     notes += [each for each in (_others(outcome), _unproven(outcome), _no_stop(outcome), _exempt(outcome)) if each]
     if outcome.roster.elsewhere:

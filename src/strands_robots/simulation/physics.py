@@ -238,7 +238,7 @@ class Physics:
 
 
 def _written(lock: threading.Lock, write: Callable[[], T], permit: Permit | None) -> T:
-    """Run a write under the command lock; one with a permit waits for the end of a hold first."""
+    """Run a write under the command lock, once no hold is left for its permit."""
     if permit is not None:
         return permit.write(lock, write)
     with lock:

@@ -9,7 +9,7 @@ import importlib.util
 import math
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
@@ -21,10 +21,11 @@ from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety.orders import new_epoch
 from strands_robots.safety.peer_answers import enrolled_peers, stop_distrust
 from strands_robots.safety.roster_search import RosterSearch
+from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.safety.silence import Sending
 from strands_robots.safety.statements import ALARM
 from strands_robots.safety.stop_notes import stop_notes
-from strands_robots.safety.stop_roster import StopRoster
+from strands_robots.safety.stop_roster import StopRoster, robots_known_at
 from strands_robots.safety.stopping import explain, grade
 from strands_robots.tools.mesh_roster import MeshReports, mesh_network
 from strands_robots.tools.roster_verdict import combined_verdict, measured, roster_verdict
@@ -138,16 +139,19 @@ class NativeMesh:
 
         return _on_mesh(stopped, stopped=None)
 
-    def emergency_stop(self, reason: str, signing_key: Any = None) -> Envelope:
+    def emergency_stop(self, reason: str, signing_key: Any = None, scope: Scope = EVERY_ROBOT) -> Envelope:
         """Send the mesh's emergency stop, again while a peer has not confirmed it.
 
         A peer that was seen and did not answer is named. Every repetition is the same stop, ``estop_id``.
+
+        Args:
+            scope: the robots that it is for. Where none of them is there, every robot is stopped.
         """
         estop_id = new_epoch()
 
         def stopped(mesh: Mesh) -> Envelope:
             reports = MeshReports(mesh)
-            roster = StopRoster(mesh_network())
+            roster = StopRoster(mesh_network(), scope=scope)
             reports.inbox.open(estop_id, roster.take)
             listening: list[threading.Thread] = []
 
@@ -156,15 +160,20 @@ class NativeMesh:
                     listening.append(threading.Thread(target=reports.listen, name="missed rosters", daemon=True))
                     listening[0].start()
 
+            def send() -> list[dict[str, Any]]:
+                some: dict[str, Any] = {}
+                if not roster.scope.everything:
+                    known = robots_known_at(mesh_network)
+                    some = {"scope": roster.scope, "remembers": known, "on_widened": roster.widen}
+                return mesh.emergency_stop(signing_key, estop_id=estop_id, on_answers=left, **some)
+
             try:
-                answers = _stop_all(
-                    mesh, lambda: mesh.emergency_stop(signing_key, estop_id=estop_id, on_answers=left), roster
-                )
+                answers = _stop_all(mesh, send, roster)
             finally:
                 reports.close()
             outcome = measured(answers, roster, Sending(signed=signing_key is not None), estop_id)
             outcome.record(mesh.peer_id)
-            return {**roster_verdict(answers, outcome), "estop_id": estop_id}
+            return {**roster_verdict(answers, outcome), "estop_id": estop_id, **scope.field()}
 
         return _on_mesh(stopped, stopped=None)
 
@@ -198,10 +207,10 @@ def _stop_all(mesh: Mesh, stop: Callable[[], list[dict[str, Any]]], roster: Stop
         for reply in replies:
             name = reply["responder_id"]
             if name != mesh.peer_id:
-                answers[name] = _stop_answer(name, reply, keys)
+                answers[name] = _stop_answer(name, reply, keys, locks=roster.scope.only)
 
     def unconfirmed() -> bool:
-        seen.update(_in_reach(mesh))
+        seen.update(name for name in _in_reach(mesh) if roster.scope.covers(name, _cells(mesh, name)))
         return any(not answers.get(name, {}).get("stopped") for name in seen)
 
     send()
@@ -209,19 +218,30 @@ def _stop_all(mesh: Mesh, stop: Callable[[], list[dict[str, Any]]], roster: Stop
     discover(mesh, lambda: send() if unconfirmed() and time.monotonic() - sent >= AGAIN_S else None)
     if unconfirmed():
         send()
-    roster.find(dict.fromkeys(seen, True))
+    roster.find(dict.fromkeys(seen, True), {name: next(iter(_cells(mesh, name)), "") for name in seen})
     silent: dict[str, Envelope] = {name: error(f"{name} did not answer.", stopped=None) for name in seen}
     return silent | answers
 
 
-def _stop_answer(target: str, reply: dict[str, Any], keys: Mapping[str, bytes] | None) -> Envelope:
+def _cells(mesh: Mesh, peer: str) -> frozenset[str]:
+    cell = (mesh.peers_by_id.get(peer) or {}).get("cell")
+    return frozenset({cell} if isinstance(cell, str) and cell else ())
+
+
+def _stop_answer(
+    target: str, reply: dict[str, Any], keys: Mapping[str, bytes] | None, *, locks: Collection[str] = ()
+) -> Envelope:
+    """Return a reply as an envelope; one of ``locks`` has to say that it is locked."""
     if reply.get("status") in ("timeout", "error"):
         return error(f"{target} did not answer.", stopped=None)
     result = reply.get("result")
     if grade(result).stopped:
         why = stop_distrust(reply, keys)
         if not why:
-            return success("stopped", stopped=True)
+            free = target in locks and not (isinstance(result, Mapping) and result.get("locked") is True)
+            return success(
+                "stopped, and NOT LOCKED: its release knows no lock by command" if free else "stopped", stopped=True
+            )
         return error(why, stopped=False if why.startswith(ALARM) else None)
     return error(explain(result) if result is not None else str(reply.get("error", "")), stopped=False)
 
@@ -321,12 +341,15 @@ class DeviceConnect:
 
         return _on_fleet(stopped, stopped=None)
 
-    def emergency_stop(self, reason: str) -> Envelope:
+    def emergency_stop(self, reason: str, scope: Scope = EVERY_ROBOT) -> Envelope:
         """Send an emergency stop on a connection of its own; answers by name.
 
         A device that is in reach and did not answer it gets a plain ``stop`` as well.
+
+        Args:
+            scope: the robots that it is for. Where none of them is there, every robot is stopped.
         """
-        return _on_fleet(lambda fleet: stop_and_lock(fleet, reason), stopped=None)
+        return _on_fleet(lambda fleet: stop_and_lock(fleet, reason, scope), stopped=None)
 
 
 def stop_everything(fleet: FleetClient) -> Envelope:
@@ -340,10 +363,10 @@ def stop_everything(fleet: FleetClient) -> Envelope:
     return roster_verdict(answers, outcome, fleet.stale)
 
 
-def stop_and_lock(fleet: FleetClient, reason: str) -> Envelope:
+def stop_and_lock(fleet: FleetClient, reason: str, scope: Scope = EVERY_ROBOT) -> Envelope:
     """Send an emergency stop under the client's name; answers by name.
 
-    A device that is in reach and did not answer it gets a plain ``stop`` as well. The roster must answer.
+    A device of its scope that is in reach and did not answer it gets a plain ``stop`` as well. The roster must answer.
     """
     from strands_robots.device_connect.enrollment import network_of  # noqa: PLC0415 - the network is loaded when it is used
     from strands_robots.device_connect.safety_controller import envelope, safety_controller  # noqa: PLC0415 - as above
@@ -353,8 +376,8 @@ def stop_and_lock(fleet: FleetClient, reason: str) -> Envelope:
     with ThreadPoolExecutor(1) as pool:
         try:
             seen = pool.submit(fleet.peers)
-            found = lambda: {peer.id: peer.stop_verb is not None for peer in seen.result()}  # noqa: E731
-            search = RosterSearch(controller, estop_id, network_of(fleet.link), found)
+            found = lambda: {peer.id: (peer.stop_verb is not None, peer.cell) for peer in seen.result()}  # noqa: E731
+            search = RosterSearch(controller, estop_id, network_of(fleet.link), found, scope)
             report = controller.stop(
                 (),
                 reason,
@@ -363,12 +386,14 @@ def stop_and_lock(fleet: FleetClient, reason: str) -> Envelope:
                 more=True,
                 on_progress=search.begin,
                 on_report=search.take,
+                scope=scope,
             )
             sending = replace(controller.sending, left=report.link)
         finally:
             controller.close()
     failed = {**report.not_stopped, **report.refused}
-    peers = [peer.id for peer in seen.result() if peer.stop_verb]
+    inside = EVERY_ROBOT if report.widened else scope
+    peers = [peer.id for peer in seen.result() if peer.stop_verb and inside.covers(peer.id, {peer.cell or ""} - {""})]
     rest = [name for name in peers if name not in failed and name not in report.stopped]
     answers: dict[str, Envelope] = {name: success("locked and still", stopped=True) for name in report.stopped}
     answers |= {name: error(answer.why, stopped=False) for name, answer in failed.items()}

@@ -19,6 +19,7 @@ from fixtures.waiting import eventually, free_port
 
 from strands_robots.device_connect.backends import LinkConfig, loopback_config, open_client
 from strands_robots.safety.estop_listener import notification
+from strands_robots.safety.sightings import Sightings
 
 pytestmark = pytest.mark.timeout(600)
 
@@ -32,6 +33,11 @@ class Site(Machine):
 
     def estop(self, *arguments: str) -> tuple[int, dict[str, Any]]:
         return self.json("estop", "--reason", "a test", *arguments, *self.flags)
+
+    def remembers(self, *names: str) -> None:
+        """Wait until this machine remembers these robots: a server writes them after its start."""
+        store = Sightings(Path(self.environment["STRANDS_STATE_DIR"]))
+        eventually(lambda: {*names} <= {each.name for each in store.read()[0]}, what=f"the memory of {names}")
 
     def elsewhere(self, state: Path) -> Site:
         """Another machine on the same network: it remembers nothing of this one."""
@@ -65,6 +71,7 @@ def frozen(process: Any) -> Iterator[None]:
 
 def test_frozen_process_is_named_with_its_reason(site: Site) -> None:
     with site.serving("arm-1", *site.flags), site.serving("arm-2", *site.flags) as (second, _):
+        site.remembers("arm-1", "arm-2")
         with frozen(second):
             code, said = site.estop()
         assert code == 3, said
@@ -162,6 +169,7 @@ def test_standing_controller_names_a_robot_that_this_machine_never_heard(site: S
         line = [*COMMAND, "safety-controller", "--id", "safety-2", *site.flags]
         with on_a_terminal(line, far.environment) as terminal:
             eventually(lambda: "arm-2" in terminal.drawn, what="the robot on the controller's screen")
+            far.remembers("arm-2")
             with frozen(second):
                 code, said = site.estop()
             assert (code, said["silent"]) == (3, ["arm-2"]), said

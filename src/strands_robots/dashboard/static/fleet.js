@@ -86,7 +86,7 @@ export function lockText(row) {
   const first = row.lockouts[0];
   if (!first) return S.locked;
   const at = typeof first.since === "number" ? S.when(new Date(first.since * 1000)) : "";
-  const why = first.reason ? `: ${first.reason}` : "";
+  const why = `${first.scope ? ` (${first.scope})` : ""}${first.reason ? `: ${first.reason}` : ""}`;
   return `${S.lockedBy(first.source, at)}${why}${row.lockouts.length > 1 ? ` (×${row.lockouts.length})` : ""}`;
 }
 

@@ -1,4 +1,4 @@
-// STOP. It means one thing, always: stop every robot. Nothing on this page changes what it does.
+// STOP. The big button and the space bar mean one thing, always: stop every robot. Nothing on this page changes that.
 import { el, setText } from "./dom.js";
 import { byName, verdictText, verdictTone } from "./fleet.js";
 import { S } from "./strings.js";
@@ -31,9 +31,10 @@ export class Stop {
     setInterval(() => this.look(), 100);
   }
 
-  press(robot) {
+  // only: the key of the one robot that stops; without it all do.
+  press(robot, only) {
     const id = ++this.id;
-    if (this.channel.send({ type: "stop", robot, id })) {
+    if (this.channel.send(only ? { type: "stop", robot, only, id } : { type: "stop", robot, id })) {
       this.notSent = "";
       this.unconfirmed.set(id, performance.now());
     } else {
