@@ -41,7 +41,7 @@ STARTED, BACK = "the process started", "its link is back"
 UNITE_S = 0.3
 """Seconds from the question for which motions hold, while the answers come in."""
 
-LISTEN_S = 1.0
+LISTEN_S = 1.9
 """Seconds from the question in which an answer counts; a busy machine answers late."""
 
 ASK_EVERY_S = 1.0
