@@ -394,8 +394,9 @@ class Discovery:
         if self._messaging.link.identified:
             # Access rules guard the topic of one device, so a beat proves the life of that one only.
             named = [each for each in named if each == own]
+        remembered = sightings()
         for name in (own, *named):
-            sightings().note(self._network, name)
+            remembered.note(self._network, name)
             # Taken out and put in again, so that the longest silent ones are dropped first.
             self._beats.pop(name, None)
             self._beats[name] = now

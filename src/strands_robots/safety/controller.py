@@ -183,8 +183,8 @@ class SafetyController:
         enrolled: Callable[[], Mapping[str, bytes]] = dict,
         require_signed: bool = False,
         stands: bool = False,
-        remembers: Remembers = none_known,
         network: NetworkKey | None = None,
+        remembers: Remembers = none_known,
     ) -> None:
         self.controller_id, self.network = device_id("controller_id", controller_id), network
         self._key = signing_key
