@@ -17,7 +17,8 @@ from strands_robots.mesh.session import clear_peers
 from strands_robots.mesh.transport import zenoh_config
 from strands_robots.mesh.transport.zenoh_config import Posture
 from strands_robots.tools import networks, robot_mesh
-from strands_robots.tools.networks import DeviceConnect, NativeMesh, combined_verdict
+from strands_robots.tools.networks import DeviceConnect, NativeMesh
+from strands_robots.tools.roster_verdict import combined_verdict
 
 
 class FakeNetwork:

@@ -110,6 +110,12 @@ class Peer:
         names = {str(each.get("name", "")) for each in self.functions}
         return next((verb for verb in ("stop", "stopMotion") if verb in names), None)
 
+    @property
+    def cell(self) -> str | None:
+        """Its cell, "" for none; None where it states neither, and reads no scope."""
+        cell = self.status.get("cell")
+        return cell if isinstance(cell, str) else None
+
     @classmethod
     def of(cls, description: Mapping[str, Any]) -> Peer:
         """Read a presence message or a registration; a field that it lacks is empty."""
@@ -388,8 +394,9 @@ class Discovery:
         if self._messaging.link.identified:
             # Access rules guard the topic of one device, so a beat proves the life of that one only.
             named = [each for each in named if each == own]
+        remembered = sightings()
         for name in (own, *named):
-            sightings().note(self._network, name)
+            remembered.note(self._network, name)
             # Taken out and put in again, so that the longest silent ones are dropped first.
             self._beats.pop(name, None)
             self._beats[name] = now

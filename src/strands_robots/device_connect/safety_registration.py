@@ -135,7 +135,6 @@ class SafetyRegistration:
         """Seconds since this robot was last served from this machine; None where over ten minutes, or never."""
         self.entry: Registered = plane().register(name, robot, key=key, wire_id=device_id, cell=cell)
         self._held: Registered | None = self.entry
-        self._network = None if link is None else network_of(link)
         try:
             self._listener: ListenerRegistration = estop_listener().register(
                 name,
@@ -144,7 +143,7 @@ class SafetyRegistration:
                 lambda: self.identity,
                 opened=False,
                 network=self._network,
-                was_here=self._network is not None and sightings().was_here(self._network, device_id) is not None,
+                was_here=self.was_here_s is not None,
             )
         except BaseException:
             self.entry.close()

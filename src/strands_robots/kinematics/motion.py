@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from strands_robots.kinematics.arm import Action, Arm, ArmState
-from strands_robots.kinematics.chain import Floats
+from strands_robots.kinematics.chain import Floats, TipPose
 from strands_robots.policies.base import Ranges, numbers
 from strands_robots.utils import shown
 
@@ -54,6 +54,7 @@ class Motion:
         verb: what was asked for.
         asked: the caller's goal, as it is answered.
         goal: where the tip shall be in the end (m), None for a motion of the gripper alone.
+        end_joints: where the joints shall be in the end (rad); empty for a motion of the gripper alone.
         wanted: where joints shall be in the end, by name (rad or m).
         told: the last opening that the gripper is told, None for none.
         grasps: something shall be between the jaws in the end.
@@ -68,6 +69,7 @@ class Motion:
     segments: Sequence[Segment]
     hz: float
     goal: Floats | None = None
+    end_joints: Floats = field(default_factory=lambda: np.zeros(0))
     wanted: Mapping[str, float] = field(default_factory=dict)
     told: float | None = None
     grasps: bool = False
@@ -97,6 +99,11 @@ class Motion:
         """Longest time that the motion may take, in seconds."""
         frames = sum(len(segment.frames) for segment in self.segments)
         return frames / self.hz + SETTLE_S * sum(segment.settles for segment in self.segments) + MARGIN_S
+
+    @property
+    def end(self) -> TipPose:
+        """Return the pose of the tip in the end."""
+        return self.arm.chain.forward(self.end_joints)
 
     @property
     def finished(self) -> bool:

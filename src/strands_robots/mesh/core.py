@@ -23,6 +23,7 @@ from strands_robots.mesh.context import Context
 from strands_robots.mesh.executor import BoundedExecutor
 from strands_robots.mesh.hearing import Hearing
 from strands_robots.mesh.input_receiver import InputReceiver
+from strands_robots.mesh.missed import MeshMissedStops
 from strands_robots.mesh.older_peers import Pacer
 from strands_robots.mesh.presence import DESCRIBE_S, PresencePublisher
 from strands_robots.mesh.registry import PeerRegistry
@@ -131,6 +132,7 @@ class Mesh(SensorLoopsMixin):
         context.console, context.consoles = ConsoleSigner(parts.clock), ConsoleTrust(parts.clock)
         self._hardware = hardware
         self._handles: list[Declaration] = []
+        self._missed: MeshMissedStops | None = None
         self._inputs: dict[str, dict[str, Any]] = {}
         self._scheduler = Scheduler(peer)
         self._sensors = SensorPublisher(context, self._scheduler)
@@ -263,6 +265,7 @@ class Mesh(SensorLoopsMixin):
             (topics.check_in_answer("*"), self._safety.on_check_in_answer),
         ):
             self._handles.append(transport.declare_subscriber(key, receive))
+        self._missed = missed = MeshMissedStops.joined_by(context, self._adapter)
         if self.robot is not None:
             if self._adapter.needs_check_in:
                 controllers = topics.check_in("*")
@@ -279,6 +282,7 @@ class Mesh(SensorLoopsMixin):
             every("children", rates["presence"].rate_hz, self.children.refresh)
             every("children's presence", rates["presence"].rate_hz, self.children.announce, quick=True)
         every("tokens", TOKENS_HZ, self._presence.look, quick=True)
+        every("missed stops", TOKENS_HZ, lambda: missed.look(context), quick=True)
         every("hearing", HEARING_HZ, self._hearing.look, quick=True)
         # A stop that is published again may wait for its turn, and behind no robot.
         every("late peers", LATE_HZ, self._safety.late.look, queue="late peers")
@@ -310,6 +314,8 @@ class Mesh(SensorLoopsMixin):
         if dropped:
             logger.info("%s left the mesh and dropped %d subscriptions.", self.peer_id, dropped)
         self._presence.stop()
+        if self._missed is not None:
+            self._missed.left_by(self._context, self._adapter)
         if self.children is not None:
             self.children.close()
         for handle in self._handles:

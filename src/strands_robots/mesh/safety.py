@@ -8,7 +8,6 @@ peers that missed it.
 from __future__ import annotations
 
 import contextlib
-import json
 import logging
 import secrets
 import time
@@ -19,10 +18,11 @@ from typing import Any
 
 from strands_robots.audit import audit_head, own_log_id
 from strands_robots.contract import Robot
-from strands_robots.mesh import topics, wire
+from strands_robots.mesh import session, topics, wire
 from strands_robots.mesh.context import Context
 from strands_robots.mesh.estop_retry import EstopRetry
 from strands_robots.mesh.late_peers import KNOWN_S, LatePeers
+from strands_robots.mesh.missed import epoch_of
 from strands_robots.mesh.older_peers import SAFETY, SAFETY_S, Closings
 from strands_robots.mesh.rpc import Requester, stop_outcome
 from strands_robots.mesh.safety_adapter import SafetyAdapter
@@ -31,7 +31,7 @@ from strands_robots.mesh.throttle import RecentKeys
 from strands_robots.mesh.transport import Sample, TransportError
 from strands_robots.safety import ed25519
 from strands_robots.safety.head_witness import CheckInAnswers, HeadWitness
-from strands_robots.safety.orders import StopOrder, derived_epoch, new_epoch, signed_stop
+from strands_robots.safety.orders import StopOrder, new_epoch, signed_stop
 from strands_robots.safety.peer_answers import (
     enrolled_peers,
     record_heads,
@@ -117,6 +117,7 @@ class FleetSafety:
         self._recent: deque[tuple[str, Scope]] = deque(maxlen=RECENT_MAX)
         self._admitted: deque[str] = deque(maxlen=RECENT_MAX)
         self._resumed: deque[str] = deque(maxlen=RECENT_MAX)
+        self.network = session.network().text
         self._latest = ""
         self._press = ("", 0.0)
 
@@ -146,6 +147,8 @@ class FleetSafety:
         order = StopOrder(
             epoch, context.peer_id, "emergency stop", "mesh", issued=context.clock(), pressed=pressed, scope=scope
         )
+        if not scope.only:
+            order = self._with_original(order, signing_key)
         if not scope.everything:
             return self._stop_some(order, signing_key, on_answers, remembers, on_widened)
         self._latest = order.epoch
@@ -287,6 +290,11 @@ class FleetSafety:
             self._put_estop(order, counts, signing_key)
             context.pacer.note(SAFETY)
 
+    def _with_original(self, order: StopOrder, signing_key: Any) -> StopOrder:
+        """Return an order of ours with the message that robots which missed it are told."""
+        payload = wire.encode(self._estop_body(order, {}, signing_key), topics.BY_NAME["estop"].max_bytes)
+        return replace(order, original=payload, network=self.network)
+
     def _put_estop(self, order: StopOrder, counts: dict[str, Any], signing_key: Any) -> None:
         body = self._estop_body(order, counts, signing_key)
         self._publish(topics.estop(), body, f"Emergency stop {order.epoch}", logging.CRITICAL)
@@ -320,7 +328,7 @@ class FleetSafety:
         if why is not None:
             context.audit("estop_rejected", notice.peer_id, reason=why)
             return
-        epoch = notice.estop_id or derived_epoch(notice.peer_id, json.dumps(body["t"]).encode())
+        epoch = epoch_of(notice, body)
         scope = self._adapter.scope(notice.peer_id, body)
         self._latest = epoch if scope.everything else self._latest
         if (epoch, scope) in self._recent:
@@ -331,7 +339,20 @@ class FleetSafety:
             context.audit("remote_estop_redundant", notice.peer_id, estop_id=epoch, reason="resumed since")
             return
         pressed = wire.finite(body.get("pressed_at"))
-        order = StopOrder(epoch, notice.peer_id, "fleet e-stop", "mesh", True, notice.t, received, pressed, scope=scope)
+        order = StopOrder(
+            epoch,
+            notice.peer_id,
+            "fleet e-stop",
+            "mesh",
+            True,
+            notice.t,
+            received,
+            pressed,
+            scope=scope,
+            # A console passes on what it sent, and nothing of others.
+            original=sample.payload if self._robot else None,
+            network=self.network,
+        )
         self._recent.append((epoch, scope))
         # The plane locks and starts the halts at once; nothing on this path waits.
         if self._adapter.begin(order) is None:

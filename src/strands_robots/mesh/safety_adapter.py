@@ -10,7 +10,7 @@ from typing import Any
 from strands_robots.envelope import is_error
 from strands_robots.safety.checkin import CheckInRules
 from strands_robots.safety.gate import MotionGate
-from strands_robots.safety.identity import robot_identity
+from strands_robots.safety.identity import SigningIdentity, robot_identity
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.orders import StopOrder, StopRules
 from strands_robots.safety.peer_answers import LockoutAnnouncer, with_lockout_statement, with_resume_statement
@@ -76,6 +76,25 @@ class SafetyAdapter:
             self._decision.require_keys()
         self.open()
 
+    @property
+    def plane(self) -> SafetyPlane:
+        """The plane that the robot is on."""
+        return self._plane
+
+    @property
+    def rules(self) -> StopRules:
+        """The rules by which an e-stop counts."""
+        return self._decision
+
+    @property
+    def moves(self) -> bool:
+        """True for a peer with a robot."""
+        return not isinstance(self._robot, NoRobot)
+
+    def own_identity(self) -> SigningIdentity | None:
+        """Return what signs for this peer."""
+        return self.identity
+
     def open(self) -> None:
         """Register this peer's robot; twice is once.
 
@@ -91,7 +110,7 @@ class SafetyAdapter:
 
     def facts(self) -> dict[str, Any]:
         """Return ``locked`` and ``epochs``; nothing without a robot."""
-        if isinstance(self._robot, NoRobot):
+        if not self.moves:
             return {}
         epochs = self.epochs()
         return {"locked": bool(epochs), "epochs": list(epochs)}
@@ -106,7 +125,7 @@ class SafetyAdapter:
 
     def serve(self, network: NetworkKey) -> None:
         """Have this machine remember that the robot is served, until :meth:`leave`."""
-        if not isinstance(self._robot, NoRobot):
+        if self.moves:
             self._network, public = network, None if self.identity is None else self.identity.public
             self.was_here_s = sightings().was_here(network, self._peer_id)
             wants = self._decision.required

@@ -19,7 +19,7 @@ from strands_robots.safety.identity import (
     local_name,
 )
 from strands_robots.safety.network_key import NetworkKey
-from strands_robots.safety.orders import MISSED, RobotReport, StopRefused, StopRules, params_of, stated_epoch
+from strands_robots.safety.orders import MISSED, RobotReport, StopOrder, StopRefused, StopRules, params_of, stated_epoch
 from strands_robots.safety.originals import ORIGINAL_MAX_BYTES, STOPS_MAX, Original, Originals
 from strands_robots.safety.plane import SafetyPlane
 from strands_robots.safety.state_files import uptime
@@ -117,7 +117,8 @@ class RobotsPort:
         robots = self._plane.robots
         back = [robots.get(each.robot_id) for each in self._members() if each.was_here]
         # A state directory that was reset since is that of a newcomer.
-        return any(each is not None and each.registered_before for each in back)
+        returned = [each.robot_id for each in back if each is not None and each.returned()]
+        return bool(returned)
 
     def devices(self) -> Sequence[str]:
         return [each.name for each in self._members()]
@@ -146,11 +147,20 @@ class RobotsPort:
         epoch = stated_epoch(source, params)
         if not epoch:
             return False
+        return self.lock(
+            epoch,
+            lambda: self._rules.order(source, params, MISSED, payload, network=self._network, age_s=age_s),
+            answerer,
+        )
+
+    def lock(self, epoch: str, decide: Callable[[], StopOrder | StopRefused], answerer: str) -> bool:
+        """Lock by a missed stop unless every robot knows it; False when it does not count."""
         if all(each.latch.knows(epoch) for each in self._plane.robots.values()):
             return True
-        order = self._rules.order(source, params, MISSED, payload, network=self._network, age_s=age_s)
+        order = decide()
         if isinstance(order, StopRefused):
             return False
+        source, age_s = order.source, order.age_s
         run = self._plane.begin(order, self._on_report)
         for robot_id in run.robot_ids if run is not None else ():
             logger.warning("%s is locked by emergency stop %s, which it had missed.", robot_id, epoch)

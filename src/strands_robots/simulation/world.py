@@ -84,6 +84,8 @@ class Simulation(PicturesMixin, ArmMixin, TeleopMixin):
         ValidationError: an argument outside its domain.
     """
 
+    knows_objects = True
+
     def __init__(
         self,
         tool_name: str = "simulation",
