@@ -88,7 +88,7 @@ class StopOutcome:
         """The limit of that sentence where no robot is enrolled, else ""."""
         if self.roster.enrolled:
             return ""
-        return f"No robot is enrolled here: a robot that was not heard for ten minutes is not missed. {ENROLL}"
+        return f"No robot is enrolled here, so one that was not heard for ten minutes is not missed: {ENROLL}"
 
     def facts(self) -> dict[str, Any]:
         """Return what a script reads besides the report's own fields."""
