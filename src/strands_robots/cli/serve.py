@@ -145,12 +145,11 @@ def serve(
         "STRANDS_ROBOT_COMMAND_ALLOW": command_allow,
         "STRANDS_ALLOW_MOCK": "true" if allow_mock else None,
         "STRANDS_DC_STATE_HZ": None if state_hz is None else str(number("--state-hz", state_hz, low=0.01, high=100)),
+        "STRANDS_CELL": None if cell is None else identifier("--cell", cell),
     }
     for name, value in flags.items():
         if value is not None:
             settings.put(name, value)
-    if cell is not None:
-        settings.put("STRANDS_CELL", identifier("--cell", cell))
     if policies is not None:
         load_profiles(policies.expanduser())
         settings.put("STRANDS_POLICIES", str(policies))
