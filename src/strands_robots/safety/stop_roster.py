@@ -371,6 +371,20 @@ def robots_known_at(network: Callable[[], NetworkKey]) -> Remembers:
     return remembers
 
 
+def unheard(network: NetworkKey, answered: Collection[str]) -> str:
+    """Return the robots of the roster that are not among ``answered``, as text.
+
+    Names that were only heard are left out where robots are enrolled. It reads the disk.
+    """
+    try:
+        roster = Roster.of(network)
+    except Exception as exc:  # noqa: BLE001 - said in place of the names
+        return f"the roster cannot be read: {exc}"
+    names = [row.name for row in roster.rows if counts(roster, row) and row.name not in answered]
+    more = f" and {len(names) - NAMED_MAX} more" if len(names) > NAMED_MAX else ""
+    return f"{', '.join(names[:NAMED_MAX])}{more}"
+
+
 def counts(roster: Roster, row: RosterRow) -> bool:
     """Return True when the exit code depends on this row.
 

@@ -157,7 +157,7 @@ class NativeMesh:
 
             def left(replies: list[dict[str, Any]]) -> None:
                 if not listening:
-                    listening.append(threading.Thread(target=reports.listen, name="missed rosters", daemon=True))
+                    listening.append(threading.Thread(target=reports.begin, name="missed rosters", daemon=True))
                     listening[0].start()
 
             def send() -> list[dict[str, Any]]:
