@@ -440,7 +440,7 @@ class EstopListener:
                 self._open[registration.key].started()
             elif registration in self._registrations:
                 missed = self._open[registration.key] = self._missed_stops(registration)
-                receive = functools.partial(self._receive, missed, _text(registration.network))
+                receive = functools.partial(self.receive, network=_text(registration.network), missed=missed)
                 registration.link.open(EVENTS, receive, lambda up: missed.link_up() if up else None)
 
     def unregister(self, registration: ListenerRegistration) -> None:
@@ -510,8 +510,13 @@ class EstopListener:
         """Act on a stop that a device of this process raises; return at once."""
         self._plane.begin(order, self._answer)
 
-    def receive(self, event: str, source: str, payload: bytes | int, network: str = "") -> None:
+    def receive(
+        self, event: str, source: str, payload: bytes | int, network: str = "", missed: MissedStops | None = None
+    ) -> None:
         """Take an event from a link's thread; returns at once."""
+        if missed is not None and event in (QUESTION, ANSWER):
+            missed.receive(event, source, payload)
+            return
         events = self._queue
         if events is None:
             return
@@ -529,12 +534,6 @@ class EstopListener:
             events.put(event, source, payload, urgent=event == ESTOP, network=network)
         elif self._refusals.due(source):
             events.put(event, source, payload, urgent=False)
-
-    def _receive(self, missed: MissedStops, network: str, event: str, source: str, payload: bytes | int) -> None:
-        if event in (QUESTION, ANSWER):
-            missed.receive(event, source, payload)
-        else:
-            self.receive(event, source, payload, network)
 
     def _missed_stops(self, registration: ListenerRegistration) -> MissedStops:
         key, link = registration.key, registration.link

@@ -110,7 +110,7 @@ class Roster:
                 rows.pop(name, None)
             else:
                 # A robot that this machine serves now is there, whatever was decided about it.
-                rows[name] = replace(known, known=Known.ENROLLED, exemption=None)
+                rows[name] = replace(known, known=Known.ENROLLED, stoppable=True, exemption=None)
         others = {name for name, robot in enrolled.items() if name not in here and robot.exemption is None}
         served = {each.name for each in found if each.alive and not each.network.meets(network)}
         return cls(
@@ -137,10 +137,20 @@ class Roster:
         return tuple(row for row in self.rows if not self.counts(row))
 
     def with_reported(self, rows: Iterable[RosterRow], by: str) -> Roster:
-        """Return the roster with rows that ``by`` reported; one known here stays."""
-        here = {row.name for row in (*self.rows, *self.exempt)}
-        added = tuple(replace(row, reported_by=by) for row in rows if row.name not in here)
-        return replace(self, rows=in_order((*self.rows, *added)))
+        """Return the roster with rows that the controller ``by`` reported.
+
+        A row of this machine stays, and takes the surer of the two grades. Where the controller's signature is not
+        verified the caller passes every row as HEARD.
+        """
+        united = {row.name: row for row in self.rows}
+        exempt = {row.name for row in self.exempt}
+        for row in rows:
+            known = united.get(row.name)
+            if known is None and row.name not in exempt:
+                united[row.name] = replace(row, reported_by=by)
+            elif known is not None and row.known < known.known:
+                united[row.name] = replace(known, known=row.known, stoppable=True, reported_by=by)
+        return replace(self, rows=in_order(united.values()))
 
 
 def _is_at(robot: EnrolledRobot, network: NetworkKey) -> bool:

@@ -208,10 +208,9 @@ class Served:
     signed_only: bool = False
     ended: bool = False
 
-    @property
-    def alive(self) -> bool:
+    def lives(self, now: Moment) -> bool:
         """True while its process lives and serves it."""
-        return not self.ended and self.at.boot == boot() and process_start(self.pid) == self.started != ""
+        return not self.ended and self.at.boot == now.boot and process_start(self.pid) == self.started != ""
 
 
 def process_start(pid: int) -> str:
@@ -311,7 +310,7 @@ class SightingFile:
         gone = [
             (each.network.text, each.name, each.pid, each.started)
             for each in self._served(connection)
-            if each.at.age_s(now) >= RECENT_S and not each.alive
+            if each.at.age_s(now) >= RECENT_S and not each.lives(now)
         ]
         connection.executemany("DELETE FROM served WHERE network = ? AND name = ? AND pid = ? AND started = ?", gone)
         connection.execute(
@@ -433,7 +432,7 @@ def _united(heard: Sequence[tuple[object, ...]], served: Sequence[Served], now: 
     latest: dict[tuple[NetworkKey, str], Served] = {}
     for row in served:
         known = latest.get((row.network, row.name))
-        if known is None or (row.alive, -row.at.age_s(now)) > (known.alive, -known.at.age_s(now)):
+        if known is None or (row.lives(now), -row.at.age_s(now)) > (known.lives(now), -known.at.age_s(now)):
             latest[row.network, row.name] = row
     by_name: dict[str, list[Served]] = {}
     for row in latest.values():
@@ -447,7 +446,7 @@ def _united(heard: Sequence[tuple[object, ...]], served: Sequence[Served], now: 
         if not any(seen.age_s >= row.at.age_s(now) - LEAVING_S for row in ended):
             found[seen.network, seen.name] = seen
     for key, own in latest.items():
-        alive, age = own.alive, own.at.age_s(now)
+        alive, age = own.lives(now), own.at.age_s(now)
         if own.ended or not (alive or age < RECENT_S):
             continue
         seen = found.get(key) or Sighting(own.network, own.name, Known.SERVED, age)

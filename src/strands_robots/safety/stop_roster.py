@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -13,6 +13,7 @@ from strands_robots.safety.controller import StopReport
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.roster import Roster, RosterRow
 from strands_robots.safety.roster_report import RosterReport
+from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope
 from strands_robots.safety.sightings import Known, sightings
 from strands_robots.safety.silence import Sending, reason_of
 from strands_robots.safety.state_files import uptime
@@ -86,13 +87,13 @@ class StopOutcome:
         """The limit of that sentence where no robot is enrolled, else ""."""
         if self.roster.enrolled:
             return ""
-        return f"No robot is enrolled here: a robot that was not heard for ten minutes is not missed. {ENROLL}"
+        return f"No robot is enrolled here, so one that was not heard for ten minutes is not missed: {ENROLL}"
 
     def facts(self) -> dict[str, Any]:
         """Return what a script reads besides the report's own fields."""
         return {
             "roster": {"size": self.size, "still": len(self.report.stopped), "enrolled": self.roster.enrolled},
-            "reasons": dict(self.reasons),
+            "reasons": dict(list(self.reasons.items())[:NAMED_MAX]),
             "retired": [row.name for row in self.roster.exempt if row.exemption and row.exemption.state == "retired"],
             "off": [row.name for row in self.roster.exempt if row.exemption and row.exemption.state == "off"],
             "elsewhere": self.roster.elsewhere,
@@ -121,6 +122,8 @@ class StopOutcome:
                 "denied": self.sending.denied,
                 "problems": list(self.problems),
                 "ok": self.ok,
+                **report.scope.field(),
+                **({"widened": True} if report.widened else {}),
             },
         )
 
@@ -131,14 +134,16 @@ class StopRoster:
     Args:
         network: of the stop.
         named: robots that the caller says must answer, besides the roster.
+        scope: the robots that the stop is for. Those that stop all the same must answer as well.
     """
 
-    def __init__(self, network: NetworkKey, named: Collection[str] = ()) -> None:
+    def __init__(self, network: NetworkKey, named: Collection[str] = (), scope: Scope = EVERY_ROBOT) -> None:
         self._network, self._pressed = network, uptime()
         self._lock, self._is_read = threading.Lock(), threading.Event()
-        self._named = frozenset(named)
+        self._named, self._asked, self.scope = frozenset(named) | scope.only, scope, scope
         self._roster = Roster(network, problems=("the roster was not read in time",))
         self._found: dict[str, bool] = {}
+        self._cells: dict[str, str | None] = {}
         self._trusted: dict[str, RosterReport] = {}
         self._unproven: dict[str, RosterReport] = {}
 
@@ -152,10 +157,20 @@ class StopRoster:
             self._roster = roster
         self._is_read.set()
 
-    def find(self, devices: Mapping[str, bool]) -> None:
-        """Take devices that were found since the press, and whether each has a stop."""
+    def find(self, devices: Mapping[str, bool], cells: Mapping[str, str | None] | None = None) -> None:
+        """Take devices that were found since the press, and whether each has a stop.
+
+        Args:
+            cells: of each; None for one that states none, and reads no scope.
+        """
         with self._lock:
             self._found |= devices
+            self._cells |= cells or {}
+
+    def widen(self) -> None:
+        """Have every robot answer: the stop has become one of all."""
+        with self._lock:
+            self.scope = EVERY_ROBOT
 
     def take(self, report: RosterReport) -> bool:
         """Take a controller's report in place of its last; False where nothing changed."""
@@ -194,12 +209,16 @@ class StopRoster:
             problem: why robots may be missing that were to be found.
         """
         sending = sending or Sending(report.link)
+        if report.widened:
+            self.widen()
+        report = replace(report, scope=self._asked, widened=self.scope != self._asked)
         # The stop is over; a disk that hangs is given this long.
         self._is_read.wait(READ_WITHIN_S)
         with self._lock:
             roster, found = self._whole(report.answered.items()), dict(self._found)
             unproven = _missed_by(self._unproven, roster)
             problems = [*roster.problems, *([problem] if problem else [])]
+            problems += [f"no robot was there for {self._asked}: every robot was stopped"] if report.widened else []
             problems += [
                 f"{each.source} misses {each.more} more robots than it names"
                 for each in self._trusted.values()
@@ -241,7 +260,14 @@ class StopRoster:
             # As surely as if it were enrolled: the caller says so.
             rows[name] = replace(rows.get(name, RosterRow(name, Known.ENROLLED)), known=Known.ENROLLED, stoppable=True)
         kept = tuple(row for name, row in marked.items() if name not in rows)
-        return replace(roster, rows=tuple(rows.values()), exempt=kept)
+        inside = self._named | dict(answered).keys()
+        return replace(
+            roster, rows=tuple(row for row in rows.values() if row.name in inside or self._covers(row)), exempt=kept
+        )
+
+    def _covers(self, row: RosterRow) -> bool:
+        cell = self._cells.get(row.name, row.cell)
+        return self.scope.everything or cell is None or self.scope.covers(row.name, {cell} - {""})
 
     def _elsewhere(self, silent: Collection[str]) -> dict[str, tuple[NetworkKey, float]]:
         """Return where else robots of these names were heard last, and seconds since."""
@@ -262,6 +288,19 @@ class StopRoster:
             store.note_answer(
                 self._network, name, Purpose.STOP_VERDICT, dict(answer.facts), {"estop_id": report.estop_id}
             )
+
+
+def robots_known_at(network: Callable[[], NetworkKey]) -> Remembers:
+    """Return what says whether this machine's roster has a robot that a scope means.
+
+    A name that was only heard counts no more than for the exit code.
+    """
+
+    def remembers(scope: Scope) -> bool:
+        roster = Roster.of(network())
+        return any(scope.names(row.name, row.cell) for row in roster.rows if counts(roster, row))
+
+    return remembers
 
 
 def counts(roster: Roster, row: RosterRow) -> bool:

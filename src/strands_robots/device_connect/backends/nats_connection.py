@@ -25,7 +25,7 @@ from nats.aio.subscription import Subscription
 
 from ...utils import redacted
 from ._compat import EncryptedClient, direct_parser
-from .config import LinkConfig
+from .config import DEFAULT_URL, LinkConfig
 from .dispatch import Throttled
 
 logger = logging.getLogger(__name__)
@@ -33,7 +33,6 @@ logger = logging.getLogger(__name__)
 RECONNECT_WAIT_S = 0.5
 """Seconds between attempts to reach a server that went away."""
 
-DEFAULT_URL = "nats://127.0.0.1:4222"
 
 Sign = Callable[[str | bytes], bytes]
 OnLink = Callable[[bool], Awaitable[None]]
