@@ -10,6 +10,7 @@ import sys
 import time
 import tracemalloc
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -21,7 +22,7 @@ from strands_robots.device_connect.enrollment import network_of
 from strands_robots.safety import sighting_file
 from strands_robots.safety.identity import ROBOTS, EnrolledKeys, Exemption, KeyFile, SigningIdentity
 from strands_robots.safety.network_key import DEVICE_CONNECT, MESH, NetworkKey
-from strands_robots.safety.sighting_file import Note, process_start
+from strands_robots.safety.sighting_file import Note, Served, own_run, process_start
 from strands_robots.safety.sightings import Known, Moment, Sighting, Sightings, flush_sightings, this_moment
 from strands_robots.safety.statements import Purpose, signed
 from strands_robots.utils import ValidationError
@@ -171,6 +172,18 @@ def test_a_served_robot_counts_while_its_process_lives(store: Sightings, clock: 
         "cell-1",
         True,
     )
+
+
+def test_each_living_process_that_serves_a_robot_is_told(store: Sightings, clock: Clock) -> None:
+    """One of them may be frozen while the other answers."""
+    both = [Served(HERE, "arm-1", pid, process_start(pid), clock()) for pid in (os.getpid(), os.getppid())]
+    store.file.write([], both, clock())
+    ((row,), problem) = store.read()
+    assert ({pid for _, pid in row.processes}, problem) == ({os.getpid(), os.getppid()}, "")
+    gone = Served(HERE, "arm-1", os.getppid(), "an earlier process", clock())
+    store.file.write([], [replace(both[1], ended=True), gone], clock())
+    ((row,), _) = store.read()
+    assert row.processes == ((own_run(), os.getpid()),)
 
 
 def test_an_orderly_end_takes_a_robot_out_though_others_heard_it(store: Sightings, clock: Clock) -> None:

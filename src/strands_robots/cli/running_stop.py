@@ -98,6 +98,7 @@ class RunningStop:
         self._begun.set()
         if widened:
             self._roster.widen()
+        if widened or self._roster.divided:
             self._expect()
 
     def _read_roster(self) -> None:
@@ -114,8 +115,9 @@ class RunningStop:
         # The report of a stop that this completes is read after what this says.
         with self._looking:
             self._searching.discard(searched)
-            awaited = self._roster.awaited(self.latest.answered if self.latest else {})
-            more = bool(self._searching) or self._roster.incomplete
+            answered = self.latest.answered if self.latest else {}
+            awaited = self._roster.awaited(answered)
+            more = bool(self._searching) or self._roster.incomplete(answered)
             if self._controller.expect(self._id, awaited, more=more) and searched == "the network":
                 self._missed = missed
 

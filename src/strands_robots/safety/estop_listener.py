@@ -35,6 +35,7 @@ from strands_robots.safety.orders import (
 )
 from strands_robots.safety.plane import SafetyPlane, plane
 from strands_robots.safety.question_ports import Member, RobotsPort
+from strands_robots.safety.sighting_file import own_run
 from strands_robots.safety.statements import Purpose, signed
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.turns import shorten_turns
@@ -559,7 +560,7 @@ class EstopListener:
         self._rules = self._make_rules()
         self._rules.require_keys()
         self._check_ins = CheckInRules(self._rules)
-        audit_head(), own_log_id()  # read from the disk now, so that no stop waits for it
+        audit_head(), own_log_id(), own_run()  # read from the disk now, so that no stop waits for it
         self._end_short_turns = shorten_turns()
         self._end_watch = AWAKE.watch(self.awake)
         self._queue = FairQueue()
@@ -651,7 +652,8 @@ class EstopListener:
         halted_now = report.received_at is not None and not report.repeated
         payload = None if halted_now else self._repeated.get(same)
         if payload is None:
-            fields = {**report.fields(), "device_id": device_id, "audit": audit_head(), **self._cell(report)}
+            fields = {**report.fields(), "device_id": device_id, "run": own_run(), "audit": audit_head()}
+            fields |= self._cell(report)
             payload = notification(VERDICT, signed(identity, Purpose.STOP_VERDICT, device_id, fields))
             if not halted_now:
                 self._repeated[same] = payload

@@ -56,8 +56,10 @@ class RosterSearch:
     def begin(self, progress: Progress) -> None:
         """Take the answers so far; start the search at the first call."""
         self._answered = progress.answered
-        if progress.widened and not self.roster.scope.everything:
+        widened = progress.widened and not self.roster.scope.everything
+        if widened:
             self.roster.widen()
+        if widened or self.roster.divided:
             self._expect(0)
         if not self.begun:
             self.begun = True
@@ -88,5 +90,5 @@ class RosterSearch:
     def _expect(self, done: int) -> None:
         with self._lock:
             self._left -= done
-            more = self._left > 0 or self.roster.incomplete
+            more = self._left > 0 or self.roster.incomplete(self._answered)
             self._controller.expect(self._id, self.roster.awaited(self._answered), more=more)

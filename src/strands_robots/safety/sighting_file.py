@@ -7,11 +7,13 @@ file is put aside and begun again; for ten minutes from then every reader is tol
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -153,6 +155,7 @@ class Sighting:
         departed: it said, unsigned, that it left.
         alive: of a robot served from this machine: its process lives.
         pid: of that process, else None.
+        processes: run id and pid of every living process that serves it.
     """
 
     network: NetworkKey
@@ -166,6 +169,7 @@ class Sighting:
     departed: bool = False
     alive: bool | None = None
     pid: int | None = None
+    processes: tuple[tuple[str, int], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,6 +212,11 @@ class Served:
     signed_only: bool = False
     ended: bool = False
 
+    @property
+    def run(self) -> str:
+        """The run id of its process, as its signed answers state it."""
+        return _run(self.at.boot, self.pid, self.started)
+
     def lives(self, now: Moment) -> bool:
         """True while its process lives and serves it."""
         return not self.ended and self.at.boot == now.boot and process_start(self.pid) == self.started != ""
@@ -232,6 +241,20 @@ def process_start(pid: int) -> str:
     except PermissionError:
         return "unknown"
     return "unknown"
+
+
+def own_run() -> str:
+    """Return the run id of this process: 16 hex digits, another one in each process."""
+    return _run_of(os.getpid())
+
+
+@lru_cache(maxsize=4)
+def _run_of(pid: int) -> str:
+    return _run(boot(), pid, process_start(pid))
+
+
+def _run(since_boot: str, pid: int, started: str) -> str:
+    return hashlib.sha256(f"{since_boot} {pid} {started}".encode()).hexdigest()[:16]
 
 
 class SightingFile:
@@ -430,7 +453,10 @@ def _moment_row(at: Moment) -> tuple[str, float, float]:
 def _united(heard: Sequence[tuple[object, ...]], served: Sequence[Served], now: Moment) -> list[Sighting]:
     """Return the sightings of the ten minutes before ``now``, one a robot and key."""
     latest: dict[tuple[NetworkKey, str], Served] = {}
+    living: dict[tuple[NetworkKey, str], dict[str, int]] = {}
     for row in served:
+        if row.lives(now):
+            living.setdefault((row.network, row.name), {})[row.run] = row.pid
         known = latest.get((row.network, row.name))
         if known is None or (row.lives(now), -row.at.age_s(now)) > (known.lives(now), -known.at.age_s(now)):
             latest[row.network, row.name] = row
@@ -459,6 +485,7 @@ def _united(heard: Sequence[tuple[object, ...]], served: Sequence[Served], now: 
             stoppable=True,
             alive=alive,
             pid=own.pid,
+            processes=tuple(living.get(key, {}).items()),
         )
     return list(found.values())
 

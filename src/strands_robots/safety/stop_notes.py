@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from strands_robots.safety.silence import UNTOLD
+from strands_robots.safety.roster import RosterRow
+from strands_robots.safety.silence import UNTOLD, described
 from strands_robots.safety.stop_roster import StopOutcome
 
 STOPS_ANYWAY = "Bare devices and robots of earlier releases stop all the same."
@@ -19,6 +20,10 @@ def stop_notes(outcome: StopOutcome) -> list[str]:
     notes += [f"{each[:1].upper()}{each[1:].rstrip('.')}." for each in outcome.problems]
     notes += [outcome.worth] if outcome.worth else []
     notes += [each for each in (_others(outcome), _unproven(outcome), _no_stop(outcome), _exempt(outcome)) if each]
+    notes += [_processes(row) for row in outcome.roster.rows if len(row.processes) > 1][:FEW]
+    if outcome.roster.joined:
+        where = "; ".join(described(each) for each in outcome.roster.joined[:FEW])
+        notes.append(f"Robots known under another address answered, so its robots must answer, too: {where}.")
     if outcome.roster.elsewhere:
         notes.append(f"{_number(outcome.roster.elsewhere, 'robot')} of other networks: this stop is not for them.")
     if outcome.report.silent and not outcome.sending.tells:
@@ -64,6 +69,10 @@ def _exempt(outcome: StopOutcome) -> str:
     rows = outcome.roster.exempt
     names = [f"{row.name} ({row.exemption.state})" if row.exemption else row.name for row in rows]
     return f"Not asked for: {_few(names)}." if names else ""
+
+
+def _processes(row: RosterRow) -> str:
+    return f"{row.name} is served by the processes {_few([str(pid) for _, pid in row.processes])} of this machine."
 
 
 def _number(count: int, thing: str) -> str:

@@ -399,7 +399,8 @@ def stop_and_lock(fleet: FleetClient, reason: str, scope: Scope = EVERY_ROBOT) -
     answers |= {name: error(answer.why, stopped=False) for name, answer in failed.items()}
     answers |= fleet.stop_each(rest, STOP_S) if rest else {}
     roster = search.roster
-    outcome = measured(answers, roster, sending, estop_id) if rest else roster.outcome(report, sending)
+    outcome = roster.outcome(report, sending)
+    outcome = measured(answers, roster, sending, estop_id) if rest else outcome
     outcome.record(fleet.source)
     roster.remember(report)
     if rest:
