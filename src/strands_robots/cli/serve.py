@@ -144,13 +144,12 @@ def serve(
         "STRANDS_MESH_POLICY_TYPE_ALLOW": policy_allow,
         "STRANDS_ROBOT_COMMAND_ALLOW": command_allow,
         "STRANDS_ALLOW_MOCK": "true" if allow_mock else None,
+        "STRANDS_CELL": identifier("--cell", cell) if cell else None,
         "STRANDS_DC_STATE_HZ": None if state_hz is None else str(number("--state-hz", state_hz, low=0.01, high=100)),
     }
     for name, value in flags.items():
         if value is not None:
             settings.put(name, value)
-    if cell is not None:
-        settings.put("STRANDS_CELL", identifier("--cell", cell))
     if policies is not None:
         load_profiles(policies.expanduser())
         settings.put("STRANDS_POLICIES", str(policies))
@@ -299,6 +298,7 @@ def _announce(screen: Screen, peer_id: str, link: LinkConfig, driver: DeviceDriv
         label(describe(link)),
         *([label(EVERY_PROGRAM_HERE)] if link.loopback_only and not link.authenticated else []),
         *([label(f"Tenant {link.tenant}.")] if link.tenant != "default" else []),
+        *([label(f"Cell {cell}.")] if (cell := settings.raw("STRANDS_CELL")) else []),
         table("", ("function", "what it does"), ((name, first_line(text)) for name, text in functions.items())),
         label("From another terminal:", "bold"),
         label(f"  strands-robots peers{flags}"),
