@@ -147,7 +147,5 @@ def test_tip_of_a_model_is_the_site_or_body_that_the_caller_names() -> None:
     robot = Robot("so100", tip="wrist")
     assert robot.body().parts.tip == "so100/tip"
     robot.cleanup()
-    with pytest.raises(
-        ValidationError, match=r"tip must be a site or a body of the model \(gripper_tip, .*, not 'claw'"
-    ):
+    with pytest.raises(ValidationError, match=r"tip must be a site or a body of .*gripper_tip, .*, not 'claw'"):
         Robot("so100", tip="claw")

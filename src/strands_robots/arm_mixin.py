@@ -66,13 +66,14 @@ class ArmTask:
     @property
     def running(self) -> bool:
         """True until the motion has ended and its end was looked at."""
-        return self.rollout.running or not self.looked.is_set()
+        return self.rollout.running or (self.sight is not None and not self.looked.is_set())
 
     def join(self, seconds: float) -> None:
         """Wait for the end and the look at it."""
         until = time.monotonic() + seconds
         self.rollout.join(seconds)
-        self.looked.wait(max(0.0, until - time.monotonic()))
+        if self.sight is not None:
+            self.looked.wait(max(0.0, until - time.monotonic()))
 
 
 def motion_rollout(body: Body, motion: Motion, permit: Permit, hz: float, observers: RolloutObservers) -> Rollout:
@@ -405,7 +406,8 @@ class ArmMixin:
             return None
         task = self._tasks.get(rollout.robot)
         if task is not None and task.rollout is rollout:
-            return None if task.running else self._outcome(task)
+            outcome = self._outcome(task)
+            return None if outcome["task_status"] in RUNNING else outcome
         why = rollout.error or ("it is done" if rollout.state == "completed" else "it was stopped")
         return {
             "task_status": rollout.state,
@@ -441,12 +443,11 @@ class ArmMixin:
         asked = self.knows_objects or (self.detector is not None and verb in ("pick", "place"))
         return self.objects(robot_name) if asked else None
 
-    def _look(self, task: ArmTask) -> None:
+    def _look(self, task: ArmTask, sight: Sight) -> None:
         """Wait for the end of a motion, then look at the objects."""
         task.rollout.join()
         try:
-            if task.sight is not None:
-                task.sight.after = self.objects(task.rollout.robot)
+            sight.after = self.objects(task.rollout.robot)
         except ValidationError as exc:
             logger.warning("The objects after %s of %s are not known: %s", task.task_id, task.rollout.robot, exc)
         finally:
@@ -477,6 +478,7 @@ class ArmMixin:
             state = arm.state(_observed(body)[1]).told(arm.told(self.targets(body.name)))
             motion = plan(Start(arm, state, hz, speed))
             motion.clock = getattr(body, "clock", motion.clock)
+            motion.stall_lag = getattr(body, "stall_lag", motion.stall_lag)
             planned.append(motion)
             return motion
 
@@ -485,7 +487,8 @@ class ArmMixin:
         self._tasks[body.name] = task
         self._recent[:] = [*self._recent[-15:], task]
         started()
-        threading.Thread(target=self._look, args=(task,), name=f"look-{body.name}", daemon=True).start()
+        if sight is not None:
+            threading.Thread(target=self._look, args=(task, sight), name=f"look-{body.name}", daemon=True).start()
         if wait:
             task.join(WAIT_S)
         return self._result(task)
@@ -499,6 +502,8 @@ class ArmMixin:
 
     def _outcome(self, task: ArmTask) -> dict[str, Any]:
         """Return what was asked, what was reached, and why the motion ended."""
+        if not task.rollout.running and task.sight is not None and self.knows_objects and not task.looked.is_set():
+            self._look(task, task.sight)
         if task.running:
             return self._measured(task, running=True)
         if task.outcome is None:
@@ -512,7 +517,7 @@ class ArmMixin:
         why = "it is under way"
         holding = None if running else self._holding(rollout.robot, motion.arm, motion.state)
         if not running:
-            why = rollout.error or "it was stopped"
+            why = motion.contact or rollout.error or "it was stopped"
             if state == "completed":
                 problem = (
                     motion.problem(error_mm, holding) or (sight.problem() if sight is not None else "")

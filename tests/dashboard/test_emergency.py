@@ -42,6 +42,7 @@ class Controller:
     def __init__(self, report: StopReport) -> None:
         self.link_up = True
         self.controller_id = "dashboard"
+        self.network = None
         self.report = report
         self.expected: Collection[str] = ()
 

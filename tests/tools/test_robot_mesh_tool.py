@@ -248,8 +248,11 @@ class TimedMesh:
     def peers(self) -> list[dict[str, Any]]:
         return [{"peer_id": name, "reachable": True} for name, at in self.arrivals.items() if at <= self.now]
 
-    def emergency_stop(self, signing_key: Any = None, *, estop_id: str = "") -> list[dict[str, Any]]:
+    def emergency_stop(
+        self, signing_key: Any = None, *, estop_id: str = "", on_answers: Callable[[list[Any]], None]
+    ) -> list[dict[str, Any]]:
         self.stops.append(self.now)
+        on_answers([])
         # One press is one stop, however often it is sent.
         self.ids.add(estop_id)
         assert len(self.ids) == 1
@@ -261,6 +264,12 @@ class TimedMesh:
 
     def sleep(self, seconds: float) -> None:
         self.now += seconds
+
+    def listen(self, topic: str, heard: object, name: str) -> bool:
+        return True
+
+    def unsubscribe(self, name: str) -> None:
+        """Nothing to undo."""
 
     def close(self) -> None:
         self.alive = False

@@ -146,6 +146,7 @@ def serve(
         "STRANDS_ALLOW_MOCK": "true" if allow_mock else None,
         "STRANDS_CELL": identifier("--cell", cell) if cell else None,
         "STRANDS_DC_STATE_HZ": None if state_hz is None else str(number("--state-hz", state_hz, low=0.01, high=100)),
+        "STRANDS_CELL": None if cell is None else identifier("--cell", cell),
     }
     for name, value in flags.items():
         if value is not None:

@@ -35,7 +35,7 @@ def safety_controller(controller_id: str, link: LinkConfig | None = None, **opti
 def stand(
     controller: SafetyController, link: LinkConfig, also: Callable[[], Collection[str]] = tuple
 ) -> StandingRoster:
-    """Have a controller that ``stands`` report whom it misses after a stop of another one.
+    """Have a controller report whom it misses after the stop of another one.
 
     Args:
         controller: made with ``stands``.

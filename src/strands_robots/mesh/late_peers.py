@@ -1,4 +1,4 @@
-"""Resumes for peers that were out of reach, and stops for such peers of 0.5 releases.
+"""Resumes for peers that were out of reach, and stops for those of 0.5 releases.
 
 Zenoh stores nothing for a peer that comes back, and the console that resumed the fleet may be gone by then. So every
 robot publishes a resume again, for a minute, when a peer that missed it is back. A peer of ours asks for the stops that
@@ -69,7 +69,7 @@ class LatePeers:
         self._delay_s = SPREAD_S * (zlib.crc32(context.peer_id.encode()) % 1000) / 1000
 
     def stopped(self, epoch: str, publish: Publish) -> None:
-        """Note a stop that locked us; ``publish`` repeats its envelope to peers of 0.5 releases."""
+        """Note a stop that locked us; ``publish`` repeats it to peers of 0.5 releases."""
         known = self._context.registry.seen_within(KNOWN_S)
         self._note(epoch, float("inf"), known, lambda peers: publish(), locks=True)
 

@@ -156,7 +156,7 @@ class MeshMissedStops:
 
 
 def epoch_of(notice: wire.EstopNotice, body: Mapping[str, Any]) -> str:
-    """Return the epoch of an e-stop, which one without an id has by its issuer and time."""
+    """Return the epoch of an e-stop: its id, else one of its issuer and time."""
     return notice.estop_id or derived_epoch(notice.peer_id, json.dumps(body["t"]).encode())
 
 

@@ -21,6 +21,7 @@ from typing import Any, Protocol
 
 from strands_robots.audit import queue_safety_event
 from strands_robots.safety import ed25519
+from strands_robots.safety.answer_slots import AnswerSlots
 from strands_robots.safety.clocks import seconds_of
 from strands_robots.safety.identity import SigningIdentity
 from strands_robots.safety.orders import params_of
@@ -41,7 +42,7 @@ STARTED, BACK = "the process started", "its link is back"
 UNITE_S = 0.3
 """Seconds from the question for which motions hold, while the answers come in."""
 
-LISTEN_S = 1.0
+LISTEN_S = 1.9
 """Seconds from the question in which an answer counts; a busy machine answers late."""
 
 ASK_EVERY_S = 1.0
@@ -61,7 +62,7 @@ ANSWER_EVERY_S = 0.1
 
 DEVICES_MAX = 64
 QUESTION_MAX_BYTES = 8 * 2**10
-QUESTIONS_MAX = 64
+QUESTIONS_MAX = 16
 """Questions that wait for one answer."""
 
 ANSWER_MAX_BYTES = 60 * 2**10
@@ -207,6 +208,11 @@ class Answerer:
         return bool(self._questions)
 
     @property
+    def nonces(self) -> tuple[str, ...]:
+        """The questions that wait."""
+        return tuple(self._questions)
+
+    @property
     def full(self) -> bool:
         """True while no further question is taken; the next answer serves its asker too."""
         return len(self._questions) >= QUESTIONS_MAX
@@ -302,6 +308,7 @@ class MissedStops:
         chance: Callable[[], float] = random.random,
     ) -> None:
         self._port, self._parse, self._clock = port, parse, clock
+        self._slots = AnswerSlots()
         self._asker, self._answerer = Asker(), Answerer(chance)
         self._reasons: deque[str] = deque(maxlen=8)
         self._questions: deque[tuple[str, bytes]] = deque(maxlen=QUESTIONS_MAX)
@@ -388,7 +395,8 @@ class MissedStops:
             logger.info("Asking for the stops missed: %s.", reason)
             self._asker.want(self._clock())
         self._take_questions()
-        self._take_answers()
+        if self._asker.listens(self._clock()):
+            self._take_answers()
         now = self._clock()
         if now >= self._asker.due:
             self._ask()
@@ -454,8 +462,16 @@ class MissedStops:
                     return
 
     def _answer(self) -> None:
+        originals = self._port.originals()
+        if originals and self._slots.take(self._answerer.nonces, [each.epoch for each in originals]):
+            # What others answered is checked now: most processes get no slot and need not.
+            self._take_answers()
+        else:
+            originals = ()
         now = self._clock()
-        nonce, rest = self._answerer.take(self._port.originals(), now)
+        nonce, rest = self._answerer.take(originals, now)
+        if not self._asker.listens(now):
+            self._answers.clear()
         if not rest:
             return
         name, identity = self._port.signer()

@@ -423,9 +423,7 @@ class SafetyPlane:
                     since=order.received,
                     answered=functools.partial(reporter.answer, run, entry.robot_id),
                 )
-            if order.original is not None:
-                received = uptime() - (time.monotonic() - order.received) - order.age_s
-                self._originals.add(Original(order.epoch, order.source, order.original, order.network, received))
+            self._note_original(order)
             reporter.begin(run)
             followed = True
             if self._reporter is not reporter:
@@ -560,6 +558,15 @@ class SafetyPlane:
             on_report(report)
         if any(entry.crowded and order.epoch not in entry.epochs for entry in robots):
             self._counted.add(order.source)
+        late = order.original is not None and not self._originals.has(order.epoch, order.network)
+        if late and any(entry.latch.state.can_resume(order.epoch) for entry in robots):
+            # It came without its bytes first, from the framework or from a device here.
+            self._note_original(order)
+
+    def _note_original(self, order: StopOrder) -> None:
+        if order.original is not None:
+            received = uptime() - (time.monotonic() - order.received) - order.age_s
+            self._originals.add(Original(order.epoch, order.source, order.original, order.network, received))
 
     def _keep(self, entries: Iterable[Registered]) -> None:
         # One at a time, so that no older state is written over a newer one.

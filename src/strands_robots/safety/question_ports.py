@@ -154,7 +154,7 @@ class RobotsPort:
         )
 
     def lock(self, epoch: str, decide: Callable[[], StopOrder | StopRefused], answerer: str) -> bool:
-        """Lock by a missed stop unless every robot knows it; False when it does not count."""
+        """Lock by a missed stop unless all know it; False when it does not count."""
         if all(each.latch.knows(epoch) for each in self._plane.robots.values()):
             return True
         order = decide()

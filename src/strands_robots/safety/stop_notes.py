@@ -13,7 +13,7 @@ FEW = 5
 
 
 def stop_notes(outcome: StopOutcome) -> list[str]:
-    """Return a sentence each on problems, what the roster is worth, groups and other networks."""
+    """Return sentences on problems, the roster's limit, groups, other networks."""
     scoped = not (outcome.report.scope.everything or outcome.report.widened)
     notes = [f"This stop was for {outcome.report.scope}. {STOPS_ANYWAY}"] if scoped else []
     notes += [f"{each[:1].upper()}{each[1:].rstrip('.')}." for each in outcome.problems]

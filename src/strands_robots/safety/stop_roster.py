@@ -87,7 +87,7 @@ class StopOutcome:
         """The limit of that sentence where no robot is enrolled, else ""."""
         if self.roster.enrolled:
             return ""
-        return f"No robot is enrolled here: a robot that was not heard for ten minutes is not missed. {ENROLL}"
+        return f"No robot is enrolled here, so one that was not heard for ten minutes is not missed: {ENROLL}"
 
     def facts(self) -> dict[str, Any]:
         """Return what a script reads besides the report's own fields."""
@@ -301,6 +301,20 @@ def robots_known_at(network: Callable[[], NetworkKey]) -> Remembers:
         return any(scope.names(row.name, row.cell) for row in roster.rows if counts(roster, row))
 
     return remembers
+
+
+def unheard(network: NetworkKey, answered: Collection[str]) -> str:
+    """Return the robots of the roster that are not among ``answered``, as text.
+
+    Names that were only heard are left out where robots are enrolled. It reads the disk.
+    """
+    try:
+        roster = Roster.of(network)
+    except Exception as exc:  # noqa: BLE001 - said in place of the names
+        return f"the roster cannot be read: {exc}"
+    names = [row.name for row in roster.rows if counts(roster, row) and row.name not in answered]
+    more = f" and {len(names) - NAMED_MAX} more" if len(names) > NAMED_MAX else ""
+    return f"{', '.join(names[:NAMED_MAX])}{more}"
 
 
 def counts(roster: Roster, row: RosterRow) -> bool:

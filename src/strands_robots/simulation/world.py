@@ -18,7 +18,7 @@ from strands_robots.kinematics.grasp import SeenObject
 from strands_robots.kinematics.motion import Motion
 from strands_robots.policies import create_policy
 from strands_robots.policies.base import SPEED_MAX
-from strands_robots.policies.check import RobotFacts
+from strands_robots.policies.check_rows import RobotFacts
 from strands_robots.policies.profiled import ProfiledPolicy
 from strands_robots.policies.profiles import profiles
 from strands_robots.policies.rollout import (
@@ -459,9 +459,9 @@ class Simulation(PicturesMixin, ArmMixin, TeleopMixin):
     def policy_facts(self, robot_name: str | None = None) -> RobotFacts:
         """Return what a policy is checked against."""
         body = self.body(robot_name)
-        rate = settings.number("STRANDS_CONTROL_HZ")
-        pictures = dict.fromkeys(body.cameras, PICTURE)
-        return RobotFacts(body.name, body.get_joints(), list(body.bounds), body.joint_units, pictures, rate)
+        pictures, rate = dict.fromkeys(body.cameras, PICTURE), settings.number("STRANDS_CONTROL_HZ")
+        facts = (body.get_joints(), list(body.bounds), body.joint_units, pictures, rate)
+        return RobotFacts(body.name, *facts, body.bounds, body.parts.model)
 
     def occupied(self, robot: str) -> str:
         """Name the rollout that drives this robot, for a refusal; empty without one."""

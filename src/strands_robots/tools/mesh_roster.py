@@ -102,7 +102,7 @@ def _stop(sender: str, payload: bytes) -> tuple[str, Mapping[str, Any]]:
 
 
 def _locked(name: str, row: Mapping[str, Any], estop_id: str, keys: Mapping[str, bytes] | None) -> bool:
-    """Return True for a peer that announces this lockout, signed where it is enrolled."""
+    """Return True for a peer that announces this lockout."""
     epochs = row.get("epochs")
     if not isinstance(epochs, list) or estop_id not in epochs or row.get("reachable") is not True:
         return False

@@ -47,7 +47,7 @@ def combined_verdict(answers: Mapping[str, Envelope], stale: str = "") -> Envelo
 
 
 def measured(answers: Mapping[str, Envelope], roster: StopRoster, sending: Sending, estop_id: str = "") -> StopOutcome:
-    """Measure the answers to a stop by the roster; one of unknown outcome is no answer."""
+    """Measure answers by the roster; one of unknown outcome is no answer."""
     graded = {name: stop_outcome(answer) for name, answer in answers.items()}
     rows = {name: Answer(name, stopped, 0.0, said) for name, (stopped, said) in graded.items() if stopped is not None}
     report = StopReport(
@@ -63,7 +63,7 @@ def measured(answers: Mapping[str, Envelope], roster: StopRoster, sending: Sendi
 
 
 def roster_verdict(answers: Mapping[str, Envelope], outcome: StopOutcome, stale: str = "") -> Envelope:
-    """Return one answer for a stop: success when every robot of the roster was confirmed.
+    """Return one answer: success when every robot of the roster was confirmed.
 
     Args:
         answers: by robot.
