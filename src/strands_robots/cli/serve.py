@@ -144,7 +144,6 @@ def serve(
         "STRANDS_MESH_POLICY_TYPE_ALLOW": policy_allow,
         "STRANDS_ROBOT_COMMAND_ALLOW": command_allow,
         "STRANDS_ALLOW_MOCK": "true" if allow_mock else None,
-        "STRANDS_CELL": identifier("--cell", cell) if cell else None,
         "STRANDS_DC_STATE_HZ": None if state_hz is None else str(number("--state-hz", state_hz, low=0.01, high=100)),
         "STRANDS_CELL": None if cell is None else identifier("--cell", cell),
     }
