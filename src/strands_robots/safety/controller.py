@@ -117,7 +117,7 @@ class StopReport:
 
     @property
     def widening(self) -> str:
-        """Why every robot was stopped, where the press was for some; else empty."""
+        """Reason why a stop of some robots became one of all, or ""."""
         return f"no robot was there for {self.scope}: every robot was stopped" if self.widened else ""
 
     @property
