@@ -116,6 +116,11 @@ class StopReport:
     widened: bool = False
 
     @property
+    def widening(self) -> str:
+        """Reason why a stop of some robots became one of all, or ""."""
+        return f"no robot was there for {self.scope}: every robot was stopped" if self.widened else ""
+
+    @property
     def answered(self) -> Mapping[str, Answer]:
         """The answer of each robot that gave one."""
         return {**self.stopped, **self.not_stopped, **self.refused, **self.claimed}

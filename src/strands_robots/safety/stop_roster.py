@@ -232,7 +232,7 @@ class StopRoster:
             roster, found = self._whole(report.answered.items()), dict(self._found)
             unproven = _missed_by(self._unproven, roster)
             problems = [*roster.problems, *([problem] if problem else [])]
-            problems += [f"no robot was there for {self._asked}: every robot was stopped"] if report.widened else []
+            problems += [report.widening] if report.widening else []
             problems += [
                 f"{each.source} misses {each.more} more robots than it names"
                 for each in self._trusted.values()
