@@ -1,7 +1,7 @@
 """Robots that were away during a stop: named, locked when they are back, and none locked that need not be.
 
-``ROSTER_NETWORKS`` and ``ROSTER_PARTS``, with commas, choose from the rows: ``nats,mesh`` and ``away,crowd``. The crowd's
-planes share processes: 400 processes of their own would take 22 GB.
+``ROSTER_NETWORKS`` and ``ROSTER_PARTS``, with commas, choose from the rows, such as ``nats,mesh`` and ``away,crowd``.
+The planes of the crowd share processes: 400 processes of their own would take 22 GB.
 """
 
 from __future__ import annotations
