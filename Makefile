@@ -72,7 +72,7 @@ real-arm:  ## LeRobot's own SO-100/SO-101 driver without torch, in .venv-lerobot
 real-arm-test: real-arm  ## The tests of a real arm, on emulated servos
 	@./scripts/tests.sh $(REAL_ARM)/python tests/integration/hardware $(ARGS)
 
-models:  ## The models of four other projects in a world of ours, in .venv-models, and their test
+models:  ## The models of eight other projects in a world of ours, in .venv-models, and their test
 	@./scripts/models.sh
 	@./scripts/tests.sh $(MODELS)/python tests/integration/simulation $(ARGS)
 

@@ -298,6 +298,8 @@ class AdaptedRobot:
     ) -> Envelope:
         try:
             permit = self.gate.permit("start_task")
+            permit.wait()
+            permit.check()
         except MotionRefused as refused:
             return refused.envelope
         with self._shared.calling():

@@ -15,6 +15,7 @@ from typing import Any
 from strands_robots._mesh_switch import mesh_env_request
 from strands_robots.contract import adapt, put_away
 from strands_robots.envelope import is_error, text_of
+from strands_robots.safety.scope import own_cell
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.utils import ValidationError, choice, own_device_id, shown
 from strands_robots.utils import peer_id as valid_peer_id
@@ -37,9 +38,12 @@ class Networked:
     mesh: Any = None
     """The robot's native mesh peer, or None."""
 
+    cell: str | None = None
+    """The cell that the robot is in, for stops of one cell; None asks ``STRANDS_CELL``."""
+
     def run(self, **options: Any) -> StopVerdict:
         """Serve this robot on Device Connect until SIGINT or SIGTERM; see :func:`run`."""
-        return run(self, **{"peer_id": self.peer_id, **options})
+        return run(self, **{"peer_id": self.peer_id, "cell": self.cell, **options})
 
     def cleanup(self) -> Any:
         """Leave the mesh, then halt the robot and free everything."""
@@ -56,6 +60,7 @@ def Robot(  # the factory reads as the class it stands for
     tool_name: str | None = None,
     peer_id: str | None = None,
     mesh: bool | None = None,
+    cell: str | None = None,
     **options: Any,
 ) -> Any:
     """Make a running robot.
@@ -68,8 +73,10 @@ def Robot(  # the factory reads as the class it stands for
         tool_name: its name on a network; the robot's name by default.
         peer_id: its id on the networks.
         mesh: True joins the native mesh now, False never; None asks ``STRANDS_MESH``.
-        options: ``sim``: arguments of ``Simulation`` (``timestep``, ``gravity``, ``realtime``), and ``scene``
-            (``tabletop``: a table with a red cube and a plate). ``real``:
+        cell: the cell that it is in, for stops of one cell; None asks ``STRANDS_CELL``, "" is none.
+        options: ``sim``: arguments of ``Simulation`` (``timestep``, ``gravity``, ``realtime``), ``scene``
+            (``tabletop``: a table with a red cube and a plate), and ``tip``, the site or body of the model that
+            motions place. ``real``:
             ``control_hz``, ``joint_ranges``, ``stop_level``, ``rest_pose``, ``model``, ``speed_limit``, ``detector``
             (an object with ``detect(frames)``, see ``kinematics.detector``), and every other one goes to the
             LeRobot configuration of the robot, such as ``port="/dev/ttyACM0"`` and ``id="left"``, with ``cameras`` as
@@ -87,8 +94,10 @@ def Robot(  # the factory reads as the class it stands for
         raise ValidationError(f"mesh must be true, false or None, not {shown(mesh)}.")
     if peer_id is not None:
         valid_peer_id("peer_id", peer_id)
+    if cell is not None:
+        own_cell(cell)
     robot = _simulated(name, tool_name, options) if kind == "sim" else _real(name, tool_name, options)
-    robot.peer_id = peer_id
+    robot.peer_id, robot.cell = peer_id, cell
     if mesh or (mesh is None and mesh_env_request()):
         try:
             robot.mesh = _join_mesh(robot, peer_id, "sim" if kind == "sim" else "robot")
@@ -114,7 +123,8 @@ def run(
         robot: any robot that ``init_device_connect`` accepts.
         peer_id: its id, without dots; made from its name by default.
         until: ends the serving as a signal does.
-        network: other arguments of ``init_device_connect``, such as ``messaging_url`` and ``allow_insecure``.
+        network: other arguments of ``init_device_connect``, such as ``messaging_url``, ``cell`` and
+            ``allow_insecure``.
 
     Returns:
         The verdict of the halt.
@@ -159,9 +169,9 @@ def _simulated(name: str, tool_name: str | None, options: dict[str, Any]) -> Any
     from strands_robots.simulation import Simulation  # noqa: PLC0415 - loads MuJoCo
     from strands_robots.simulation.tabletop import furnish  # noqa: PLC0415 - simulation only
 
-    label, scene = _label(name), options.pop("scene", None)
+    label, scene, tip = _label(name), options.pop("scene", None), options.pop("tip", "")
     simulation = _construct(_networked(Simulation), tool_name=tool_name or label, **options)
-    answer = simulation.add_robot(label, model=name)
+    answer = simulation.add_robot(label, model=name, tip=tip)
     if is_error(answer):
         simulation.cleanup()
         raise ValidationError(str(answer["reason"]), NO_SUCH_MODEL)
@@ -234,7 +244,7 @@ def _label(name: object) -> str:
 def _join_mesh(robot: Any, peer_id: str | None, peer_type: str) -> Any:
     from strands_robots.mesh import init_mesh  # noqa: PLC0415 - the mesh is loaded when it is used
 
-    mesh = init_mesh(robot, peer_id=peer_id, peer_type=peer_type)
+    mesh = init_mesh(robot, peer_id=peer_id, peer_type=peer_type, cell=robot.cell)
     if mesh is not None and hasattr(robot, "input_sink"):
         from strands_robots.mesh.input import MeshInputSink  # noqa: PLC0415 - as above
 

@@ -236,6 +236,8 @@ class RosTelemetryBase:
             logger.warning("A command on %s is dropped whole: %s.", self.command_topic, problem)
             return False
         try:
+            if self._robot.gate.held:
+                return False  # one of a stream; those after the hold count
             action = self._within_speed({str(n): float(p) for n, p in zip(names, positions, strict=True)})
             # The robot's own verb asks its own gate: a locked robot refuses here as on every other path.
             answer = self._robot.send_action(action)

@@ -195,6 +195,9 @@ _declare(
     Setting("DISPLAY", "text", "", "X display; with one, MuJoCo's own choice of OpenGL is kept."),
     # Safety.
     Setting(
+        "STRANDS_CELL", "text", "", "Cell of the robots of this process, for stops of one cell. Unset: of every cell."
+    ),
+    Setting(
         "STRANDS_HALT_DEADLINE_S",
         "number",
         "1.0",

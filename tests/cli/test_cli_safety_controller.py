@@ -14,7 +14,7 @@ from rich.console import Console
 from strands_robots.cli import safety_controller
 from strands_robots.cli.lockout_report import LockoutReport
 from strands_robots.cli.safety_controller import FleetScreen, StopButton
-from strands_robots.cli.stop import style_of
+from strands_robots.cli.stop_report import style_of
 from strands_robots.device_connect.backends import loopback_config
 from strands_robots.safety.answers import Answer
 from strands_robots.safety.controller import Progress, StopReport
@@ -26,6 +26,7 @@ class FakeController:
 
     controller_id = "safety-1"
     link_up = True
+    network = None
 
     def __init__(self) -> None:
         self.ids: list[str] = []

@@ -16,14 +16,17 @@ from tests.cli.conftest import FakeFleet, Run
 from strands_robots import device_connect
 from strands_robots.cli.network import Network
 from strands_robots.cli.output import Exit, Screen
-from strands_robots.cli.stop import RunningStop, exit_code, progress_rows, report_rows, show_resume, summary
+from strands_robots.cli.running_stop import RunningStop
+from strands_robots.cli.stop import show_resume
+from strands_robots.cli.stop_report import exit_code, progress_rows, report_rows, summary
 from strands_robots.device_connect import safety_controller
 from strands_robots.device_connect.backends import loopback_config
 from strands_robots.device_connect.discovery import Peer, RegistryError
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.safety.answers import Answer
 from strands_robots.safety.controller import Progress, StopReport
-from strands_robots.tools.networks import stop_outcome
+from strands_robots.safety.silence import Sending
+from strands_robots.tools.roster_verdict import stop_outcome
 
 
 def answer(name: str, stopped: bool | None = True, ms: float = 3.0, why: str = "") -> Answer:
@@ -44,6 +47,7 @@ class FakeController:
         self.report = stop_report
         self.calls: list[tuple[Collection[str], str]] = []
         self.presses: list[str] = []
+        self.sending, self.controller_id = Sending(), "desk"
 
     def wait_link(self, timeout: float) -> bool:
         return True
@@ -54,6 +58,9 @@ class FakeController:
     def stop(self, expected: Collection[str], reason: str, **more: Any) -> StopReport:
         self.calls.append((expected, reason))
         return self.report
+
+    def expect(self, estop_id: str, names: Collection[str], *, more: bool = False) -> bool:
+        return True
 
     def close(self) -> None:
         pass
@@ -76,11 +83,12 @@ def test_estop_names_each_robot_and_exits_with_the_worst(
 ) -> None:
     fake = FakeController(stop_report)
     monkeypatch.setattr(safety_controller, "safety_controller", lambda *given, **more: fake)
-    result = run("estop", "a", "b", "--reason", "a hand")
+    names = sorted({*stop_report.answered, *stop_report.silent}) or ["a"]
+    result = run("estop", *names, "--reason", "a hand")
     assert result.exit_code == code
     assert printed in result.stdout
-    assert fake.calls == [(["a", "b"], "a hand")]
-    facts = json.loads(run("estop", "a", "--json").stdout)
+    assert fake.calls == [(names, "a hand")]
+    facts = json.loads(run("estop", *(names if stop_report.answered or stop_report.silent else []), "--json").stdout)
     assert facts["silent"] == list(stop_report.silent)
     assert (facts["status"] == "success") is (code == 0)
 
@@ -284,9 +292,10 @@ class LookingController(FakeController):
         assert self._over or self._until.wait(20)
         return super().stop(expected, reason)
 
-    def expect(self, estop_id: str, names: Collection[str]) -> bool:
-        self.named.append(set(names))
-        self._until.set()
+    def expect(self, estop_id: str, names: Collection[str], *, more: bool = False) -> bool:
+        if not more:
+            self.named.append(set(names))
+            self._until.set()
         return not self._over
 
 
@@ -316,7 +325,7 @@ def test_estop_whose_robots_could_not_be_looked_up_is_no_success(
 
 
 def test_robots_that_are_found_at_the_second_try_must_answer(estop: Callable[..., Result]) -> None:
-    controller = LookingController(report(answer("a"), answer("b")))
+    controller = LookingController(report(answer("a"), answer("b"), answer("c")))
     result = estop(Lookup(RegistryError("the database is gone"), ["b", "c"]), controller)
     assert result.exit_code == 0
     assert controller.named == [{"a", "b", "c"}]

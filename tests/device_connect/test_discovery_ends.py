@@ -46,7 +46,14 @@ class Wire:
     """A network of this machine: a device for each time, which answers the first probe so many seconds later."""
 
     def __init__(self, answers: tuple[float, ...]) -> None:
-        self.link = SimpleNamespace(tenant="default", meeting_point="tcp/127.0.0.1:1", is_peer=False, identified=False)
+        self.link = SimpleNamespace(
+            tenant="default",
+            connect=(),
+            listen=(),
+            meeting_point="tcp/127.0.0.1:1",
+            is_peer=False,
+            identified=False,
+        )
         self.links = 0
         self._answers: dict[str, float] = {f"arm-{number}": at for number, at in enumerate(answers)}
         self._takes: dict[str, Take] = {}

@@ -53,7 +53,9 @@ class Fleet:
         self.planes: dict[str, SafetyPlane] = {}
         self._folder = folder
 
-    def parts(self, peer_id: str, *, identity: Identity | None = None, sessionless: bool = False) -> Parts:
+    def parts(
+        self, peer_id: str, *, identity: Identity | None = None, sessionless: bool = False, keep: bool = False
+    ) -> Parts:
         transport = MemoryTransport(self.bus, sessionless=sessionless)
         self.transports[peer_id] = transport
         own = self.planes[peer_id] = SafetyPlane(LockoutStore(self._folder / peer_id), deadline_s=20.0)
@@ -71,6 +73,7 @@ class Fleet:
             identity=lambda _: identity or Identity(),
             audit=lambda event, peer, payload: self.audit.append((event, peer, payload)),
             plane=own,
+            keep=keep,
         )
 
     def join(self, robot: Any, peer_id: str, peer_type: str = "robot", **options: Any) -> Mesh:

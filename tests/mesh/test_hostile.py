@@ -171,6 +171,12 @@ def seeds(peers: Fleet, signer: Signer) -> dict[str, dict[str, Any]]:
             "estop_id": "1" * 32,
             "audit": {"log": "a" * 32, "count": 1, "last": "b" * 64},
         },
+        "strands/arm-9/missed/ask": {"nonce": "1" * 32, "devices": ["arm-9"], "t": now},
+        "strands/arm-9/missed/answer": {
+            "nonce": "1" * 32,
+            "stops": [{"source": "console", "event": "e30", "age_s": 1.0}],
+            "more": 0,
+        },
         "strands/lead/safety/event": {**common, "event": "emergency_stop"},
         "strands/lead/input/leader": {**common, "seq": 1, "action": {"j": 1.0}},
         "strands/lead/camera/front": {**common, "encoding": "jpeg", "data": "AAAA"},

@@ -14,7 +14,7 @@ from tests.mesh.peers import Fleet
 
 from strands_robots.mesh import safety
 from strands_robots.mesh.resume_authority import keygen, load_signing_key, main
-from strands_robots.mesh.safety import SafetyAdapter
+from strands_robots.mesh.safety_adapter import SafetyAdapter
 from strands_robots.mesh.transport import Sample
 from strands_robots.safety.orders import StopOrder, new_epoch
 from strands_robots.safety.persistence import LockoutStore

@@ -11,7 +11,7 @@ from tests.mesh.peers import Fleet, received
 
 from strands_robots.cli.mesh_controller import MeshController
 from strands_robots.cli.resume_mesh import ask_peers
-from strands_robots.cli.stop import exit_code, style_of
+from strands_robots.cli.stop_report import exit_code, style_of
 from strands_robots.mesh import topics
 from strands_robots.safety.identity import ROBOTS, EnrolledKeys, KeyFile, robot_identity
 from strands_robots.safety.orders import new_epoch

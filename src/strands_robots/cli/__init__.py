@@ -41,6 +41,10 @@ def _leave(code: object) -> NoReturn:
     policies = sys.modules.get("strands_robots.policies.unfinished")
     if policies is not None:
         policies.name_unfinished()
+    sightings = sys.modules.get("strands_robots.safety.sightings")
+    if sightings is not None:
+        # What runs at an interpreter's end does not run here.
+        sightings.flush_sightings()
     logging.shutdown()
     for stream in (sys.stdout, sys.stderr):
         try:

@@ -7,13 +7,17 @@ from typing import Annotated
 
 import typer
 
+from strands_robots.audit import log_safety_event
 from strands_robots.cli.command import OnMesh, Timeout, command
+from strands_robots.cli.enrolled import Forget, Listed, Off, Reason, Retire, apply, change_of, show_enrolled
 from strands_robots.cli.lockout_report import LockoutReport
 from strands_robots.cli.network import Network, describe
 from strands_robots.cli.output import CliError, Exit, Screen, label, plain, table
-from strands_robots.cli.resume import ask_mesh, ask_robots, lockable_robots
+from strands_robots.cli.resume import ask_mesh, ask_robots, lockable_robots, operator
 from strands_robots.safety import ed25519
+from strands_robots.safety.consoles import enrolled_consoles
 from strands_robots.safety.identity import DEFAULT_TENANT, EnrolledKeys, KeyFileError, fingerprint, local_name
+from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.statements import Purpose, own_key
 from strands_robots.utils import device_id, number, shown
 
@@ -30,18 +34,39 @@ def enroll(
     network: Network,
     *,
     devices: Annotated[list[str] | None, typer.Argument(metavar="DEVICE...", help="Which; else all found.")] = None,
-    replace: Annotated[bool, typer.Option("--replace", help="Accept the new key of a robot set up anew.")] = False,
+    replace: Annotated[bool, typer.Option("--replace", help="Accept a robot's new key, or its new network.")] = False,
     console: Annotated[str, typer.Option(help="Let a console elsewhere move hardware: its `keys console`.")] = "",
+    retire: Retire = "",
+    off: Off = "",
+    forget: Forget = "",
+    reason: Reason = "",
+    listed: Listed = False,
     timeout: Timeout = 2.0,
     on_mesh: OnMesh = False,
 ) -> None:
     """Keep the public keys of robots: from then on only a signed answer counts."""
+    change = change_of(retire=retire, off=off, forget=forget, reason=reason)
+    if change is not None or listed:
+        if devices or console or replace or (change is not None and listed):
+            raise CliError("--list, --retire, --off and --forget go with no other.", Exit.USAGE)
+        if change is None:
+            show_enrolled(screen)
+        else:
+            apply(screen, change, DEFAULT_TENANT if on_mesh else network.stated_tenant)
+        return
     if console:
         _enroll_console(screen, console)
         return
     wanted = [device_id("DEVICE", each) for each in devices or []]
     seconds = number("--timeout", timeout, above=0, high=60)
-    reports, tenant, where = (_on_mesh if on_mesh else _on_fleet)(network, wanted, seconds)
+    _enroll_robots(screen, network, wanted, seconds, replace=replace, on_mesh=on_mesh)
+
+
+def _enroll_robots(
+    screen: Screen, network: Network, wanted: list[str], seconds: float, *, replace: bool, on_mesh: bool
+) -> None:
+    reports, key, where = (_on_mesh if on_mesh else _on_fleet)(network, wanted, seconds)
+    tenant = key.tenant
     if not reports:
         raise CliError(f"No robot answered. {where}", Exit.SILENT, devices={})
     keys = {each.name: own_key(Purpose.LOCKOUT_STATE, each.name, _statement(each.facts)) for each in reports}
@@ -63,9 +88,11 @@ def enroll(
             else:
                 outcome[name] = "known" if known.get(local) == public else "enrolled", ""
                 fresh[local] = public
-        file.enroll(fresh, replace=replace)
+        undone = file.enroll(fresh, replace=replace, network=key)
     except (KeyFileError, OSError) as exc:
         raise CliError(f"Nothing was enrolled: {exc}") from exc
+    for local, exempt in undone.items():
+        log_safety_event("exemption_undone", local, {"was": exempt.state, "by": exempt.by, "who": operator()})
     prints = {name: fingerprint(public) if public else "" for name, public in keys.items()}
     styles = {"CHANGED KEY": "bold red", "no key": "yellow"}
     rows = (
@@ -93,8 +120,6 @@ def enroll(
 
 def _enroll_console(screen: Screen, text: str) -> None:
     """Keep the key of a console on another machine, for the robots of this one."""
-    from strands_robots.mesh.console_keys import enrolled_consoles  # noqa: PLC0415 - loaded when it is used
-
     public = ed25519.decode(text, 32)
     if public is None:
         raise CliError(f"--console must be the key that `strands-robots keys console` prints there, not {shown(text)}.")
@@ -109,14 +134,18 @@ def _enroll_console(screen: Screen, text: str) -> None:
     )
 
 
-def _on_fleet(network: Network, wanted: list[str], seconds: float) -> tuple[list[LockoutReport], str, str]:
+def _on_fleet(network: Network, wanted: list[str], seconds: float) -> tuple[list[LockoutReport], NetworkKey, str]:
+    from strands_robots.device_connect.enrollment import network_of  # noqa: PLC0415 - loaded when a network is used
+
     with network.fleet() as fleet:
         reports = ask_robots(fleet, wanted or lockable_robots(fleet, seconds), seconds)
-        return reports, fleet.link.tenant, describe(fleet.link)
+        return reports, network_of(fleet.link), describe(fleet.link)
 
 
-def _on_mesh(network: Network, wanted: list[str], seconds: float) -> tuple[list[LockoutReport], str, str]:
-    return ask_mesh(network, seconds, wanted), DEFAULT_TENANT, "It was looked for on the native mesh."
+def _on_mesh(network: Network, wanted: list[str], seconds: float) -> tuple[list[LockoutReport], NetworkKey, str]:
+    from strands_robots.mesh import session  # noqa: PLC0415 - loaded when a network is used
+
+    return ask_mesh(network, seconds, wanted), session.network(), "It was looked for on the native mesh."
 
 
 def _statement(facts: Mapping[str, object]) -> Mapping[str, object]:

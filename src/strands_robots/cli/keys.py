@@ -14,6 +14,7 @@ import typer
 from strands_robots.cli.command import command
 from strands_robots.cli.output import CliError, Exit, Screen
 from strands_robots.safety.approval import state_dir
+from strands_robots.safety.consoles import console_key
 from strands_robots.safety.ed25519 import keygen, load_signing_key
 
 T = TypeVar("T")
@@ -55,8 +56,6 @@ def estop(screen: Screen, *, file: KeyFile, passphrase_file: PassphraseFile = No
 
 def console(screen: Screen) -> None:
     """Print the public key of this user's consoles, for robots on other machines."""
-    from strands_robots.mesh.console_keys import console_key  # noqa: PLC0415 - loaded when it is used
-
     public = _refusable(lambda: console_key().load_or_make()).public_text
     screen.data({"status": "success", "STRANDS_MESH_CONSOLE_PUBLIC_KEYS": public})
     screen.say(

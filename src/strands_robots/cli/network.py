@@ -98,6 +98,11 @@ class Network:
             raise CliError(f"The network does not carry this: {exc}", Exit.SILENT) from exc
 
     @property
+    def stated_tenant(self) -> str:
+        """The tenant of Device Connect, of the flag or the environment."""
+        return self.tenant or settings.raw("TENANT")
+
+    @property
     def flags(self) -> str:
         """The flags as given, without passwords, for another command."""
         words = []
@@ -123,7 +128,7 @@ class Network:
 
     def _reached(self) -> LinkConfig:
         backends = _backends()
-        tenant = self.tenant or settings.raw("TENANT")
+        tenant = self.stated_tenant
         if self.credentials:
             settings.put("MESSAGING_CREDENTIALS_FILE", str(self.credentials))
         if self.nats or self.connect or self.listen or self.multicast:

@@ -29,7 +29,7 @@ from strands_robots.envelope import text_of
 from strands_robots.policies import warm_profiles
 from strands_robots.policies.base import SPEED_MAX
 from strands_robots.policies.profiles import load_profiles
-from strands_robots.utils import ValidationError, number, own_device_id, redacted, shown, text
+from strands_robots.utils import ValidationError, identifier, number, own_device_id, redacted, shown, text
 
 if TYPE_CHECKING:
     from device_connect_edge.drivers import DeviceDriver
@@ -121,6 +121,9 @@ def serve(
         typer.Option("--detector", help="What sees objects for a real arm: a callable that makes it, module:name."),
     ] = None,
     state_hz: Annotated[float | None, typer.Option("--state-hz", help="stateUpdate events a second, idle.")] = None,
+    cell: Annotated[
+        str | None, typer.Option("--cell", help="The cell that it is in, for stops of one cell; none by default.")
+    ] = None,
     record: Annotated[
         Path | None, typer.Option("--record", help="Also record joints, pictures and events: a new .mcap file.")
     ] = None,
@@ -142,6 +145,7 @@ def serve(
         "STRANDS_ROBOT_COMMAND_ALLOW": command_allow,
         "STRANDS_ALLOW_MOCK": "true" if allow_mock else None,
         "STRANDS_DC_STATE_HZ": None if state_hz is None else str(number("--state-hz", state_hz, low=0.01, high=100)),
+        "STRANDS_CELL": None if cell is None else identifier("--cell", cell),
     }
     for name, value in flags.items():
         if value is not None:

@@ -134,6 +134,9 @@ class RobotDriver(CollectedOnce):
         hardware: True where a motion needs the operator's approval besides the caller's authorization.
     """
 
+    cell: str | None = None
+    """The cell that the robot is in, "" for none; None asks the robot, then ``STRANDS_CELL``."""
+
     verbs: ClassVar[Mapping[str, Verb]] = {}
     """The verbs of the device, by name; each becomes an RPC method."""
 

@@ -34,6 +34,7 @@ from strands_robots.device_connect.safety_registration import (
     LEAVE_TIMEOUT_S,
     REGISTRATIONS,
     SafetyRegistration,
+    cell_of,
     register_safety,
 )
 from strands_robots.device_connect.shutdown import LOOP_JOIN_TIMEOUT_S
@@ -106,6 +107,7 @@ async def init_device_connect(  # noqa: PLR0917 - the documented signature
     *,
     link: LinkConfig | None = None,
     bringup_timeout: float = BRINGUP_TIMEOUT_S,
+    cell: str | None = None,
 ) -> Runtime:
     """Serve a robot or a simulation; returns when it can be discovered and called.
 
@@ -122,6 +124,8 @@ async def init_device_connect(  # noqa: PLR0917 - the documented signature
         link: says how to connect in full, instead of URL and backend. A link that stays on this machine
             (``loopback_config()``) needs no ``allow_insecure``.
         bringup_timeout: seconds until the device has to be callable.
+        cell: the cell that the robot is in, for stops of one cell; its own or that of ``STRANDS_CELL`` by
+            default, "" for none.
 
     Raises:
         ValidationError: an argument out of its domain, or an unauthenticated transport without an opt-in.
@@ -133,12 +137,13 @@ async def init_device_connect(  # noqa: PLR0917 - the documented signature
     reach = link_for(messaging_url, messaging_backend, tenant, link)
     insecure = insecure_opt_in(allow_insecure, reach, stated=link is not None)
     driver = driver_for(robot, peer_type)
+    stays_in = cell_of(driver, cell)
     announceable(driver)
     warnings = _framework_warnings(name)
     registration = asyncio.create_task(
         called(
             REGISTRATIONS,
-            lambda: register_safety(name, driver, reach, named=peer_id is not None),
+            lambda: register_safety(name, driver, reach, named=peer_id is not None, cell=stays_in),
             bringup_timeout,
         )
     )
@@ -146,7 +151,12 @@ async def init_device_connect(  # noqa: PLR0917 - the documented signature
     async def before_live(messaging: Any) -> None:
         await refuse_duplicate(name, reach, messaging)
         # Before it can be called, it can be stopped.
-        await asyncio.shield(registration)
+        registered = await asyncio.shield(registration)
+        if registered is not None:
+            # In its presence from the first one on: a robot that states a cell, or none, reads the scope of a stop.
+            runtime.status["cell"] = registered.cell
+            if registered.signed_only:
+                runtime.status["signed_stops"] = True
 
     try:
         # Before the link: a worker and the loop that take the interpreter from one another would both take longer.
@@ -201,6 +211,7 @@ def init_device_connect_sync(  # noqa: PLR0917 - the documented signature
     *,
     link: LinkConfig | None = None,
     bringup_timeout: float = BRINGUP_TIMEOUT_S,
+    cell: str | None = None,
 ) -> Runtime:
     """Serve a robot as :func:`init_device_connect`, on the process's device loop.
 
@@ -227,6 +238,7 @@ def init_device_connect_sync(  # noqa: PLR0917 - the documented signature
                 allow_insecure=allow_insecure,
                 link=link,
                 bringup_timeout=bringup_timeout,
+                cell=cell,
             )
             host = _hosts.get(runtime)
             if host is None:

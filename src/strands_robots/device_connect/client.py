@@ -23,9 +23,12 @@ from strands_robots.bounded_json import LONG_MAX, json_object
 from strands_robots.device_connect.backends import LinkConfig, open_client
 from strands_robots.device_connect.backends.base import NoResponderError
 from strands_robots.device_connect.discovery import HEARTBEATS_S, Discovery, Peer, parts
+from strands_robots.device_connect.enrollment import network_of
 from strands_robots.device_connect.shutdown import LOOP_JOIN_TIMEOUT_S
 from strands_robots.envelope import Envelope, error
 from strands_robots.errors import StrandsRobotsError
+from strands_robots.safety.sightings import sightings
+from strands_robots.safety.statements import Purpose
 from strands_robots.safety.stopping import Outcome, explain, grade
 from strands_robots.utils import ValidationError, device_id, shown, text
 
@@ -33,6 +36,9 @@ T = TypeVar("T")
 
 COLLECT_MARGIN_S = 3.0
 """Seconds that a discovery may last beyond its own deadline, on a loaded machine."""
+
+PURPOSES = {"getStatus": Purpose.LOCKOUT_STATE, "resume": Purpose.RESUME_ANSWER}
+"""Functions whose answer has a signed part, with its purpose."""
 
 IN_FLIGHT = 64
 """Calls of :meth:`FleetClient.call_each` that wait for an answer at a time."""
@@ -84,6 +90,7 @@ class FleetClient:
         self._thread = threading.Thread(target=self._loop.run_forever, name="fleet-client", daemon=True)
         self._messaging: Any = None
         self._discovery: Discovery | None = None
+        self._network = network_of(link)
 
     def __enter__(self) -> Self:
         self._thread.start()
@@ -302,7 +309,20 @@ class FleetClient:
             data = await self._messaging.request(self._subject(f"{name}.cmd"), encoded, timeout=within)
         except MessagingError as exc:
             raise self._unanswered(name, within, exc) from exc
-        return _answer(name, verb, data)
+        answer = _answer(name, verb, data)
+        self._remember(name, verb, params, answer)
+        return answer
+
+    def _remember(self, device: str, verb: str, params: Mapping[str, Any], answer: Envelope) -> None:
+        """Have this machine remember who answered."""
+        purpose = PURPOSES.get(verb)
+        if purpose is None:
+            sightings().note(self._network, device)
+            return
+        asked = params.get("assertion") if verb == "resume" else params
+        nonce = asked.get("nonce") if isinstance(asked, Mapping) else None
+        expected = {"nonce": nonce} if nonce else {}
+        sightings().note_answer(self._network, device, purpose, answer.get("statement"), expected)
 
     def _unanswered(self, device: str, within: float, exc: Exception) -> Exception:
         """Return the error for an unanswered call."""

@@ -22,7 +22,9 @@ from strands_robots import settings
 from strands_robots.bounded_json import json_object
 from strands_robots.device_connect.backends.base import Backend, NoResponderError, UnreadableReplyError
 from strands_robots.device_connect.beat import BEAT_S, HEARTBEAT_S, named_in
+from strands_robots.device_connect.enrollment import network_of
 from strands_robots.errors import StrandsRobotsError
+from strands_robots.safety.sightings import sightings
 
 logger = logging.getLogger(__name__)
 
@@ -108,6 +110,12 @@ class Peer:
         names = {str(each.get("name", "")) for each in self.functions}
         return next((verb for verb in ("stop", "stopMotion") if verb in names), None)
 
+    @property
+    def cell(self) -> str | None:
+        """Its cell, "" for none; None where it states neither, and reads no scope."""
+        cell = self.status.get("cell")
+        return cell if isinstance(cell, str) else None
+
     @classmethod
     def of(cls, description: Mapping[str, Any]) -> Peer:
         """Read a presence message or a registration; a field that it lacks is empty."""
@@ -134,6 +142,7 @@ class Discovery:
         """Empty, or one sentence on why the last collection may lack devices or name some that are gone."""
         self._messaging = messaging
         self._root = f"device-connect.{messaging.link.tenant}"
+        self._network, self._remembered = network_of(messaging.link), sightings()
         self._present: dict[str, Peer] = {}
         self._listed: dict[str, Peer] = {}
         self._listed_at: float | None = None
@@ -299,6 +308,7 @@ class Discovery:
                 async for row in self._rows(within):
                     peer = Peer.of(row)
                     devices[peer.id] = peer
+                    self._remember(peer)
                     self._found(peer)
             except NoResponderError:
                 if not self._messaging.link.is_peer or loop.time() >= linked_by:
@@ -337,7 +347,22 @@ class Discovery:
             return
         if answer.get("device_id") == name:
             peer = self._described[name] = replace(Peer.of(answer), heard_at=time.monotonic())
+            self._remember(peer)
             self._found(peer)
+
+    def _remember(self, peer: Peer, *, departing: bool = False) -> None:
+        """Have this machine remember a device that was heard."""
+        cell, stops = peer.status.get("cell"), peer.stop_verb is not None
+        self._remembered.note(
+            self._network,
+            peer.id,
+            # A device that states no cell is in none, so that a forged presence cannot put it into one.
+            cell=None if departing else cell if isinstance(cell, str) else "",
+            signed_only=True if peer.status.get("signed_stops") is True else None,
+            # A departing device describes itself no more.
+            stoppable=True if stops else None if departing else False,
+            departing=departing,
+        )
 
     async def _ask(self, leaf: str, method: str, params: Mapping[str, Any], within: float) -> Mapping[str, Any]:
         request = {"jsonrpc": "2.0", "id": uuid.uuid4().hex, "method": method, "params": params}
@@ -354,11 +379,13 @@ class Discovery:
         if presence.get("device_id") != name:
             return
         if presence.get("departing"):
+            self._remember(Peer.of(presence), departing=True)
             self._present.pop(name, None)
             self._beats.pop(name, None)
             self._named.discard(name)
         else:
             peer = self._present[name] = replace(Peer.of(presence), heard_at=time.monotonic())
+            self._remember(peer)
             self._found(peer)
 
     async def _on_heartbeat(self, data: bytes, subject: str, reply: str | None) -> None:
@@ -368,6 +395,7 @@ class Discovery:
             # Access rules guard the topic of one device, so a beat proves the life of that one only.
             named = [each for each in named if each == own]
         for name in (own, *named):
+            self._remembered.note(self._network, name)
             # Taken out and put in again, so that the longest silent ones are dropped first.
             self._beats.pop(name, None)
             self._beats[name] = now

@@ -10,9 +10,10 @@ from typing import Any
 
 from device_connect_edge.drivers import DeviceDriver
 
-from strands_robots.contract import Haltable
+from strands_robots.contract import Haltable, body_of
 from strands_robots.device_connect._compat import link_of, stated_id
 from strands_robots.device_connect.backends import LinkConfig
+from strands_robots.device_connect.enrollment import network_of
 from strands_robots.device_connect.stop_link import NoStopLink, stop_link
 from strands_robots.envelope import Envelope
 from strands_robots.safety.estop_listener import ListenerRegistration, estop_listener
@@ -22,6 +23,8 @@ from strands_robots.safety.orders import REASON_MAX, StopOrder, epoch_of
 from strands_robots.safety.persistence import hardware_key, simulation_key
 from strands_robots.safety.plane import Registered, plane
 from strands_robots.safety.resume import is_epoch
+from strands_robots.safety.scope import own_cell
+from strands_robots.safety.sightings import sightings
 from strands_robots.safety.statements import Purpose, signed
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.serving.workers import Share
@@ -38,7 +41,13 @@ LEAVE_TIMEOUT_S = 15.0
 
 
 def register_safety(
-    device_id: str, driver: DeviceDriver, link: LinkConfig | None, *, named: bool, tenant: str = DEFAULT_TENANT
+    device_id: str,
+    driver: DeviceDriver,
+    link: LinkConfig | None,
+    *,
+    named: bool,
+    tenant: str = DEFAULT_TENANT,
+    cell: str = "",
 ) -> SafetyRegistration | None:
     """Register a driver's robot with the safety plane; None without a robot.
 
@@ -46,6 +55,7 @@ def register_safety(
         link: the device's; None where it is none that a connection of the listener's own can take.
         tenant: the device's, where there is no ``link``.
         named: the operator gave ``device_id``; a simulation's lockout is kept only then.
+        cell: the cell that it is in; empty for none.
     """
     robot = getattr(driver, "robot", driver)
     gate = getattr(robot, "gate", None)
@@ -53,7 +63,7 @@ def register_safety(
         logger.warning("%s has no robot that the safety plane could halt; it hears no emergency stop.", device_id)
         return None
     key = _key(device_id, driver, robot, named=named)
-    registration = SafetyRegistration(device_id, robot, link, key, link.tenant if link else tenant)
+    registration = SafetyRegistration(device_id, robot, link, key, link.tenant if link else tenant, cell=cell)
     if hasattr(driver, "registration"):
         driver.registration = registration
         registration.driver = driver
@@ -68,7 +78,9 @@ def register_served(driver: DeviceDriver, runtime: Any) -> SafetyRegistration | 
     """
     link = link_of(runtime)
     device_id = unreserved("device_id", runtime.device_id, RESERVED_DEVICE_IDS)
-    made = register_safety(device_id, driver, link, named=stated_id(runtime), tenant=runtime.tenant)
+    made = register_safety(
+        device_id, driver, link, named=stated_id(runtime), tenant=runtime.tenant, cell=cell_of(driver)
+    )
     if made is not None:
         made.open()
     if link is None:
@@ -78,6 +90,16 @@ def register_served(driver: DeviceDriver, runtime: Any) -> SafetyRegistration | 
             runtime.device_id,
         )
     return made
+
+
+def cell_of(driver: DeviceDriver, cell: str | None = None) -> str:
+    """Return the cell as given, as driver or robot state it, or of ``STRANDS_CELL``.
+
+    Raises:
+        ValidationError: it is no identifier.
+    """
+    stated = (getattr(each, "cell", None) for each in (driver, body_of(getattr(driver, "robot", None))))
+    return own_cell(next((each for each in (cell, *stated) if isinstance(each, str)), None))
 
 
 def _key(device_id: str, driver: DeviceDriver, robot: Any, *, named: bool) -> str | None:
@@ -93,14 +115,25 @@ class SafetyRegistration:
     """One robot in the safety plane and on the e-stop listener."""
 
     def __init__(
-        self, device_id: str, robot: Any, link: LinkConfig | None, key: str | None, tenant: str = DEFAULT_TENANT
+        self,
+        device_id: str,
+        robot: Any,
+        link: LinkConfig | None,
+        key: str | None,
+        tenant: str = DEFAULT_TENANT,
+        *,
+        cell: str = "",
     ) -> None:
         self.device_id = device_id
+        self.cell = cell
         # Two tenants may each have a device of this id in one process.
         name = local_name(tenant, device_id)
         self._name = name
         self.driver: Any = None
-        self.entry: Registered = plane().register(name, robot, key=key, wire_id=device_id)
+        self._network = None if link is None else network_of(link)
+        self.was_here_s = None if self._network is None else sightings().was_here(self._network, device_id)
+        """Seconds since this robot was last served from this machine; None where over ten minutes, or never."""
+        self.entry: Registered = plane().register(name, robot, key=key, wire_id=device_id, cell=cell)
         self._held: Registered | None = self.entry
         try:
             self._listener: ListenerRegistration = estop_listener().register(
@@ -109,6 +142,8 @@ class SafetyRegistration:
                 lambda: NoStopLink() if link is None else stop_link(link),
                 lambda: self.identity,
                 opened=False,
+                network=self._network,
+                was_here=self.was_here_s is not None,
             )
         except BaseException:
             self.entry.close()
@@ -131,8 +166,18 @@ class SafetyRegistration:
         Until then the runtime's handler and every RPC ``stop`` stop the robot.
         """
         # No answer that this link sends waits for the key.
-        self.identity  # noqa: B018
+        identity = self.identity
         self._listener.open()
+        if self._network is not None:
+            public = None if identity is None else identity.public
+            sightings().serve(
+                self._network, self.device_id, cell=self.cell, signed_only=self.signed_only, public=public
+            )
+
+    @property
+    def signed_only(self) -> bool:
+        """True where only signed stops count."""
+        return estop_listener().signed
 
     @property
     def up(self) -> bool:
@@ -142,7 +187,9 @@ class SafetyRegistration:
     def runtime_estop(self, source: object, params: object, raw: bytes | int | None = None) -> None:
         """Act on an emergency stop of the runtime's handler; return at once."""
         if isinstance(source, str):
-            estop_listener().accept_params(source, params if isinstance(params, Mapping) else {}, "runtime", raw)
+            estop_listener().accept_params(
+                source, params if isinstance(params, Mapping) else {}, "runtime", raw, self._network
+            )
 
     def raise_estop(self, params: Mapping[str, Any]) -> None:
         """Lock and halt on this device's own emergency stop; return at once.
@@ -174,6 +221,7 @@ class SafetyRegistration:
             "lockout": [each.fields() for each in lockouts],
             "check_in": check_in,
             "stop_lane": self.up,
+            "cell": self.cell,
             "statement": signed(self.identity, Purpose.LOCKOUT_STATE, self.device_id, fields),
         }
 
@@ -184,6 +232,8 @@ class SafetyRegistration:
     def leave(self) -> None:
         """Leave listener and plane; block while a link closes. Safe to call twice."""
         self._listener.close()
+        if self._network is not None:
+            sightings().leave(self._network, self.device_id)
         if getattr(self.driver, "registration", None) is self:
             # Whatever serves the driver next registers it anew.
             self.driver.registration = None

@@ -17,8 +17,10 @@ from typing import TYPE_CHECKING, Any
 from device_connect_edge.messaging import MessagingError
 
 from strands_robots.device_connect.backends import LinkConfig
-from strands_robots.safety.estop_listener import CHECK_IN_ANSWER, VERDICT, OnEvent, OnState, StopLink
+from strands_robots.safety.estop_listener import CHECK_IN_ANSWER, ESTOP, VERDICT, OnEvent, OnState, StopLink
+from strands_robots.safety.missed_stops import ANSWER, QUESTION
 from strands_robots.safety.orders import PARSED_MAX_BYTES
+from strands_robots.safety.roster_report import STOP_ROSTER
 from strands_robots.safety.stop_log import stop_logger
 
 if TYPE_CHECKING:
@@ -36,8 +38,11 @@ LEASE_MS = 4000
 OVERLAP_S = 2.0
 """Time in which a replaced session still carries stops: peers learn of the new one and of one another meanwhile."""
 
-ANSWERS = frozenset((VERDICT, CHECK_IN_ANSWER))
-"""Events that answer; any other one is a stop or a check-in, and goes first."""
+ANSWERS = frozenset((VERDICT, CHECK_IN_ANSWER, QUESTION, ANSWER, STOP_ROSTER))
+"""Events of which many may be sent at once; any other one is a stop or a check-in, and goes first."""
+
+LOST_MAX = 1024
+"""Peers remembered that were linked once; one of them that is linked again makes the link up anew."""
 
 CLOSE_S = 10.0
 """Seconds that a close waits for the link's thread."""
@@ -86,14 +91,14 @@ def _from_here(endpoint: str) -> str:
 
 
 class _State:
-    """Up or down; reports each change."""
+    """Up or down; reports each change, and again when it is up anew."""
 
     def __init__(self, on_state: OnState) -> None:
         self.up = False
         self._on_state = on_state
 
-    def set(self, up: bool) -> None:
-        if up != self.up:
+    def set(self, up: bool, *, anew: bool = False) -> None:
+        if up != self.up or (up and anew):
             self.up = up
             self._on_state(up)
 
@@ -107,6 +112,8 @@ class ZenohStopLink:
         self._sessions: tuple[LinkedSession, ...] = ()
         self._dropping, self._reporting, self._starting = threading.Lock(), threading.Lock(), threading.Lock()
         self._state = _State(lambda up: None)
+        self._linked: frozenset[tuple[int, str]] = frozenset()
+        self._lost: dict[str, None] = {}
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
         self._subscribed: tuple[Collection[str], OnEvent] = ((), lambda event, source, payload: None)
@@ -120,7 +127,7 @@ class ZenohStopLink:
     @property
     def remotes(self) -> set[str]:
         """The Zenoh ids of the sessions it is linked to."""
-        return {zid for each in self._sessions for zid in tuple(each.remotes)}
+        return {zid for _, zid in self._links()}
 
     def open(self, events: Collection[str], on_event: OnEvent, on_state: OnState) -> None:
         self._state = _State(on_state)
@@ -229,7 +236,19 @@ class ZenohStopLink:
 
     def _report(self) -> None:
         with self._reporting:
-            self._state.set(bool(self.remotes) and not self._closing.is_set())
+            before, self._linked = self._linked, self._links()
+            here = {zid for _, zid in self._linked}
+            new_session = bool({each for each, _ in self._linked} - {each for each, _ in before})
+            # A peer that is back may have sent a stop meanwhile, though others stayed linked.
+            back = new_session or not here.isdisjoint(self._lost)
+            self._lost.update(dict.fromkeys(zid for _, zid in before if zid not in here))
+            for zid in (*here, *list(self._lost)[:-LOST_MAX]):
+                self._lost.pop(zid, None)
+            self._state.set(bool(here) and not self._closing.is_set(), anew=back)
+
+    def _links(self) -> frozenset[tuple[int, str]]:
+        """Return each link as session and peer."""
+        return frozenset((id(each), zid) for each in self._sessions for zid in tuple(each.remotes))
 
 
 class NatsStopLink:
@@ -245,10 +264,19 @@ class NatsStopLink:
         self._sending: set[asyncio.Future[None]] = set()
         self._end: asyncio.Event | None = None
         self._thread: threading.Thread | None = None
+        self._stops: set[str] = set()
 
     @property
     def up(self) -> bool:
         return self._state.up
+
+    @property
+    def denied(self) -> str:
+        """The server's refusal of a stop of this connection, or ""."""
+        client, said = self._client, ""
+        for subject in tuple(self._stops):
+            said = said or (client.denied(subject) if client is not None else "")
+        return said
 
     def open(self, events: Collection[str], on_event: OnEvent, on_state: OnState) -> None:
         self._state = _State(on_state)
@@ -261,7 +289,10 @@ class NatsStopLink:
         loop = self._loop
         if loop is None or loop.is_closed() or not self._state.up:
             return False
-        loop.call_soon_threadsafe(self._send, f"{self._root}.{source}.event.{event}", payload)
+        subject = f"{self._root}.{source}.event.{event}"
+        if event == ESTOP:
+            self._stops.add(subject)
+        loop.call_soon_threadsafe(self._send, subject, payload)
         return True
 
     def close(self) -> None:

@@ -16,7 +16,7 @@ from strands_robots.hardware.calibration import answer_lost, write_to_servos
 from strands_robots.hardware.device_facts import require_port
 from strands_robots.hardware.speed import default_speeds
 from strands_robots.policies.base import Action, checked_speeds, is_velocity, numbers
-from strands_robots.safety.gate import Permit, PermitVoidError
+from strands_robots.safety.gate import MotionsHeldError, Permit, PermitVoidError
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import StopLevel
 from strands_robots.utils import ValidationError, number, shown
@@ -53,6 +53,9 @@ class DeviceBody:
     Raises:
         ValidationError: the device lacks a part of the interface, a range is none, or it cannot release torque.
     """
+
+    stall_lag = 0.05
+    """Least lag of a joint in contact, in radians: a gear sticks and has play before it moves."""
 
     def __init__(
         self,
@@ -171,17 +174,22 @@ class DeviceBody:
         def send() -> Any:
             if not permit.valid:
                 raise PermitVoidError(f"{self.name} was stopped")
+            if permit.held:
+                # Also before the second try of an exchange that the process did not run in.
+                raise MotionsHeldError(f"{self.name} holds")
             if self._limp:
                 self._stiffen()
             self.driven = True
             # A driver that bounds the step reads the joints first, whose answer may be lost.
             return self.device.send_action(dict(action))
 
-        with self.lock:
+        def exchange() -> Mapping[str, Any]:
             sent = self._exchange(send, self._send_tries)
             told = sent if isinstance(sent, Mapping) else dict(action)
             self.targets |= numbers(told)
             return told
+
+        return permit.write(self.lock, exchange)
 
     def hold(self, permit: Permit | None = None) -> None:
         with self.lock:
@@ -191,11 +199,14 @@ class DeviceBody:
 
     def let_go(self, permit: Permit) -> None:
         """Switch the torque off at the end of a motion."""
-        with self.lock:
+
+        def release() -> None:
             if not permit.valid:
                 raise PermitVoidError(f"{self.name} was stopped")
             self._release()
             self.driven = False
+
+        permit.write(self.lock, release)
 
     @property
     def motors(self) -> tuple[str, ...]:

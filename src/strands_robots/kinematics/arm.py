@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -18,6 +18,9 @@ ACCELERATION_RAD_S2 = 8.0
 
 GRIP_MARGIN = 0.03
 """Share of the gripper's range by which an object keeps the jaws from where they are told to go."""
+
+SLIDE_SPEED_M_S = 0.25
+"""Greatest speed of a sliding joint in a planned motion."""
 
 SAG_RAD = 0.06
 """Greatest distance of a resting joint from where it was told to be."""
@@ -33,19 +36,25 @@ class JointMap:
     Attributes:
         observed: key of the joint in an observation of the body.
         commanded: its action key.
+        modelled: an observation is in the model's own unit, and only a command is mapped.
     """
 
     observed: str
     commanded: str
     factor: float = 1.0
     offset: float = 0.0
+    modelled: bool = False
+
+    def position(self, observed: float) -> float:
+        """Return the joint position of an observation."""
+        return observed if self.modelled else self.radians(observed)
 
     def value(self, radians: float) -> float:
-        """Return the body's value of a joint position."""
+        """Return the command of a joint position."""
         return self.offset + self.factor * radians
 
     def radians(self, value: float) -> float:
-        """Return the joint position of a body's value."""
+        """Return the joint position of a command."""
         return (value - self.offset) / self.factor
 
 
@@ -109,7 +118,11 @@ class Arm:
     def __post_init__(self) -> None:
         count = len(self.chain.joints)
         speeds = [
-            min(JOINT_SPEED_RAD_S, self.speeds.get(each.commanded, math.inf) / abs(each.factor)) for each in self.maps
+            min(
+                JOINT_SPEED_RAD_S if joint.turns else SLIDE_SPEED_M_S,
+                self.speeds.get(each.commanded, math.inf) / abs(each.factor),
+            )
+            for joint, each in zip(self.chain.joints, self.maps, strict=True)
         ]
         bounds = Bounds(np.array(speeds), np.full(count, ACCELERATION_RAD_S2))
         object.__setattr__(self, "bounds", bounds)
@@ -117,12 +130,19 @@ class Arm:
     @classmethod
     def of(cls, chain: Chain) -> Arm:
         """Return the arm of a body whose numbers are the model's own."""
-        maps = tuple(JointMap(joint.name, joint.key) for joint in chain.joints)
+        maps = _maps(chain)
         gripper = chain.gripper
         if gripper is None:
             return cls(chain, maps, None)
         seen = (gripper.joint.low, gripper.joint.high)
         return cls(chain, maps, JawMap(gripper.joint.name, gripper.joint.key, seen, (gripper.closed, gripper.opened)))
+
+    def whole(self) -> Arm:
+        """Return this arm with every actuated joint of its model."""
+        chain = self.chain.whole()
+        if chain is self.chain:
+            return self
+        return replace(self, chain=chain, maps=(*self.maps, *_maps(chain)[len(self.maps) :]))
 
     def state(self, observation: Mapping[str, float]) -> ArmState:
         """Return the arm's state in an observation of its body.
@@ -133,18 +153,27 @@ class Arm:
         missing = [each.observed for each in self.maps if each.observed not in observation]
         if missing:
             raise ValidationError(f"the arm's {', '.join(missing)} could not be read.")
-        joints = np.array([each.radians(observation[each.observed]) for each in self.maps])
+        joints = np.array([each.position(observation[each.observed]) for each in self.maps])
         jaw = self.jaw
         known = jaw is not None and jaw.observed in observation
         return ArmState(joints, jaw.opening(observation[jaw.observed]) if jaw is not None and known else None)
 
     def told(self, targets: Mapping[str, float]) -> Floats:
         """Return the joints that a body was told; NaN where that is not known."""
-        return np.array([each.radians(targets.get(each.commanded, np.nan)) for each in self.maps])
+        return np.array(
+            [
+                np.nan if joint.refusal else each.radians(targets.get(each.commanded, np.nan))
+                for joint, each in zip(self.chain.joints, self.maps, strict=True)
+            ]
+        )
 
     def action(self, joints: Floats) -> Action:
-        """Return the targets of joint positions (rad)."""
-        return {each.commanded: each.value(float(at)) for each, at in zip(self.maps, joints, strict=True)}
+        """Return the targets of joint positions (rad), of the joints that take positions."""
+        return {
+            each.commanded: each.value(float(at))
+            for joint, each, at in zip(self.chain.joints, self.maps, joints, strict=True)
+            if not joint.refusal
+        }
 
     def grip(self, opening: float) -> Action:
         """Return the target of a gripper's opening; nothing without a gripper."""
@@ -163,3 +192,7 @@ class Arm:
         None without a gripper.
         """
         return None if state.opening is None else state.opening > told + GRIP_MARGIN
+
+
+def _maps(chain: Chain) -> tuple[JointMap, ...]:
+    return tuple(JointMap(joint.name, joint.key, joint.factor, joint.offset, modelled=True) for joint in chain.joints)

@@ -17,6 +17,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from strands_robots.kinematics.servos import JointDrive, actuator_kind, drives, is_servo
+from strands_robots.kinematics.tip import ARM_JOINTS_MIN, mark_tip
 from strands_robots.utils import ValidationError
 
 Floats = NDArray[np.float64]
@@ -25,8 +27,6 @@ MODELS = Path(__file__).parents[1] / "models"
 
 TABLE = "table"
 """Name of the plane on which the arm stands, in refusals; added to a model without one."""
-
-ARM_JOINTS_MIN = 3
 
 _AXIAL_M = 1e-3
 """Greatest distance of the tip from the axis of the last joint that makes this joint a roll."""
@@ -40,7 +40,13 @@ _HINGE, _SLIDE, _FREE = (
 
 @dataclass(frozen=True, slots=True)
 class ArmJoint:
-    """One joint: action key, places in ``qpos`` and ``qvel``, range (rad or m)."""
+    """One joint: action key, places in ``qpos`` and ``qvel``, range (rad or m).
+
+    Attributes:
+        factor: command of its position servo for one radian or metre.
+        offset: its command for the joint's zero.
+        refusal: why it cannot be moved to a position; empty where it can.
+    """
 
     name: str
     key: str
@@ -49,6 +55,9 @@ class ArmJoint:
     low: float
     high: float
     turns: bool
+    factor: float = 1.0
+    offset: float = 0.0
+    refusal: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,28 +100,31 @@ class Chain:
         spec: the arm alone, with its base where the base frame is; it is changed.
         label: what the model is called in refusals.
         table_z: height of the table in the base frame, metres; None for none.
+        tip: site or body that motions place; by default as :mod:`~strands_robots.kinematics.tip` finds it.
 
     Raises:
-        ValidationError: the model has no arm: no site at a tip, or fewer than three joints between base and tip.
+        ValidationError: the model does not compile, or has no joint with an actuator.
     """
 
-    def __init__(self, spec: Any, label: str, table_z: float | None = 0.0) -> None:
+    def __init__(self, spec: Any, label: str, table_z: float | None = 0.0, tip: str = "") -> None:
         has_plane = any(geom.type == mujoco.mjtGeom.mjGEOM_PLANE for geom in spec.worldbody.geoms)
         if table_z is not None and not has_plane:
-            spec.worldbody.add_geom(
-                name=TABLE, type=mujoco.mjtGeom.mjGEOM_PLANE, size=[2, 2, 0.05], pos=[0, 0, table_z]
-            )
+            # Without a name, which the model may have given to a part of its own.
+            spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[2, 2, 0.05], pos=[0, 0, table_z])
+        name = mark_tip(spec, tip)
         try:
             self.model = model = spec.compile()
         except (ValueError, mujoco.FatalError) as exc:
             raise ValidationError(f"model {label} does not compile: {' '.join(str(exc).split())[:300]}") from exc
         self.label = label
         self.table_z = 0.0 if table_z is None else table_z
-        name = tip_site(model)
-        if not name:
-            raise ValidationError(f"{label} has no site at its tip, so it cannot be moved to a point.")
-        self.site = int(model.site(name).id)
-        self.joints = _joints_between(model, int(model.site_bodyid[self.site]), label)
+        self._drives = drives(model)
+        self.site = int(model.site(name).id) if name else -1
+        self.joints = self._leading(int(model.site_bodyid[self.site])) if name else ()
+        if not self.joints:
+            raise ValidationError(f"{label} has no joint that could be moved to a position{_actuators(model)}.")
+        self._models_body = True
+        self.floats = bool((model.jnt_type == _FREE).any())
         self._home = _home(model)
         data = self.data(self.rest)
         self.axis, self.roll = self._approach(data)
@@ -138,7 +150,7 @@ class Chain:
     @property
     def shoulder(self) -> Floats:
         """Place of the first joint (m); an approach points away from it."""
-        index = int(self.model.joint(self.joints[0].name).id)
+        index = int(self.model.dof_jntid[self.joints[0].dof])
         anchor: Floats = self.data(self.rest).xanchor[index].copy()
         return anchor
 
@@ -147,9 +159,33 @@ class Chain:
         """Indices of the joints that place the tip: all but a roll."""
         return np.array([i for i in range(len(self.joints)) if i != self.roll])
 
+    def whole(self) -> Chain:
+        """Return this chain with every actuated joint but the gripper's."""
+        if not self._models_body:
+            return self
+        own = {joint.name for joint in self.joints} | ({self.gripper.joint.name} if self.gripper else set())
+        others = [each for each in map(self._joint, sorted(self._drives)) if each.name not in own]
+        if not others:
+            return self
+        wider = copy.copy(self)
+        wider.joints = (*self.joints, *others)
+        return wider
+
+    def require_arm(self) -> None:
+        """Refuse an arm whose tip cannot be moved to a point."""
+        refused = next((joint.refusal for joint in self.joints if joint.refusal), "")
+        if refused:
+            raise ValidationError(f"the tip of {self.label} cannot be moved to a point: {refused}.")
+        if len(self.joints) < ARM_JOINTS_MIN:
+            raise ValidationError(f"{self.label} has no arm: {len(self.joints)} joints lead to its tip.")
+
     def limited(self, ranges: Mapping[str, tuple[float, float]]) -> Chain:
-        """Return this chain with joints narrowed to ``ranges``, by name (rad or m)."""
+        """Return this chain for a real arm, with narrower joints.
+
+        ``ranges`` are by name (rad or m). The arm has servos of its own, and no joint but these.
+        """
         narrowed = copy.copy(self)
+        narrowed._models_body = False
         narrowed.joints = tuple(_narrowed(joint, ranges) for joint in self.joints)
         return narrowed
 
@@ -185,21 +221,54 @@ class Chain:
         direction from it to the tip.
         """
         last = self.joints[-1]
-        index = int(self.model.joint(last.name).id)
+        index = int(self.model.dof_jntid[last.dof])
         axis, anchor = data.xaxis[index], data.xanchor[index]
         towards = data.site_xpos[self.site] - anchor
         along = float(axis @ towards)
         rotation = data.site_xmat[self.site].reshape(3, 3)
-        if not last.turns or abs(along) < 0.5 * float(np.linalg.norm(towards)):
-            length = float(np.linalg.norm(towards))
+        length = float(np.linalg.norm(towards))
+        if not last.turns or length < 1e-6 or abs(along) < 0.5 * length:
             direction = towards / length if length > 1e-6 else axis
             return rotation.T @ direction, None
         beside = float(np.linalg.norm(towards - along * axis))
         return rotation.T @ (axis * np.sign(along)), len(self.joints) - 1 if beside < _AXIAL_M else None
 
+    def _leading(self, body: int) -> tuple[ArmJoint, ...]:
+        """Return the actuated joints between the base and a body."""
+        model, found = self.model, []
+        while body > 0:
+            first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
+            found += [index for index in reversed(range(first, first + count)) if index in self._drives]
+            body = int(model.body_parentid[body])
+        return tuple(self._joint(index) for index in reversed(found))
+
+    def _joint(self, index: int) -> ArmJoint:
+        model, drive = self.model, self._drives.get(index)
+        name, turns = str(model.joint(index).name), int(model.jnt_type[index]) == _HINGE
+        low, high = model.jnt_range[index] if model.jnt_limited[index] else (-np.pi, np.pi) if turns else (-1.0, 1.0)
+        lowest, highest = _servo_range(model, drive)
+        if max(low, lowest) < min(high, highest):
+            low, high = max(low, lowest), min(high, highest)
+        places = int(model.jnt_qposadr[index]), int(model.jnt_dofadr[index])
+        if drive is None:
+            return ArmJoint(name, name, *places, float(low), float(high), turns, refusal=f"{name} has no actuator")
+        key = name if drive.actuator is None else str(model.actuator(drive.actuator).name) or name
+        if drive.servo:
+            return ArmJoint(name, key, *places, float(low), float(high), turns, drive.factor, drive.offset)
+        refusal = f"the actuator {key} of {name} is a {drive.kind}, whose command is no position"
+        return ArmJoint(name, key, *places, float(low), float(high), turns, refusal=refusal)
+
+    def _gripping(self, finger: int) -> int | None:
+        """Return the servo of a finger, or the only actuator beside the arm's."""
+        model, drive = self.model, self._drives.get(finger)
+        keys = {joint.key for joint in self.joints}
+        free = [index for index in range(model.nu) if model.actuator(index).name not in keys]
+        actuator = drive.actuator if drive is not None else free[0] if len(free) == 1 else None
+        return actuator if actuator is not None and is_servo(model, actuator) else None
+
     def _gripper(self, data: Any) -> Gripper | None:
         model, own = self.model, {joint.name for joint in self.joints}
-        hand = int(model.jnt_bodyid[model.joint(self.joints[-1].name).id])
+        hand = int(model.dof_bodyid[self.joints[-1].dof])
         fingers = [
             index
             for index in range(model.njnt)
@@ -209,14 +278,12 @@ class Chain:
         ]
         if not fingers:
             return None
-        joint = _arm_joint(model, fingers[0])
-        actuator = _actuator(model, fingers[0])
-        free = [i for i in range(model.nu) if model.actuator(i).name not in {each.key for each in self.joints}]
-        if actuator is None and len(free) == 1:
-            actuator = free[0]
+        joint, actuator = self._joint(fingers[0]), self._gripping(fingers[0])
+        if actuator is None and model.nu:
+            return None
         closed, opened = joint.low, joint.high
         if actuator is not None:
-            joint = replace(joint, key=str(model.actuator(actuator).name) or joint.name)
+            joint = replace(joint, key=str(model.actuator(actuator).name) or joint.name, refusal="")
             if model.actuator_ctrllimited[actuator]:
                 closed, opened = (float(v) for v in model.actuator_ctrlrange[actuator])
         tip, rotation = data.site_xpos[self.site], data.site_xmat[self.site].reshape(3, 3)
@@ -240,11 +307,12 @@ class Chain:
         return Gripper(joint, closed, opened, rotation.T @ closing, pad)
 
 
-def tip_site(model: Any, prefix: str = "") -> str:
-    """Return the site of the hand: gripper_tip, else the last one, else none."""
-    sites = [name for name in (str(model.site(i).name) for i in range(model.nsite)) if name.startswith(prefix)]
-    named = [name for name in sites if name.endswith("gripper_tip")]
-    return (named or sites[-1:] or [""])[0]
+def _servo_range(model: Any, drive: JointDrive | None) -> tuple[float, float]:
+    """Return the joint positions (rad or m) of the ends of a servo's commands."""
+    if drive is None or drive.actuator is None or not drive.servo or not model.actuator_ctrllimited[drive.actuator]:
+        return -np.inf, np.inf
+    low, high = ((float(each) - drive.offset) / drive.factor for each in model.actuator_ctrlrange[drive.actuator])
+    return min(low, high), max(low, high)
 
 
 @cache
@@ -253,47 +321,12 @@ def built_in(name: str) -> Chain:
     return Chain(mujoco.MjSpec.from_file(str(MODELS / f"{name}.xml")), name)
 
 
-def _joints_between(model: Any, body: int, label: str) -> tuple[ArmJoint, ...]:
-    found: list[ArmJoint] = []
-    while body > 0:
-        first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
-        for index in reversed(range(first, first + count)):
-            kind = int(model.jnt_type[index])
-            if kind == _FREE:
-                break
-            if kind not in (_HINGE, _SLIDE):
-                raise ValidationError(
-                    f"{label} has a joint that is neither hinge nor slide; its arm cannot be planned."
-                )
-            found.insert(0, _arm_joint(model, index))
-        body = int(model.body_parentid[body])
-    if len(found) < ARM_JOINTS_MIN:
-        raise ValidationError(f"{label} has no arm: {len(found)} joints lead to its tip.")
-    return tuple(found)
-
-
-def _arm_joint(model: Any, index: int) -> ArmJoint:
-    name = str(model.joint(index).name)
-    actuator = _actuator(model, index)
-    key = name if actuator is None else str(model.actuator(actuator).name) or name
-    turns = int(model.jnt_type[index]) == _HINGE
-    low, high = model.jnt_range[index] if model.jnt_limited[index] else (-np.pi, np.pi) if turns else (-1.0, 1.0)
-    if actuator is not None and model.actuator_ctrllimited[actuator]:
-        low, high = max(low, model.actuator_ctrlrange[actuator][0]), min(high, model.actuator_ctrlrange[actuator][1])
-    address, dof = int(model.jnt_qposadr[index]), int(model.jnt_dofadr[index])
-    return ArmJoint(name, key, address, dof, float(low), float(high), turns)
-
-
-def _actuator(model: Any, joint: int) -> int | None:
-    on_joint = mujoco.mjtTrn.mjTRN_JOINT.value
-    return next(
-        (
-            index
-            for index in range(model.nu)
-            if int(model.actuator_trntype[index]) == on_joint and int(model.actuator_trnid[index][0]) == joint
-        ),
-        None,
-    )
+def _actuators(model: Any) -> str:
+    """Return a model's actuators by name, for a refusal."""
+    kinds = [actuator_kind(model, index) for index in range(model.nu)]
+    names = [f"{model.actuator(index).name} ({kind})" for index, kind in enumerate(kinds)]
+    more = f" and {len(names) - 6} more" if len(names) > 6 else ""
+    return f"; its actuators are {', '.join(names[:6])}{more}" if names else ", and no actuator"
 
 
 def _ancestors(model: Any, body: int) -> set[int]:
@@ -311,4 +344,4 @@ def _home(model: Any) -> Floats:
 
 def _narrowed(joint: ArmJoint, ranges: Mapping[str, tuple[float, float]]) -> ArmJoint:
     low, high = ranges.get(joint.name, (joint.low, joint.high))
-    return replace(joint, low=max(joint.low, low), high=min(joint.high, high))
+    return replace(joint, low=max(joint.low, low), high=min(joint.high, high), refusal="")

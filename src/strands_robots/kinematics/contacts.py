@@ -42,7 +42,7 @@ class ContactCheck:
         found: dict[tuple[str, str], float] = {}
         for index in range(data.ncon):
             depth = -float(data.contact.dist[index])
-            if depth > 0:
+            if depth > 0 and not (self._chain.floats and 0 in model.geom_bodyid[data.contact.geom[index]]):
                 first, second = (self._part(int(geom)) for geom in data.contact.geom[index])
                 pair = (second, first) if first == TABLE else (first, second)
                 found[pair] = max(depth, found.get(pair, 0.0))

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from strands_robots.kinematics.chain import Chain, Floats
+from strands_robots.kinematics.chain import Chain, Floats, TipPose
 from strands_robots.kinematics.inverse import rolled
 from strands_robots.kinematics.motion import Motion, Segment
 from strands_robots.kinematics.moves import Start, require_gripper
@@ -65,6 +65,7 @@ class Held:
         below: of its bottom from its centre (m).
         width: between the jaws (m).
         approach_deg: at which it was grasped, so that it stands upright.
+        radius: of the circle within its outline from above (m).
     """
 
     name: str
@@ -72,6 +73,12 @@ class Held:
     below: float
     width: float
     approach_deg: float
+    radius: float = 0.0
+
+    def centre(self, pose: TipPose) -> Floats:
+        """Return the place of its centre for a pose of the tip (m)."""
+        centre: Floats = pose.position + pose.rotation @ self.offset
+        return centre
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,10 +123,12 @@ def pick(start: Start, target: SeenObject, approach: float | None) -> tuple[Moti
             float(target.size[2]) / 2,
             grip.width,
             pose.approach_deg,
+            float(min(target.size[0], target.size[1])) / 2,
         )
         goal = start.arm.chain.forward(way[-1]).position
         asked = {"object": target.name, **_point(target.position), "approach": degrees}
-        return Motion(start.arm, "pick", asked, segments, start.hz, goal, told=0.0, grasps=True), held
+        motion = Motion(start.arm, "pick", asked, segments, start.hz, goal, way[-1], told=0.0, grasps=True)
+        return motion, held
     # The refusal is that of the steepest reach to the object's centre, or it is the way that is blocked.
     planner.reach(target.position + np.array([0.0, 0.0, 0.02]), approach)
     raise ValidationError(f"no way to grasp {target.name} at {_shown(target.position)} is free of contact.")

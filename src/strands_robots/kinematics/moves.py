@@ -75,7 +75,8 @@ def move_joints(start: Start, degrees: Mapping[str, float]) -> Motion:
     turns = {joint.name: joint.turns for joint in start.arm.chain.joints}
     planner = start.planner()
     targets = {name: float(np.radians(at)) if turns.get(name, True) else at for name, at in degrees.items()}
-    return _to(start, "moveJoints", {"joints": dict(degrees)}, planner, planner.joints(targets))
+    motion = _to(start, "moveJoints", {"joints": dict(degrees)}, planner, planner.joints(targets))
+    return replace(motion, wanted=targets)
 
 
 def go_to(start: Start, place: str, degrees: Mapping[str, float]) -> Motion:

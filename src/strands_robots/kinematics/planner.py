@@ -64,6 +64,8 @@ class Planner:
             if name not in by_name:
                 raise ValidationError(f"joints must be of {', '.join(by_name)}; there is no {name}.")
             joint = self.chain.joints[by_name[name]]
+            if joint.refusal:
+                raise ValidationError(f"{name} cannot be moved to a position: {joint.refusal}.")
             if not joint.low <= value <= joint.high:
                 raise ValidationError(f"{name} must be {_range(joint)}, not {_shown(joint, value)}.")
             wanted[by_name[name]] = value
@@ -77,6 +79,7 @@ class Planner:
             approach_deg: degrees below the horizontal; None for the steepest reachable.
             near: joints to stay near to; the present ones by default.
         """
+        self.chain.require_arm()
         start = self.start if near is None else near
         if approach_deg is not None:
             direction = self.direction(position, approach_deg)
@@ -137,6 +140,7 @@ class Planner:
             start: joints to begin with; the present ones by default.
             direction: approach along the way; by default as steep as at the start, where that can be kept.
         """
+        self.chain.require_arm()
         joints = self.start if start is None else start
         pose = self.chain.forward(joints)
         offset = goal - pose.position

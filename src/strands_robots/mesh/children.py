@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -22,7 +22,7 @@ from strands_robots.mesh.presence import DESCRIBE_S, PresencePublisher
 from strands_robots.mesh.safety import status_of
 from strands_robots.mesh.teleop import TeleopReceivers
 from strands_robots.mesh.throttle import AuditThrottle
-from strands_robots.mesh.transport import Declaration, TransportError, undeclare
+from strands_robots.mesh.transport import Declaration, Sample, TransportError, undeclare
 from strands_robots.safety.identity import SigningIdentity
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS
@@ -144,6 +144,7 @@ class Children:
         teleop: the parent's input streams, which may drive any of the robots.
         audit: makes the audit of a child.
         robot_key: the parent's, which signs for its children as well.
+        lock_of: returns, for a child's id, what locks its parent; ``epochs`` returns those that lock it.
     """
 
     def __init__(
@@ -159,7 +160,10 @@ class Children:
         teleop: TeleopReceivers,
         audit: Callable[[str], AuditThrottle],
         robot_key: SigningIdentity | None = None,
+        lock_of: Callable[[str], Callable[[object, Sample, str], str | None]],
+        epochs: Callable[[], Collection[str]],
     ) -> None:
+        self._lock_of, self._epochs = lock_of, epochs
         self._context = context
         self._world = world
         self._pipeline = pipeline
@@ -249,6 +253,8 @@ class Children:
             before_stop=self._teleop.void,
             after_stop=self._teleop.reap,
             robot_key=self._robot_key,
+            lock=self._lock_of(peer),
+            epochs=self._epochs,
         )
         presence = PresencePublisher(context, self._kind, robot.facts, partial(self._safety, peer))
         handles: list[Declaration] = []

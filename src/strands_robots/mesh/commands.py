@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from functools import partial
 from typing import Any
 
@@ -12,6 +12,7 @@ from strands_robots.envelope import is_error
 from strands_robots.mesh import topics, wire
 from strands_robots.mesh.console_keys import MOTION
 from strands_robots.mesh.context import Context
+from strands_robots.mesh.scoped_stops import ESTOP
 from strands_robots.mesh.throttle import RecentKeys
 from strands_robots.mesh.transport import Sample, TransportError
 from strands_robots.mesh.wire_identity import IdentityError
@@ -44,6 +45,9 @@ HALT = "stop over the mesh"
 LOG_EVERY_S = 1.0
 REPLAY_S = wire.FRESH_S + wire.AHEAD_S
 REPLAYS_MAX = 4096
+LOCKING_MAX = 512
+"""Stops with an envelope whose answer is still to come."""
+
 PROVEN_MAX = 65_536
 """Signed commands that a peer tells apart in the time in which they are fresh; beyond that it refuses."""
 
@@ -151,6 +155,8 @@ class CommandReceiver:
         before_stop: called when a stop has arrived; it may wait for nothing.
         after_stop: called before stops are answered.
         robot_key: signs the answers to stops; without one they are not signed.
+        lock: locks by the envelope of an emergency stop in a stop from this sender, and returns its epoch.
+        epochs: returns those that lock the robot.
     """
 
     def __init__(
@@ -162,8 +168,12 @@ class CommandReceiver:
         before_stop: Callable[[], None] = lambda: None,
         after_stop: Callable[[], None] = lambda: None,
         robot_key: SigningIdentity | None = None,
+        lock: Callable[[object, Sample, str], str | None] = lambda estop, sample, sender: None,
+        epochs: Callable[[], Collection[str]] = tuple,
     ) -> None:
         self._context = context
+        self._lock, self._epochs = lock, epochs
+        self._locking: dict[str, str] = {}
         self._robot_key = robot_key
         self._pipeline = pipeline
         self._target_of = target_of or partial(stop_target, pipeline.robot)
@@ -193,6 +203,7 @@ class CommandReceiver:
         if verb is None:
             return
         if verb.kind is Kind.STOP:
+            self._lock_first(request, sample)
             self._stop(request, verb)
             return
         named = request.command.get("robot_name")
@@ -248,6 +259,21 @@ class CommandReceiver:
             event = "command_refused" if is_error(answer.result) else "command_executed"
             audit(event, request.sender_id, action=verb.name, turn_id=request.turn_id)
 
+    def _lock_first(self, request: wire.Request, sample: Sample) -> None:
+        """Lock where a stop holds the envelope of an emergency stop, and answer so."""
+        estop = request.command.get(ESTOP)
+        if estop is None:
+            return
+        try:
+            epoch = self._lock(estop, sample, request.sender_id)
+        except Exception:
+            logger.critical("%s is stopped, and was not locked.", self._context.peer_id, exc_info=True)
+            return
+        if epoch is not None:
+            self._locking[request.turn_id] = epoch
+            while len(self._locking) > LOCKING_MAX:
+                del self._locking[next(iter(self._locking))]
+
     def _stop(self, request: wire.Request, verb: Verb) -> None:
         name = verb.readable(request.command)[0]["robot_name"] or ""
         self._pipeline.pending.void(name)
@@ -277,7 +303,10 @@ class CommandReceiver:
             event, fields["reason"] = "command_refused", explain(result)
             self._log_doubt(fields["reason"])
         for sender, turn in requests:
-            self._reply(sender, turn, result=with_stop_statement(self._robot_key, self._context.peer_id, turn, result))
+            epoch = self._locking.pop(turn, None)
+            lock = {} if epoch is None else {"estop_id": epoch, "locked": epoch in self._epochs()}
+            signed = with_stop_statement(self._robot_key, self._context.peer_id, turn, result)
+            self._reply(sender, turn, result={**signed, **lock})
             audit(event, sender, turn_id=turn, **fields)
 
     def _log_doubt(self, reason: str) -> None:

@@ -15,11 +15,10 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from strands_robots import settings
 from strands_robots.mesh import wire
 from strands_robots.safety import ed25519
-from strands_robots.safety.approval import state_dir
-from strands_robots.safety.identity import EnrolledKeys, KeyFile, SigningIdentity
+from strands_robots.safety.consoles import console_key, kept_consoles, stated_consoles
+from strands_robots.safety.identity import SigningIdentity
 from strands_robots.utils import MissingExtraError
 
 logger = logging.getLogger(__name__)
@@ -32,16 +31,6 @@ INPUT = "mesh-input"
 
 READ_AGAIN_S = 1.0
 """Age in seconds from which the trusted keys are read anew."""
-
-
-def console_key() -> KeyFile:
-    """Return the file with the key of this user's consoles on this machine."""
-    return KeyFile("consoles", "console")
-
-
-def enrolled_consoles() -> EnrolledKeys:
-    """Return the file with the public keys of consoles on other machines."""
-    return EnrolledKeys(state_dir() / "consoles")
 
 
 class ConsoleSigner:
@@ -115,19 +104,15 @@ class ConsoleTrust:
             return self._keys
 
     def _read(self) -> frozenset[bytes]:
-        name = "STRANDS_MESH_CONSOLE_PUBLIC_KEYS"
-        keys = {*ed25519.public_keys(settings.items(name), name)}
-        complaint = ""
+        keys, complaint = stated_consoles(), ""
         try:
-            own = console_key().load()
-            keys |= {own.public} if own is not None else set()
-            keys |= {*enrolled_consoles().load().values()}
+            keys |= kept_consoles()
         except (ValueError, OSError, MissingExtraError) as exc:
             complaint = str(exc)
         if complaint and complaint != self._complaint:
             logger.error("Keys of consoles are left out: %s", complaint)
         self._complaint = complaint
-        return frozenset(keys)
+        return keys
 
 
 def _covered(body: Mapping[str, Any], head: Mapping[str, Any], purpose: str) -> bytes:

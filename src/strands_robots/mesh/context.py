@@ -29,6 +29,7 @@ class Context:
         audit: records refusals; ``audit.always`` records what may never be left out.
         transport: None while the peer is not on the mesh.
         console: signs what moves real hardware; ``consoles`` checks such signatures.
+        has_robot: it moves; a peer without a robot remembers those that it hears.
         pacer: keeps messages apart while a peer of a 0.5 release is known.
     """
 
@@ -42,6 +43,7 @@ class Context:
     console: ConsoleSigner = field(default_factory=ConsoleSigner)
     consoles: ConsoleTrust = field(default_factory=ConsoleTrust)
     pacer: Pacer = field(default_factory=Pacer)
+    has_robot: bool = False
     began: float = field(init=False)
     _began_at: float = field(init=False)
 
@@ -55,6 +57,11 @@ class Context:
             stamp: wall-clock seconds of its sender. Once what was issued before is no longer fresh, all is false.
         """
         return stamp < self.began and self.monotonic() - self._began_at <= wire.FRESH_S + wire.AHEAD_S
+
+    @property
+    def age_s(self) -> float:
+        """Seconds since this peer began."""
+        return self.monotonic() - self._began_at
 
     def running(self) -> bool:
         return self.transport is not None and self.transport.is_alive()

@@ -23,11 +23,13 @@ from strands_robots.mesh.context import Context
 from strands_robots.mesh.executor import BoundedExecutor
 from strands_robots.mesh.hearing import Hearing
 from strands_robots.mesh.input_receiver import InputReceiver
+from strands_robots.mesh.missed import MeshMissedStops
 from strands_robots.mesh.older_peers import Pacer
 from strands_robots.mesh.presence import DESCRIBE_S, PresencePublisher
 from strands_robots.mesh.registry import PeerRegistry
 from strands_robots.mesh.rpc import Requester
-from strands_robots.mesh.safety import FleetSafety, OnAnswers, SafetyAdapter, status_of
+from strands_robots.mesh.safety import FleetSafety, OnAnswers, status_of
+from strands_robots.mesh.safety_adapter import SafetyAdapter
 from strands_robots.mesh.scheduler import Scheduler
 from strands_robots.mesh.security import validate_peer_id
 from strands_robots.mesh.sensors import CameraPublisher, SensorLoopsMixin, SensorPublisher
@@ -42,6 +44,7 @@ from strands_robots.mesh.wire_identity import Identity, signature_policy
 from strands_robots.recording.cameras import frames_of
 from strands_robots.safety.persistence import simulation_key
 from strands_robots.safety.plane import SafetyPlane
+from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope, none_known, own_cell
 from strands_robots.serving.pipeline import Own, Pipeline
 from strands_robots.serving.robot_verbs import served
 from strands_robots.utils import number, text
@@ -70,6 +73,7 @@ class Parts:
         identity: gives the signer and verifier of a transport.
         audit: where safety events go; the audit log by default.
         keep: the lockout outlives the process under the peer's id.
+        cell: the cell that the robot is in; empty for none.
     """
 
     acquire: Callable[[], Transport | None] = session.acquire
@@ -82,6 +86,7 @@ class Parts:
     audit: AuditSink | None = None
     plane: SafetyPlane | None = None
     keep: bool = False
+    cell: str = ""
 
     def recorder(self, name: str) -> AuditThrottle:
         """Return the audit of a peer."""
@@ -113,7 +118,7 @@ class Mesh(SensorLoopsMixin):
         self._newest_input: dict[tuple[str, str], tuple[float, float]] = {}
         key = _safety_key(self.robot, self.peer_id, keep=self._parts.keep)
         # A locked robot that leaves the mesh stays on the safety plane: to leave and join again must not unlock it.
-        self._adapter = SafetyAdapter(self.peer_id, self.robot, key, self._parts.plane)
+        self._adapter = SafetyAdapter(self.peer_id, self.robot, key, self._parts.plane, self._parts.cell)
         self._compose()
 
     def _compose(self) -> None:
@@ -123,10 +128,11 @@ class Mesh(SensorLoopsMixin):
         self._context = context = Context(
             peer, parts.registry, parts.recorder(peer), Identity(), parts.clock, parts.monotonic
         )
-        context.pacer = parts.pacer
+        context.pacer, context.has_robot = parts.pacer, robot is not None
         context.console, context.consoles = ConsoleSigner(parts.clock), ConsoleTrust(parts.clock)
         self._hardware = hardware
         self._handles: list[Declaration] = []
+        self._missed: MeshMissedStops | None = None
         self._inputs: dict[str, dict[str, Any]] = {}
         self._scheduler = Scheduler(peer)
         self._sensors = SensorPublisher(context, self._scheduler)
@@ -160,6 +166,8 @@ class Mesh(SensorLoopsMixin):
             before_stop=self._teleop.void,
             after_stop=self._teleop.reap,
             robot_key=self._adapter.identity,
+            lock=self._lock_of(peer),
+            epochs=self._adapter.epochs,
         )
         self._safety = FleetSafety(
             context, self._adapter, self._requester, self._pipeline.shares.urgent, robot=robot is not None
@@ -175,12 +183,17 @@ class Mesh(SensorLoopsMixin):
                 report=self._adapter.report,
                 own=lambda child: {"ping": own["ping"], "resume": self._resume_of(child)},
                 robot_key=self._adapter.identity,
+                lock_of=self._lock_of,
+                epochs=self._adapter.epochs,
                 teleop=self._teleop,
                 audit=parts.recorder,
             )
 
     def _safety_facts(self, peer_id: str = "") -> dict[str, Any]:
         return {**self._adapter.announced(peer_id), **self._hearing.facts()}
+
+    def _lock_of(self, peer_id: str) -> Callable[[object, Sample, str], str | None]:
+        return lambda estop, sample, sender: self._safety.on_own_estop(estop, sample, sender, peer_id)
 
     def _resume_of(self, peer_id: str) -> Own:
         return lambda arguments: self._safety.on_resume_command(arguments.get("assertion"), peer_id)
@@ -210,6 +223,7 @@ class Mesh(SensorLoopsMixin):
                 return
             try:
                 self._adapter.open()
+                self._adapter.serve(session.network())
                 self._begin(transport)
             except BaseException:
                 # A peer that cannot join gives back the session and its subscribers.
@@ -231,6 +245,7 @@ class Mesh(SensorLoopsMixin):
     def _leave(self) -> None:
         self._end(LOOP_JOIN_TIMEOUT_S)
         self._parts.release()
+        self._adapter.leave()
         if not self._adapter.epochs():
             self._adapter.close()
         self._compose()
@@ -250,6 +265,7 @@ class Mesh(SensorLoopsMixin):
             (topics.check_in_answer("*"), self._safety.on_check_in_answer),
         ):
             self._handles.append(transport.declare_subscriber(key, receive))
+        self._missed = missed = MeshMissedStops.joined_by(context, self._adapter)
         if self.robot is not None:
             if self._adapter.needs_check_in:
                 controllers = topics.check_in("*")
@@ -266,6 +282,7 @@ class Mesh(SensorLoopsMixin):
             every("children", rates["presence"].rate_hz, self.children.refresh)
             every("children's presence", rates["presence"].rate_hz, self.children.announce, quick=True)
         every("tokens", TOKENS_HZ, self._presence.look, quick=True)
+        every("missed stops", TOKENS_HZ, lambda: missed.look(context), quick=True)
         every("hearing", HEARING_HZ, self._hearing.look, quick=True)
         # A stop that is published again may wait for its turn, and behind no robot.
         every("late peers", LATE_HZ, self._safety.late.look, queue="late peers")
@@ -297,6 +314,8 @@ class Mesh(SensorLoopsMixin):
         if dropped:
             logger.info("%s left the mesh and dropped %d subscriptions.", self.peer_id, dropped)
         self._presence.stop()
+        if self._missed is not None:
+            self._missed.left_by(self._context, self._adapter)
         if self.children is not None:
             self.children.close()
         for handle in self._handles:
@@ -503,9 +522,16 @@ class Mesh(SensorLoopsMixin):
         return next(iter(self._adapter.epochs()), None)
 
     def emergency_stop(
-        self, signing_key: Any = None, *, estop_id: str = "", on_answers: OnAnswers = lambda replies: None
+        self,
+        signing_key: Any = None,
+        *,
+        estop_id: str = "",
+        on_answers: OnAnswers = lambda replies: None,
+        scope: Scope = EVERY_ROBOT,
+        remembers: Remembers = none_known,
+        on_widened: Callable[[], None] = lambda: None,
     ) -> list[dict[str, Any]]:
-        """Stop and lock this robot and every peer; return the answers.
+        """Stop and lock every robot, this one too, or those of ``scope``.
 
         A peer that did not stop or did not answer is named at CRITICAL.
 
@@ -513,6 +539,9 @@ class Mesh(SensorLoopsMixin):
             signing_key: for fleets that act on signed stops only.
             estop_id: 32 hex digits, the same for one press; a fresh one by default.
             on_answers: called with the replies so far.
+            scope: the robots that it is for. Where none of them is there, every robot is stopped.
+            remembers: says whether this machine knows a robot in the scope.
+            on_widened: called where every robot is stopped for that.
 
         Raises:
             RuntimeError: this peer is not on the mesh.
@@ -520,7 +549,14 @@ class Mesh(SensorLoopsMixin):
         # A link that is down must not keep this robot from stopping; the fleet gets the stop later.
         if self._context.transport is None:
             raise RuntimeError(f"{self.peer_id} is not on the mesh: no peer would hear the emergency stop.")
-        return self._safety.emergency_stop(signing_key, estop_id=estop_id, on_answers=on_answers)
+        return self._safety.emergency_stop(
+            signing_key,
+            estop_id=estop_id,
+            on_answers=on_answers,
+            scope=scope,
+            remembers=remembers,
+            on_widened=on_widened,
+        )
 
     def check_in_every(self, interval_s: float, signing_key: Any = None) -> None:
         """Check in with robots that need a live controller, while this peer is joined.
@@ -564,19 +600,23 @@ def identity_of(transport: Transport) -> Identity:
     return Identity.from_settings(TlsCredentials.from_settings() if signature_policy() == "1" else None)
 
 
-def init_mesh(robot: Any, peer_id: str | None = None, peer_type: str = "robot", mesh: bool = True) -> Mesh | None:
+def init_mesh(
+    robot: Any, peer_id: str | None = None, peer_type: str = "robot", mesh: bool = True, *, cell: str | None = None
+) -> Mesh | None:
     """Make and start a mesh peer for ``robot``; None when the mesh is off.
 
     Args:
         peer_id: default ``<tool_name_str or "robot">-<8 hex>``.
+        cell: the cell that the robot is in, for stops of one cell; that of ``STRANDS_CELL`` by default, "" for none.
 
     Raises:
-        ValueError: ``peer_id`` is no identifier, a reserved word or the name of another robot of this process.
+        ValueError: ``peer_id`` is no identifier, a reserved word or the name of another robot of this process, or
+            ``cell`` is no identifier.
     """
     if not mesh or mesh_disabled_by_env():
         return None
     named = peer_id if peer_id is not None else _default_id(robot)
-    started = Mesh(robot, named, peer_type, parts=Parts(keep=peer_id is not None))
+    started = Mesh(robot, named, peer_type, parts=Parts(keep=peer_id is not None, cell=own_cell(cell)))
     started.start()
     return started
 

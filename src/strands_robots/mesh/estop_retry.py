@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Any
 
 from strands_robots.mesh.context import Context
@@ -35,25 +36,36 @@ class EstopRetry:
         self._over = threading.Event()
 
     def begin(
-        self, epoch: str, missing: Iterable[str], locked: Callable[[], bool], publish: Callable[[], None]
+        self,
+        epoch: str,
+        missing: Iterable[str],
+        locked: Callable[[], bool],
+        publish: Callable[[], None],
+        command: Callable[[str], dict[str, Any]] = lambda peer: {"action": "stop"},
     ) -> None:
         """Repeat the stop until ``missing`` have stopped or the lockout is over.
 
         Args:
             publish: publishes the stop's envelope once more.
+            command: returns the command that stops a peer.
         """
         self._over.set()  # a later stop is answered for an earlier one as well
         over = self._over = threading.Event()
         left = set(missing)
         if left:
             name = f"mesh-{self._context.peer_id}-estop-retry"
-            thread = threading.Thread(
-                target=self._run, args=(over, epoch, left, locked, publish), name=name, daemon=True
-            )
-            thread.start()
+            run = partial(self._run, over=over, epoch=epoch, left=left, locked=locked, publish=publish, command=command)
+            threading.Thread(target=run, name=name, daemon=True).start()
 
     def _run(
-        self, over: threading.Event, epoch: str, left: set[str], locked: Callable[[], bool], publish: Callable[[], None]
+        self,
+        *,
+        over: threading.Event,
+        epoch: str,
+        left: set[str],
+        locked: Callable[[], bool],
+        publish: Callable[[], None],
+        command: Callable[[str], dict[str, Any]],
     ) -> None:
         began, silences = self._context.monotonic(), Counter[str]()
         logged: set[tuple[str, Outcome]] = set()
@@ -64,7 +76,7 @@ class EstopRetry:
             for peer in back:
                 if over.is_set():
                     return
-                reply: dict[str, Any] = self._requester.send(peer, {"action": "stop"}, RETRY_ANSWER_S)
+                reply = self._ask(peer, command(peer))
                 outcome = stop_outcome(reply)
                 if outcome is Outcome.STOPPED:
                     left.discard(peer)
@@ -78,6 +90,10 @@ class EstopRetry:
                     logged.add((peer, outcome))
                     why = explain(reply.get("result")) if "result" in reply else shown(reply.get("error"))
                     logger.critical("%s is in reach and did NOT stop on emergency stop %s: %s", peer, epoch, why)
+
+    def _ask(self, peer: str, stop: dict[str, Any]) -> dict[str, Any]:
+        replies = self._requester.stop_each(lambda: {peer: stop}, RETRY_ANSWER_S, lambda replies: not replies)
+        return next(iter(replies), {"status": "timeout"})
 
     def _seen_since(self, began: float, peer: str) -> bool:
         row = self._context.registry.get(peer, self._context.monotonic() - began)

@@ -374,6 +374,9 @@ class InputReceiver:
         if permit is not None and not permit.valid:
             self._counts["lockout"] += 1
             return
+        if permit is not None and permit.held:
+            self._counts["rate_dropped"] += 1
+            return
         try:
             # A frame that waits for the bus is as old as its stream: a halt since then refuses it there.
             with nullcontext() if permit is None else permit.inside():

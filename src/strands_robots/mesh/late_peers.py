@@ -1,7 +1,8 @@
-"""Stops and resumes for peers that were out of reach when they were published.
+"""Resumes for peers that were out of reach, and stops for those of 0.5 releases.
 
-Zenoh stores nothing for a peer that comes back, and the console that issued a stop may be gone by then. So every robot
-that holds an epoch publishes its stop again when a peer that missed it is back, and for a minute its resume.
+Zenoh stores nothing for a peer that comes back, and the console that resumed the fleet may be gone by then. So every
+robot publishes a resume again, for a minute, when a peer that missed it is back. A peer of ours asks for the stops that
+it missed (:mod:`~strands_robots.mesh.missed`); one of the 0.5 releases cannot, and gets them in the same way.
 """
 
 from __future__ import annotations
@@ -68,8 +69,9 @@ class LatePeers:
         self._delay_s = SPREAD_S * (zlib.crc32(context.peer_id.encode()) % 1000) / 1000
 
     def stopped(self, epoch: str, publish: Publish) -> None:
-        """Note a stop that locked us; ``publish`` repeats its envelope."""
-        self._note(epoch, float("inf"), self._known(), lambda peers: publish(), locks=True)
+        """Note a stop that locked us; ``publish`` repeats it to peers of 0.5 releases."""
+        known = self._context.registry.seen_within(KNOWN_S)
+        self._note(epoch, float("inf"), known, lambda peers: publish(), locks=True)
 
     def resumed(self, epoch: str, targets: Iterable[str], publish: Publish) -> None:
         """Note a resume that we admitted; ``publish`` repeats it."""
@@ -130,18 +132,17 @@ class LatePeers:
         while len(self._missing) > STORED_MAX:
             del self._missing[next(iter(self._missing))]
 
-    def _known(self) -> set[str]:
-        return self._context.registry.seen_within(KNOWN_S)
-
     def _back(self, missing: _Missing, keys: Mapping[str, bytes] | None) -> list[str]:
         """Return peers in reach that missed it; forget those that it reached."""
         back: list[str] = []
+        older = self._context.registry.older() if missing.locks else ()
         passed = self._context.monotonic() - missing.since
         for peer, tries in list(missing.pending.items()):
             row = self._context.registry.get(peer)
             if row is None or not row["reachable"] or row["age"] > passed - SETTLE_S:
                 continue
-            if tries >= TRIES_MAX or self._reached(row, missing, keys):
+            asks = missing.locks and peer not in older
+            if asks or tries >= TRIES_MAX or self._reached(row, missing, keys):
                 del missing.pending[peer]
             else:
                 back.append(peer)

@@ -9,12 +9,14 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
+from strands_robots.mesh import session as mesh_session
 from strands_robots.mesh import topics, wire
 from strands_robots.mesh.context import Context
 from strands_robots.mesh.registry import PeerRegistry
 from strands_robots.mesh.throttle import TroubleLog
 from strands_robots.mesh.transport import Declaration, Sample, Transport, TransportError, undeclare
 from strands_robots.mesh.wire_identity import IdentityError
+from strands_robots.safety.sightings import sightings
 
 logger = logging.getLogger(__name__)
 
@@ -121,6 +123,7 @@ class PresenceListener:
         self._transport = transport
         self._registry = registry
         self._members: dict[str, Context] = {}
+        self._network, self._remembered = mesh_session.network(), sightings()
         self._skewed: set[str] = set()
         self._leaving: dict[tuple[str, str], float] = {}
         self._tokens: dict[tuple[str, str], None] = {}
@@ -225,6 +228,24 @@ class PresenceListener:
             anonymous=anonymous,
         ):
             logger.info("%s sees %s (%s).", context.peer_id, peer, presence.robot_type)
+        self._remember(members, sample, peer, facts)
+
+    def _remember(self, members: list[Context], sample: Sample, peer: str, facts: Mapping[str, Any]) -> None:
+        """Have this machine remember a robot that was heard.
+
+        Robots' own processes do not: that would cost the square of their number.
+        """
+        robot = "locked" in facts or "tool_name" in facts
+        if not robot or any(each.has_robot for each in members) or self._registry.of_world(peer, sample.session):
+            return
+        cell = facts.get("cell")
+        self._remembered.note(
+            self._network,
+            peer,
+            cell=cell if isinstance(cell, str) else "",
+            signed_only=True if facts.get("signed_stops") is True else None,
+            stoppable=True,
+        )
 
     def _name_skew(self, peer: str, ahead: float) -> None:
         """Log once a peer that is left out for its clock, for a bounded number."""

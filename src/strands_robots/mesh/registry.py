@@ -201,6 +201,14 @@ class PeerRegistry:
         row = self._row(peer_id)
         return row.session if row else None
 
+    def of_world(self, peer_id: str, session: str | None) -> bool:
+        """True for a robot of a world, which answers by the world.
+
+        The world has to be on the same session: another one's name hides no robot.
+        """
+        world = peer_id.rpartition("__")[0]
+        return bool(world) and session is not None and self.session_of(world) == session
+
     def certificate_of(self, peer_id: str) -> tuple[str, str] | None:
         row = self._row(peer_id)
         return row.certificate if row else None

@@ -12,12 +12,14 @@ from dataclasses import dataclass, field
 from queue import Empty, SimpleQueue
 from typing import Any
 
-from strands_robots.mesh import console_keys, topics, wire
+from strands_robots.mesh import console_keys, session, topics, wire
 from strands_robots.mesh.context import Context
 from strands_robots.mesh.older_peers import ASK_AGAIN_S, COMMANDS_S
 from strands_robots.mesh.registry import attribute
 from strands_robots.mesh.security import validate_command
 from strands_robots.mesh.transport import Sample, TransportError
+from strands_robots.safety.sightings import sightings
+from strands_robots.safety.statements import Purpose
 from strands_robots.safety.stopping import Outcome, grade
 from strands_robots.serving.peer_verbs import PEER_VERBS
 from strands_robots.serving.verbs import Kind
@@ -30,7 +32,12 @@ BROADCAST_RESPONDER = "\x00broadcast"
 """Expected responder of a broadcast; the NUL keeps it apart from every peer id."""
 
 REPLIES_MAX = 4096
+
+PURPOSES = {"status": Purpose.LOCKOUT_STATE, "resume": Purpose.RESUME_ANSWER, "stop": Purpose.STOP_VERDICT}
+"""Actions whose answer a robot signs, with the purpose of the signature."""
+
 _NO_ID = frozenset("/*$?#")
+LOOK_S = 0.02
 REPEAT_S = 0.5
 """Seconds after which an unanswered stop is sent again: its message or its answer may be lost."""
 
@@ -43,6 +50,7 @@ class Turn:
 
     Attributes:
         expected: id of the responder, or :data:`BROADCAST_RESPONDER`.
+        command: as it was sent.
         ids: every id that the request was sent under.
         arrived: the replies that count, in order, and None when the mesh was stopped.
         via: ``direct`` where the transport reports whether the topic has subscribers, else ``publish``.
@@ -50,6 +58,7 @@ class Turn:
     """
 
     expected: str
+    command: Mapping[str, Any] = field(default_factory=dict)
     ids: list[str] = field(default_factory=list)
     arrived: SimpleQueue[dict[str, Any] | None] = field(default_factory=SimpleQueue)
     answered: set[tuple[str | None, str, str]] = field(default_factory=set)
@@ -82,7 +91,7 @@ class Requester:
         if isinstance(prepared, str):
             return refused(prepared)
         peer, clean, seconds = prepared
-        turn = Turn(peer)
+        turn = Turn(peer, clean)
         try:
             problem = self._publish(topics.command(peer), clean, turn, seconds)
             if problem is not None:
@@ -141,7 +150,7 @@ class Requester:
             logger.warning("broadcast: %s", prepared)
             return []
         _, clean, seconds = prepared
-        turn = Turn(BROADCAST_RESPONDER)
+        turn = Turn(BROADCAST_RESPONDER, clean)
         try:
             problem = self._publish(topics.broadcast(), clean, turn)
             if problem is not None:
@@ -150,6 +159,44 @@ class Requester:
             return self._collect(turn, clean, seconds, missing)
         finally:
             self._close(turn)
+
+    def stop_each(
+        self,
+        stops: Callable[[], Mapping[str, dict[str, Any]]],
+        seconds: float,
+        goes_on: Callable[[list[dict[str, Any]]], bool],
+    ) -> list[dict[str, Any]]:
+        """Send each peer a stop of its own, and collect the replies.
+
+        Args:
+            stops: returns the stop of each peer that has to answer. It is asked, and a peer without a result gets the
+                stop again, every ``ASK_AGAIN_S``.
+            goes_on: ends the collection; it gets the replies so far, many times a second. A peer's result replaces an
+                error of it.
+        """
+        turn, replies = Turn(BROADCAST_RESPONDER), dict[str, dict[str, Any]]()
+        now = again = time.monotonic()
+        deadline = now + seconds
+        try:
+            while now < deadline:
+                if now >= again:
+                    again = now + ASK_AGAIN_S
+                    for peer, command in stops().items():
+                        if replies.get(peer, {}).get("type") != "response":
+                            self._publish(topics.command(peer), command, turn)
+                if not goes_on(list(replies.values())):
+                    break
+                with contextlib.suppress(Empty):  # no answer in this interval
+                    reply = turn.next(LOOK_S)
+                    if reply is None:
+                        break
+                    peer = str(reply["responder_id"])
+                    if peer not in replies or (replies[peer]["type"], reply["type"]) == ("error", "response"):
+                        replies[peer] = reply
+                now = time.monotonic()
+        finally:
+            self._close(turn)
+        return list(replies.values())
 
     def _collect(
         self,
@@ -238,9 +285,23 @@ class Requester:
                 turn.answered.add(responder)
         if counts:
             body.pop("sig", None)
+            self._remember(sample, reply, turn, body.get("result"))
             turn.arrived.put(body)
         if duplicate:
             self._context.audit("response_duplicate_rejected", reply.responder_id, turn_id=reply.turn_id)
+
+    def _remember(self, sample: Sample, reply: wire.Reply, turn: Turn, result: object) -> None:
+        """Have this machine remember a robot that answered, signed."""
+        purpose = PURPOSES.get(str(turn.command.get("action")))
+        statement = result.get("statement") if isinstance(result, Mapping) else None
+        if purpose is None or statement is None or self._context.registry.of_world(reply.responder_id, sample.session):
+            return
+        assertion = turn.command.get("assertion")
+        asked = assertion if isinstance(assertion, Mapping) else turn.command
+        expected = {"nonce": asked["nonce"]} if "nonce" in asked else {}
+        if purpose is Purpose.STOP_VERDICT:
+            expected = {"turn_id": reply.turn_id}
+        sightings().note_answer(session.network(), reply.responder_id, purpose, statement, expected)
 
     def _prepare(self, target: object, command: object, timeout: object) -> tuple[str, dict[str, Any], float] | str:
         if self._context.transport is None:

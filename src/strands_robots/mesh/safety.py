@@ -8,41 +8,36 @@ peers that missed it.
 from __future__ import annotations
 
 import contextlib
-import json
 import logging
 import secrets
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import Future
+from dataclasses import replace
 from typing import Any
 
 from strands_robots.audit import audit_head, own_log_id
 from strands_robots.contract import Robot
-from strands_robots.envelope import is_error
-from strands_robots.mesh import topics, wire
+from strands_robots.mesh import session, topics, wire
 from strands_robots.mesh.context import Context
 from strands_robots.mesh.estop_retry import EstopRetry
 from strands_robots.mesh.late_peers import KNOWN_S, LatePeers
+from strands_robots.mesh.missed import epoch_of
 from strands_robots.mesh.older_peers import SAFETY, SAFETY_S, Closings
 from strands_robots.mesh.rpc import Requester, stop_outcome
+from strands_robots.mesh.safety_adapter import SafetyAdapter
+from strands_robots.mesh.scoped_stops import ScopedStop
 from strands_robots.mesh.throttle import RecentKeys
 from strands_robots.mesh.transport import Sample, TransportError
 from strands_robots.safety import ed25519
-from strands_robots.safety.checkin import CheckInRules
-from strands_robots.safety.gate import MotionGate
 from strands_robots.safety.head_witness import CheckInAnswers, HeadWitness
-from strands_robots.safety.identity import robot_identity
-from strands_robots.safety.orders import StopOrder, StopRules, derived_epoch, new_epoch, signed_bytes
+from strands_robots.safety.orders import StopOrder, new_epoch, signed_stop
 from strands_robots.safety.peer_answers import (
-    LockoutAnnouncer,
     enrolled_peers,
     record_heads,
-    with_lockout_statement,
-    with_resume_statement,
 )
-from strands_robots.safety.plane import Registered, SafetyPlane, Stoppable, plane
 from strands_robots.safety.resume import REJECTED, configured_keys, is_epoch, sign
+from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope, none_known
 from strands_robots.safety.statements import Proof, Purpose, proof_of
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import Outcome, StopVerdict
@@ -61,10 +56,10 @@ COLLECT_S = 3.0
 SPACING_S = SAFETY_S
 """Between two messages on a safety topic: peers in the field let two a second through."""
 
-REPORT_S = 2.0
-"""Seconds besides the halt deadline in which the plane reports, its lockout file included."""
-
 RECENT_MAX = 512
+SCOPED_MAX = 64
+"""Stops of some robots that are repeated to those that did not confirm them."""
+
 HEADS_PER_S = 20
 """Answers to check-ins that are read in a second; a flood of them costs no more."""
 
@@ -74,155 +69,8 @@ STATUS_S = 1.0
 ASK_S = 1.0
 """Seconds in which peers report the epochs that a resume is signed for."""
 
-Verdict = Callable[[], StopVerdict | None]
 OnAnswers = Callable[[list[dict[str, Any]]], None]
 """Gets the replies to an emergency stop so far, on the thread that collects them."""
-
-
-class NoRobot:
-    """Stand-in for a peer without a robot, such as a console: it never moves."""
-
-    tool_name_str = "none"
-
-    def __init__(self) -> None:
-        self.gate = MotionGate()
-
-    def halt(self, reason: str = "") -> StopVerdict:
-        return StopVerdict()
-
-
-class SafetyAdapter:
-    """The robot of one peer on the safety plane.
-
-    Args:
-        robot: None for a peer without one.
-        key: under which its lockout survives a restart; None for one that is not stored.
-        own: another plane than the process's; for tests with several peers in one process.
-    """
-
-    def __init__(
-        self, peer_id: str, robot: Stoppable | None, key: str | None = None, own: SafetyPlane | None = None
-    ) -> None:
-        self._plane = own or plane()
-        self._peer_id = peer_id
-        self._robot = robot or NoRobot()
-        self.identity = None if robot is None else robot_identity(peer_id)
-        self._announcer = LockoutAnnouncer(self.identity)
-        self._key = key
-        self._entry: Registered | None = None
-        self._decision = StopRules()
-        self._check_ins = CheckInRules(self._decision if self._decision.required else StopRules(keys=()))
-        if robot is not None:
-            self._decision.require_keys()
-        self.open()
-
-    def open(self) -> None:
-        """Register this peer's robot; twice is once.
-
-        Raises:
-            ValidationError: another robot of this process has this name.
-        """
-        if self._entry is None:
-            self._entry = self._plane.register(self._peer_id, self._robot, key=self._key)
-
-    def epochs(self) -> tuple[str, ...]:
-        """The epochs that lock this robot, oldest first; empty while it may move."""
-        return self._entry.epochs if self._entry is not None else ()
-
-    def facts(self) -> dict[str, Any]:
-        """Return ``locked`` and ``epochs``; nothing without a robot."""
-        if isinstance(self._robot, NoRobot):
-            return {}
-        epochs = self.epochs()
-        return {"locked": bool(epochs), "epochs": list(epochs)}
-
-    def announced(self, peer_id: str = "") -> dict[str, Any]:
-        """Return :meth:`facts`, signed; of a robot of its world by its id."""
-        facts = self.facts()
-        return self._announcer.of(peer_id or self._peer_id, facts) if facts else {}
-
-    def lockouts(self) -> list[dict[str, Any]]:
-        """Return each lockout with its source, reason and time."""
-        return [each.fields() for each in self._entry.latch.state.all] if self._entry is not None else []
-
-    def report(self, peer_id: str = "", nonce: str = "") -> dict[str, Any]:
-        """Return lockouts and check-in; of a robot of its world by its id."""
-        check_in = self._plane.checkin.fields(time.monotonic())
-        facts = with_lockout_statement(self.identity, peer_id or self._peer_id, self.facts(), nonce)
-        return {**facts, "lockout": self.lockouts(), "check_in": check_in}
-
-    def stop_refusal(self, source: str, body: Mapping[str, Any]) -> str | None:
-        """The reason why an e-stop of ``source`` does not count, or None."""
-        why = self._decision.source_refusal(source)
-        if why is None and self._decision.required:
-            why = self._decision.signature_refusal(source, body, Purpose.EMERGENCY_STOP)
-        return why
-
-    @property
-    def open_to_all(self) -> bool:
-        """True when an e-stop of any name counts."""
-        return self._decision.open and not self._decision.required
-
-    @property
-    def needs_check_in(self) -> bool:
-        """True when this process's robots need a live controller."""
-        return self._plane.checkin.on
-
-    def check_in(self, source: str, body: Mapping[str, Any]) -> str | None:
-        """Record a controller's check-in, or return the reason why it does not count."""
-        why = self._check_ins.refusal(source, body)
-        if why is None:
-            self._plane.checkin.record(source, time.monotonic())
-        return why
-
-    def halt(self, reason: str) -> None:
-        """Void every motion of this robot and halt it; return at once."""
-        self._robot.gate.revoke()
-
-        def halted(verdict: Future[StopVerdict]) -> None:
-            if verdict.result().stopped is not True:
-                logger.critical("%s DID NOT STOP: %s", self._peer_id, verdict.result().envelope().get("reason"))
-
-        self._plane.executor.submit(self._robot, self._peer_id, reason).add_done_callback(halted)
-
-    def begin(self, order: StopOrder) -> Verdict | None:
-        """Lock under the order's epoch and start the halt; None for a known epoch.
-
-        The callable that is returned waits for the robot's verdict, at most the halt deadline and the time that the
-        plane takes to report; it returns None when there is none by then.
-        """
-        run, entry = self._plane.begin(order), self._entry
-        if run is None:
-            return None
-
-        def verdict() -> StopVerdict | None:
-            run.wait(run.deadline_s + REPORT_S)
-            report = entry.reports.get(order.epoch) if entry is not None else None
-            return report.verdict if report is not None else None
-
-        return verdict
-
-    def resume(self, assertion: object) -> str | None:
-        """Clear the epoch of an operator's assertion, or return the rejection."""
-        entry = self._entry
-        return REJECTED if entry is None or is_error(entry.resume(assertion, "mesh")) else None
-
-    def answer_to_resume(self, assertion: object, peer_id: str = "") -> dict[str, Any]:
-        """Check an assertion and return the signed answer.
-
-        Args:
-            peer_id: the robot of its world that was asked, if one was.
-        """
-        rejected = self.resume(assertion)
-        result = {"status": "ok"} if rejected is None else {"status": "error", "error": rejected}
-        facts = {"device_id": peer_id or self._peer_id, **self.facts()}
-        return with_resume_statement(self.identity, peer_id or self._peer_id, assertion, result, facts)
-
-    def close(self) -> None:
-        """Take this peer's robot off the plane; twice is once."""
-        entry, self._entry = self._entry, None
-        if entry is not None:
-            entry.close()
 
 
 def status_of(robot: Robot, facts: Callable[[str], Mapping[str, Any]]) -> Own:
@@ -260,14 +108,16 @@ class FleetSafety:
         self._resumes = resumes
         self._robot = robot
         self._retry = EstopRetry(context, requester)
+        self._unresumed: dict[str, float] = {}
         self._closings = Closings(
             f"mesh-{context.peer_id}-closing",
             lambda peer: requester.send(peer, {"action": "status"}, STATUS_S).get("result"),
         )
         self.late = LatePeers(context, adapter.epochs)
-        self._recent: deque[str] = deque(maxlen=RECENT_MAX)
+        self._recent: deque[tuple[str, Scope]] = deque(maxlen=RECENT_MAX)
         self._admitted: deque[str] = deque(maxlen=RECENT_MAX)
         self._resumed: deque[str] = deque(maxlen=RECENT_MAX)
+        self.network = session.network().text
         self._latest = ""
         self._press = ("", 0.0)
 
@@ -277,14 +127,30 @@ class FleetSafety:
     # Issuing.
 
     def emergency_stop(
-        self, signing_key: Any = None, *, estop_id: str = "", on_answers: OnAnswers = lambda replies: None
+        self,
+        signing_key: Any = None,
+        *,
+        estop_id: str = "",
+        on_answers: OnAnswers = lambda replies: None,
+        scope: Scope = EVERY_ROBOT,
+        remembers: Remembers = none_known,
+        on_widened: Callable[[], None] = lambda: None,
     ) -> list[dict[str, Any]]:
-        """Stop this robot and every peer; return their replies, the local one first."""
+        """Stop this robot and every peer; return their replies, the local one first.
+
+        Where no robot in ``scope`` is there, every robot is stopped.
+        """
         context = self._context
         if not estop_id or estop_id != self._press[0]:
             self._press = (estop_id or new_epoch(), context.clock())
         epoch, pressed = self._press
-        order = StopOrder(epoch, context.peer_id, "emergency stop", "mesh", issued=context.clock(), pressed=pressed)
+        order = StopOrder(
+            epoch, context.peer_id, "emergency stop", "mesh", issued=context.clock(), pressed=pressed, scope=scope
+        )
+        if not scope.only:
+            order = self._with_original(order, signing_key)
+        if not scope.everything:
+            return self._stop_some(order, signing_key, on_answers, remembers, on_widened)
         self._latest = order.epoch
         # The fleet receives the stop while the local robot halts.
         local = self._adapter.begin(order)
@@ -306,6 +172,64 @@ class FleetSafety:
         replies = self._requester.broadcast({"action": "stop"}, COLLECT_S, missing)
         verdict = local() if local is not None else None
         responses = [*self._local_reply(order, verdict), *replies]
+        counts, stopped = self._conclude(order, responses, replies, roster)
+        self._close_stop(order, counts, signing_key, {str(each["responder_id"]) for each in replies})
+        unreached = (roster | context.registry.seen_within(KNOWN_S)) - stopped - {context.peer_id}
+        self._retry.begin(
+            order.epoch,
+            unreached,
+            lambda: order.epoch in self._adapter.epochs(),
+            lambda: self._publish_estop(order, counts, signing_key, paced=True),
+        )
+        return responses
+
+    def _stop_some(
+        self,
+        order: StopOrder,
+        signing_key: Any,
+        on_answers: OnAnswers,
+        remembers: Remembers,
+        on_widened: Callable[[], None],
+    ) -> list[dict[str, Any]]:
+        """Stop the robots of the order's scope; return their replies, a local one first."""
+        context, scope = self._context, order.scope
+        local = self._adapter.begin(order)
+        none = {"responses_received": 0, "peers_not_stopped": 0, "peers_silent": 0}
+        body = self._estop_body(order, none, signing_key)
+        stop = ScopedStop(
+            context,
+            self._requester,
+            order.epoch,
+            scope,
+            body,
+            lambda: self._publish_estop(order, none, signing_key),
+            SPACING_S,
+        )
+        replies = stop.send(COLLECT_S, on_answers, remembers)
+        if stop.widened:
+            on_widened()
+            return self.emergency_stop(signing_key, estop_id=order.epoch, on_answers=on_answers)
+        own = self._local_reply(order, local() if local is not None else None) if self._adapter.within(scope) else []
+        counts, stopped = self._conclude(order, [*own, *replies], replies, stop.targets())
+        if scope.cell:
+            self._close_stop(order, counts, signing_key, {str(each["responder_id"]) for each in replies})
+        self._unresumed[order.epoch] = until = time.monotonic() + KNOWN_S
+        while len(self._unresumed) > SCOPED_MAX:
+            del self._unresumed[next(iter(self._unresumed))]
+        self._retry.begin(
+            order.epoch,
+            stop.targets() - stopped,
+            lambda: order.epoch in self._unresumed and time.monotonic() < until,
+            stop.publish if scope.cell else lambda: None,
+            stop.command,
+        )
+        return [*own, *replies]
+
+    def _conclude(
+        self, order: StopOrder, responses: list[dict[str, Any]], replies: list[dict[str, Any]], roster: set[str]
+    ) -> tuple[dict[str, Any], set[str]]:
+        """Log and audit the answers to a stop; return their counts, and who stopped."""
+        context = self._context
         stopped = {str(each["responder_id"]) for each in responses if stop_outcome(each) is Outcome.STOPPED}
         not_stopped = [name for each in responses if (name := str(each["responder_id"])) not in stopped]
         silent = sorted(roster - {str(each["responder_id"]) for each in replies})
@@ -318,15 +242,7 @@ class FleetSafety:
             "peers_not_stopped": len(not_stopped),
             "peers_silent": len(silent),
         }
-        self._close_stop(order, counts, signing_key, {str(each["responder_id"]) for each in replies})
         record_heads(context.peer_id, replies, roster)
-        unreached = (roster | context.registry.seen_within(KNOWN_S)) - stopped - {context.peer_id}
-        self._retry.begin(
-            order.epoch,
-            unreached,
-            lambda: order.epoch in self._adapter.epochs(),
-            lambda: self._publish_estop(order, counts, signing_key, paced=True),
-        )
         context.audit.always(
             "emergency_stop",
             estop_id=order.epoch,
@@ -334,8 +250,9 @@ class FleetSafety:
             not_stopped=not_stopped,
             silent=silent,
             lockout_engaged=self.locked(),
+            **order.scope.field(),
         )
-        return responses
+        return counts, stopped
 
     def _close_stop(self, order: StopOrder, counts: dict[str, Any], signing_key: Any, answered: set[str]) -> None:
         """Publish the stop with its counts, later where a 0.5 peer would drop it."""
@@ -373,13 +290,22 @@ class FleetSafety:
             self._put_estop(order, counts, signing_key)
             context.pacer.note(SAFETY)
 
+    def _with_original(self, order: StopOrder, signing_key: Any) -> StopOrder:
+        """Return an order of ours with the message that robots which missed it are told."""
+        payload = wire.encode(self._estop_body(order, {}, signing_key), topics.BY_NAME["estop"].max_bytes)
+        return replace(order, original=payload, network=self.network)
+
     def _put_estop(self, order: StopOrder, counts: dict[str, Any], signing_key: Any) -> None:
+        body = self._estop_body(order, counts, signing_key)
+        self._publish(topics.estop(), body, f"Emergency stop {order.epoch}", logging.CRITICAL)
+
+    def _estop_body(self, order: StopOrder, counts: dict[str, Any], signing_key: Any) -> dict[str, Any]:
         # The time is that of the sending, because peers in the field refuse what is older than a minute.
         context = self._context
         counts = {**counts, "lockout_engaged": True}
         notice = wire.EstopNotice(context.peer_id, context.clock(), order.epoch, context.session_id(), counts)
-        body = self._signed({**notice.to_wire(), "pressed_at": order.pressed}, Purpose.EMERGENCY_STOP, signing_key)
-        self._publish(topics.estop(), body, f"Emergency stop {order.epoch}", logging.CRITICAL)
+        stated = {**notice.to_wire(), "pressed_at": order.pressed, **order.scope.field()}
+        return self._signed(stated, Purpose.EMERGENCY_STOP, signing_key)
 
     # Receiving.
 
@@ -402,9 +328,10 @@ class FleetSafety:
         if why is not None:
             context.audit("estop_rejected", notice.peer_id, reason=why)
             return
-        epoch = notice.estop_id or derived_epoch(notice.peer_id, json.dumps(body["t"]).encode())
-        self._latest = epoch
-        if epoch in self._recent:
+        epoch = epoch_of(notice, body)
+        scope = self._adapter.scope(notice.peer_id, body)
+        self._latest = epoch if scope.everything else self._latest
+        if (epoch, scope) in self._recent:
             self.late.heard(epoch)
             context.audit("remote_estop_redundant", notice.peer_id, estop_id=epoch)
             return
@@ -412,16 +339,62 @@ class FleetSafety:
             context.audit("remote_estop_redundant", notice.peer_id, estop_id=epoch, reason="resumed since")
             return
         pressed = wire.finite(body.get("pressed_at"))
-        order = StopOrder(epoch, notice.peer_id, "fleet e-stop", "mesh", True, notice.t, received, pressed)
-        self._recent.append(epoch)
+        order = StopOrder(
+            epoch,
+            notice.peer_id,
+            "fleet e-stop",
+            "mesh",
+            True,
+            notice.t,
+            received,
+            pressed,
+            scope=scope,
+            # A console passes on what it sent, and nothing of others.
+            original=sample.payload if self._robot else None,
+            network=self.network,
+        )
+        self._recent.append((epoch, scope))
         # The plane locks and starts the halts at once; nothing on this path waits.
         if self._adapter.begin(order) is None:
-            context.audit("remote_estop_redundant", notice.peer_id, estop_id=epoch)
+            if self._adapter.within(scope):
+                context.audit("remote_estop_redundant", notice.peer_id, estop_id=epoch)
             return
         if order.timing(context.clock()) == "ahead":
             context.audit("estop_clock_skew", notice.peer_id, estop_id=epoch)
-        self.late.stopped(epoch, lambda: self._repeat_estop({**body, "estop_id": epoch}))
+        if scope.everything:
+            self.late.stopped(epoch, lambda: self._repeat_estop({**body, "estop_id": epoch}))
         self._publish_event("emergency_stop", epoch)
+
+    def on_own_estop(self, given: object, sample: Sample, sender: str, peer_id: str) -> str | None:
+        """Lock by the envelope in a ``stop`` for this peer; return its epoch, or None.
+
+        The plain stop is carried out whatever this says.
+
+        Args:
+            sender: of the command, who must be the envelope's issuer.
+            peer_id: to whom the command was sent: this peer, or a robot of its world.
+        """
+        context, received = self._context, time.monotonic()
+        try:
+            body = dict(given) if isinstance(given, Mapping) else {}
+            _require_same_session(body, sample)
+            notice = wire.EstopNotice.of(body)
+        except wire.WireError as exc:
+            context.audit("estop_rejected", reason=str(exc))
+            return None
+        why = "its issuer is not the sender" if notice.peer_id != sender else self._adapter.stop_refusal(sender, body)
+        if why is not None or notice.estop_id is None:
+            context.audit("estop_rejected", sender, reason=why or "it has no estop_id")
+            return None
+        scope = self._adapter.scope(sender, body)
+        if peer_id in scope.only:
+            # A robot of a world is locked with it.
+            scope = replace(scope, only=scope.only | {context.peer_id})
+        pressed = wire.finite(body.get("pressed_at"))
+        self._adapter.begin(
+            StopOrder(notice.estop_id, sender, "fleet e-stop", "mesh", True, notice.t, received, pressed, scope=scope)
+        )
+        return notice.estop_id
 
     def _repeat_estop(self, body: dict[str, Any]) -> None:
         """Publish a stop of another issuer again, from our session."""
@@ -475,6 +448,7 @@ class FleetSafety:
             return self._denied(str(exc))
         relayed = 0
         for epoch, assertions in signed.items():
+            self._unresumed.pop(epoch, None)
             for assertion in assertions:
                 ours = epoch in own and context.peer_id in assertion["targets"]
                 rejected = self._adapter.resume(assertion) if ours else None
@@ -646,8 +620,7 @@ class FleetSafety:
         if signing_key is None:
             return stated
         stated["nonce"] = secrets.token_hex(16)
-        covered = signed_bytes(purpose, self._context.peer_id, stated)
-        return {**stated, "sig": ed25519.encode(signing_key.sign(covered))}
+        return signed_stop(signing_key, purpose, self._context.peer_id, stated)
 
     def _denied(self, why: str) -> dict[str, Any]:
         self._context.audit("resume_denied", reason=why)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import atexit
 import logging
+import os
 import threading
 from typing import Any
 
@@ -19,6 +20,7 @@ from strands_robots.mesh.registry import PEER_TIMEOUT, PeerRegistry
 from strands_robots.mesh.transport import Transport, TransportError
 from strands_robots.mesh.transport.factory import make_transport
 from strands_robots.mesh.wire import WireError
+from strands_robots.safety.network_key import MESH, NetworkKey
 from strands_robots.utils import MissingExtraError, number
 
 __all__ = [
@@ -29,6 +31,7 @@ __all__ = [
     "get_peer",
     "get_peers",
     "get_session",
+    "network",
     "pacer",
     "prune_peers",
     "put",
@@ -140,6 +143,22 @@ def zenoh_error_types() -> tuple[type[BaseException], ...]:
     except ImportError:
         return (OSError, RuntimeError)
     return (zenoh.ZError, OSError, RuntimeError)
+
+
+def network() -> NetworkKey:
+    """Return the key of the mesh that this process joins, from its settings."""
+    backend = settings.raw("STRANDS_MESH_BACKEND").lower()
+    endpoints = [*settings.items("ZENOH_CONNECT"), *settings.items("ZENOH_LISTEN")]
+    if backend in ("zenoh", "bridge") and not endpoints:
+        endpoints = [f"tcp/127.0.0.1:{settings.integer('STRANDS_MESH_PORT')}"]
+    broker = settings.raw("STRANDS_IOT_ENDPOINT")
+    if backend == "bridge" and broker:
+        endpoints.append(broker)
+    elif backend == "iot":
+        endpoints = [broker]
+    elif backend == "memory":
+        endpoints = [f"memory-{os.getpid()}"]
+    return NetworkKey.of(MESH, endpoints)
 
 
 def registry() -> PeerRegistry:

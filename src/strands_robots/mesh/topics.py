@@ -46,6 +46,9 @@ TABLE: tuple[Topic, ...] = (
     Topic("resume", "strands/safety/resume", 0, None, 4 * KIB, True, True, 1, True, True),
     Topic("checkin", "strands/*/checkin", 0, None, 4 * KIB, True, True, 1, False, True),
     Topic("checkin_answer", "strands/*/checkin/answer", 0, None, 4 * KIB, True, False, 1, False, True),
+    Topic("missed_ask", "strands/*/missed/ask", 0, None, 8 * KIB, True, qos=None),
+    Topic("missed_answer", "strands/*/missed/answer", 0, None, 64 * KIB, True, qos=None),
+    Topic("missed_roster", "strands/*/missed/roster", 0, None, 16 * KIB, True, False, 1, False, True),
     Topic("broadcast", "strands/broadcast", 0, None, 16 * KIB, True, True, 1, False, True),
     Topic("cmd", "strands/*/cmd", 0, None, 16 * KIB, True, True, 1, False, True),
     Topic("response", "strands/*/response/**", 0, None, 1024 * KIB, True, True, 1, False, True),
@@ -93,6 +96,18 @@ def check_in(controller: str) -> str:
 
 def check_in_answer(robot: str) -> str:
     return f"{ROOT}/{robot}/checkin/answer"
+
+
+def missed_ask(peer: str) -> str:
+    return f"{ROOT}/{peer}/missed/ask"
+
+
+def missed_answer(peer: str) -> str:
+    return f"{ROOT}/{peer}/missed/answer"
+
+
+def missed_roster(controller: str) -> str:
+    return f"{ROOT}/{controller}/missed/roster"
 
 
 def response(requester: str, responder: str, turn: str) -> str:

@@ -27,6 +27,7 @@ from strands_robots.policies.base import (
     SpeedLimit,
     checked_action,
     follows_instruction,
+    is_velocity,
     numbers,
 )
 from strands_robots.policies.loop_counts import Counted
@@ -226,6 +227,8 @@ class Rollout:
         self._last: dict[str, float] = {}
         self._written_at = -math.inf
         self._held_back: Action = {}
+        self._moving = False
+        self._holds = permit.holds
         self._stop_requested = threading.Event()
         self._begun = threading.Event()
         self._paced = policy if isinstance(policy, Paced) else None
@@ -366,12 +369,15 @@ class Rollout:
         logger.error(message, self.policy_name, self.robot, exc, exc_info=None if expected else exc)
 
     def _loop(self, bounds: Ranges) -> State:
-        started = self._clock.now()
+        began = started = self._clock.now()
         chunk: deque[Action] = deque()
         tick = 0
         while self._permit.valid:
+            if self._held():
+                started = self._clock.now() - tick * self._period
+                continue
             # The duration starts with the first tick: loading a policy is not part of it.
-            if self.duration is not None and self._clock.now() - started >= self.duration:
+            if self.duration is not None and self._clock.now() - began >= self.duration:
                 return "completed"
             if self._steps is not None and self.step_count >= self._steps:
                 return "completed"
@@ -381,12 +387,16 @@ class Rollout:
                 if actions is None:
                     return "completed"
                 chunk.extend([actions] if isinstance(actions, Mapping) else actions)
+            if self._held():
+                started = self._clock.now() - tick * self._period
+                continue
             if chunk:
                 wanted = chunk.popleft()
                 checked = checked_action(wanted, bounds)
                 self.out_of_range_steps += any(checked[key] != wanted[key] for key in checked)
                 action = self._limited(checked, observation)
                 sent = self._body.send_action(action, self._permit)
+                self._moving = any(is_velocity(key) and value for key, value in sent.items())
                 self.step_count += 1
                 self.clamped_steps += bool(self._held_back)
                 self._notify("step", observation=numbers(observation), action=numbers(sent))
@@ -395,10 +405,24 @@ class Rollout:
                 self._body.send_action(self._limited(self._held_back, observation), self._permit)
             if self._paced is not None and self._paced.preparing:
                 # The first inference is part of loading.
-                started, tick = self._clock.now(), 0
+                began = started = self._clock.now()
+                tick = 0
+            if self._held():
+                # Beats that were missed meanwhile are neither made up for nor left out: the plan goes on from here.
+                started = self._clock.now() - tick * self._period
             tick = self._next(tick, started)
             self._clock.wait(started + tick * self._period, self._stop_requested)
         return "stopped"
+
+    def _held(self) -> bool:
+        """Wait for the end of a hold; return True if there was one since the last call."""
+        if self._moving and self._permit.held:
+            # A velocity goes on by itself until another one is written.
+            self._moving = False
+            self._body.hold(self._permit)
+        self._permit.wait()
+        before, self._holds = self._holds, self._permit.holds
+        return self._holds != before
 
     def _limited(self, action: Action, observation: Mapping[str, Any]) -> Action:
         """Return the action to write now, within the speed limit of the body."""

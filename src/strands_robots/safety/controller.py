@@ -15,7 +15,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from strands_robots.audit import log_witness
-from strands_robots.safety import ed25519
 from strands_robots.safety.answers import ANSWERS_MAX, Answer, Answers, Received
 from strands_robots.safety.estop_listener import (
     CHECK_IN,
@@ -23,13 +22,30 @@ from strands_robots.safety.estop_listener import (
     ESTOP,
     VERDICT,
     FailureBudget,
+    OnEvent,
     RenewableLink,
+    ReportingLink,
     StopLink,
     notification,
 )
 from strands_robots.safety.head_witness import HeadWitness
 from strands_robots.safety.identity import KeyFileError
-from strands_robots.safety.orders import REASON_MAX, answered_field, new_epoch, params_of, signed_bytes
+from strands_robots.safety.missed_stops import ANSWER, QUESTION, MissedStops
+from strands_robots.safety.network_key import NetworkKey
+from strands_robots.safety.orders import REASON_MAX, answered_field, new_epoch, params_of, signed_stop
+from strands_robots.safety.question_ports import ControllerPort
+from strands_robots.safety.roster_inbox import OnReport, RosterInbox
+from strands_robots.safety.roster_report import STOP_ROSTER
+from strands_robots.safety.scope import (
+    EVERY_ROBOT,
+    WIDEN_S,
+    KnownRobots,
+    Remembers,
+    Scope,
+    none_known,
+    report_widened,
+)
+from strands_robots.safety.silence import Sending
 from strands_robots.safety.statements import Proof, Purpose, proof_of
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.turns import shorten_turns
@@ -82,7 +98,8 @@ class StopReport:
     stopped when its signature was needed and is missing. ``silent`` are the expected ones that gave no answer, and
     ``alarms`` those in whose name a wrong key answered, with the reason. ``link``: the stop left this machine at least
     once. ``elapsed_ms`` is the time from the press until the last answer or the deadline, ``left_ms`` until the stop
-    first left this machine.
+    first left this machine. ``scope`` are the robots that the press was for; ``widened``: none of them was there, and
+    every robot was stopped.
     """
 
     estop_id: str
@@ -95,6 +112,8 @@ class StopReport:
     left_ms: float = 0.0
     claimed: Mapping[str, Answer] = field(default_factory=dict)
     alarms: Mapping[str, str] = field(default_factory=dict)
+    scope: Scope = EVERY_ROBOT
+    widened: bool = False
 
     @property
     def answered(self) -> Mapping[str, Answer]:
@@ -113,8 +132,11 @@ class StopReport:
 
     @property
     def ok(self) -> bool:
-        """True when every robot is known to be still; no answer at all is not ok."""
-        missing = self.not_stopped or self.refused or self.silent or self.claimed or self.alarmed
+        """True when every robot is known to be still.
+
+        No answer at all is not ok, nor one of no robot in its scope.
+        """
+        missing = self.not_stopped or self.refused or self.silent or self.claimed or self.alarmed or self.widened
         return bool(self.stopped) and not missing
 
 
@@ -129,6 +151,8 @@ class Progress:
     elapsed_ms: float
     left_ms: float = 0.0
     alarms: Mapping[str, str] = field(default_factory=dict)
+    scope: Scope = EVERY_ROBOT
+    widened: bool = False
 
 
 OnProgress = Callable[[Progress], None]
@@ -144,6 +168,9 @@ class SafetyController:
         on_link: called at once when the link is lost or back.
         enrolled: gives the public keys of robots, read when this is made and once each stop has left.
         require_signed: count a robot that is not enrolled as *claimed* only.
+        stands: receive the stops of other controllers, too, for :meth:`hear_others`.
+        network: of its stops, whose roster must answer them; None where that is not known.
+        remembers: says whether this machine knows a robot in a scope; asked on a thread once such a stop has left.
     """
 
     def __init__(
@@ -155,10 +182,14 @@ class SafetyController:
         on_link: Callable[[bool], None] = lambda up: None,
         enrolled: Callable[[], Mapping[str, bytes]] = dict,
         require_signed: bool = False,
+        stands: bool = False,
+        network: NetworkKey | None = None,
+        remembers: Remembers = none_known,
     ) -> None:
-        self.controller_id = device_id("controller_id", controller_id)
+        self.controller_id, self.network = device_id("controller_id", controller_id), network
         self._key = signing_key
         self._enrolled, self._require_signed = enrolled, require_signed
+        self._remembers = remembers
         self._keys: Mapping[str, bytes] = {}
         self._load_keys()
         self._on_link = on_link
@@ -170,14 +201,42 @@ class SafetyController:
         self._check_in: threading.Thread | None = None
         self._unanswered_s = 0.0
         self._witness, self._heads = HeadWitness(always=True), FailureBudget()
-        self._link = make_link()
+        self._reports = RosterInbox()
+        self._others: OnEvent | None = None
+        self._link, self._linked = make_link(), False
         self._end_short_turns = shorten_turns()
-        self._link.open((VERDICT, CHECK_IN_ANSWER), self._receive, self._link_changed)
+        self._sent = ControllerPort(self.controller_id, signing_key, lambda: self._keys, self._publish)
+        self._missed = MissedStops(self._sent)
+        events = (VERDICT, CHECK_IN_ANSWER, QUESTION, ANSWER, STOP_ROSTER, *((ESTOP,) if stands else ()))
+        self._link.open(events, self._receive, self._link_changed)
 
     @property
     def link_up(self) -> bool:
         """True while the link reaches a peer."""
         return self._link.up
+
+    @property
+    def sending(self) -> Sending:
+        """The way its stops leave: signed or not, and the broker's refusal."""
+        tells = isinstance(self._link, ReportingLink)
+        denied = self._link.denied if isinstance(self._link, ReportingLink) else ""
+        return Sending(signed=self._key is not None, denied=denied, tells=tells)
+
+    @property
+    def signing_key(self) -> Any:
+        """The key that signs its stops, or None."""
+        return self._key
+
+    def hear_others(self, hear: OnEvent) -> None:
+        """Give the stops of others, and the answers of robots, to ``hear``.
+
+        It is called on a thread of the link: it returns at once, parses nothing and may not raise.
+        """
+        self._others = hear
+
+    def publish(self, event: str, payload: bytes) -> bool:
+        """Send an event under this controller's name; False when the link is down."""
+        return self._link.publish(self.controller_id, event, payload)
 
     def wait_link(self, timeout: float) -> bool:
         """True when the link is up within ``timeout`` seconds."""
@@ -191,32 +250,47 @@ class SafetyController:
         *,
         deadline_s: float = DEADLINE_S,
         estop_id: str = "",
+        more: bool = False,
         on_progress: OnProgress = lambda progress: None,
+        on_report: OnReport = lambda report: None,
+        scope: Scope = EVERY_ROBOT,
     ) -> StopReport:
-        """Stop every robot of the tenant, now, and wait for their answers.
+        """Stop every robot of the tenant, or those of ``scope``; wait for answers.
 
         The stop is sent at once and again until each ``expected`` robot has answered or ``deadline_s`` is over; while
         the link is down it waits for it and is sent in the moment it is back. Without ``expected`` it is repeated to
         the deadline, and every robot that answers is in the report.
+
+        A stop for some robots of which none has answered ``WIDEN_S`` after it left, and none is known here, becomes a
+        stop of every robot: a name may be mistyped.
 
         Args:
             expected: ids of the robots that must answer.
             reason: for the robots and their logs, at most 200 characters.
             deadline_s: seconds until silence is reported as silence.
             estop_id: 32 hex digits; a fresh one by default.
+            more: :meth:`expect` will name further robots, so the stop goes on until then.
             on_progress: called at each answer, when the link changes, and once 100 ms have passed.
+            on_report: called with what standing controllers say they miss, on a thread of its own.
+            scope: the robots that it is for; those that read no scope stop all the same.
         """
         number("deadline_s", deadline_s, above=0, high=3600)
         if isinstance(expected, str):
             raise ValidationError(f"expected must be a collection of robot ids, not the text {expected!r}.")
         estop_id = estop_id or new_epoch()
         press = self.press(estop_id)
-        run = _Running(estop_id, frozenset(expected), time.monotonic(), press, reason[:REASON_MAX])
+        run = _Running(
+            estop_id, frozenset(expected) | scope.only, time.monotonic(), press, reason[:REASON_MAX], scope, more=more
+        )
+        deadline_s = deadline_s if scope.everything else max(deadline_s, 2 * WIDEN_S)
         with self._changed:
             self._stops[run.estop_id] = run
         try:
             # The first one is sent before anything else is done.
             self._send(run)
+            self._reports.open(run.estop_id, on_report)
+            if not scope.everything:
+                run.known = KnownRobots(scope, self._remembers)
             self._load_keys()
             run.graded = Answers(self._keys, required=self._require_signed, pressed_at=press.wall)
             self._repeat(run, deadline_s, on_progress)
@@ -224,6 +298,9 @@ class SafetyController:
             with self._changed:
                 del self._stops[run.estop_id]
                 self._ended = run
+            self._reports.close(run.estop_id)
+            if run.complete:
+                self._sent.answered(run.estop_id)
         return self._report(run)
 
     def review(self, report: StopReport) -> StopReport:
@@ -251,12 +328,17 @@ class SafetyController:
                 del self._presses[next(iter(self._presses))]
         return press
 
-    def expect(self, estop_id: str, names: Collection[str]) -> bool:
-        """Name further robots that must answer ``estop_id``; False when it is over."""
+    def expect(self, estop_id: str, names: Collection[str], *, more: bool = False) -> bool:
+        """Name further robots that must answer ``estop_id``; False when it is over.
+
+        Args:
+            more: further ones will be named, so the stop goes on until then.
+        """
         with self._changed:
             run = self._stops.get(estop_id)
             if run is not None:
                 run.expected |= frozenset(names)
+                run.more = more
                 self._changed.notify_all()
         return run is not None
 
@@ -280,19 +362,26 @@ class SafetyController:
         if self._check_in is not None:
             self._check_in.join(2.0)
         self._link.close()
+        self._reports.end()
+        self._missed.close()
         self._end_short_turns()
 
     def _send(self, run: _Running) -> None:
         """Send the stop, issued now and pressed at its press."""
         fields: dict[str, Any] = {"estop_id": run.estop_id, "reason": run.reason, "pressed_at": run.press.wall}
+        fields |= {} if run.widened else run.scope.field()
         # Expected ones first: a flood of answers in invented names crowds none of them out.
         fields |= answered_field(sorted(run.graded.final(), key=lambda name: name not in run.expected))
         payload, now = self._signed(ESTOP, Purpose.EMERGENCY_STOP, fields), time.monotonic()
         if self._link.publish(self.controller_id, ESTOP, payload) and run.left is None:
             run.left = now
+        if run.sent != run.widened:
+            run.sent = run.widened
+            self._sent.sent(run.estop_id, payload)
 
     def _repeat(self, run: _Running, deadline_s: float, on_progress: OnProgress) -> None:
-        pauses, reported = iter(REPEAT_S if self._key is None else REPEAT_SIGNED_S), -1
+        quick_first = REPEAT_S if self._key is None else REPEAT_SIGNED_S
+        pauses, reported = iter(quick_first), -1
         longest_s = REPEAT_EACH_MAX_S if self._key is None else REPEAT_EACH_SIGNED_MAX_S
         pause, next_send, again = 0.0, run.started, 0
         renew_at = run.started + max(SETTLE_S, RENEW_S - self._unanswered_s)
@@ -303,8 +392,12 @@ class SafetyController:
             now = time.monotonic()
             late = now - run.started >= UNCONFIRMED_S
             with self._changed:
-                state = hash((run.changes, len(run.expected), late, self._link.up))
                 finished = run.complete or now - run.started >= deadline_s
+                if run.widens_at <= now and not run.settled_scope:
+                    run.widened = True
+                    report_widened(run.estop_id, run.scope)
+                    pauses, next_send, finished = iter(quick_first), 0.0, False
+                state = hash((run.changes, len(run.expected), late, run.widened, self._link.up))
             if state != reported or finished:
                 reported = state
                 on_progress(run.progress(self._link.up, now))
@@ -322,10 +415,11 @@ class SafetyController:
                 pause = next(pauses, pause)
                 next_send = now + max(pause, min(REPEAT_EACH_S * len(run.expected), longest_s))
             marks = [next_send, run.started + deadline_s, *([] if late else [run.started + UNCONFIRMED_S])]
+            marks += [run.widens_at] if run.widens_at > now else []
             with self._changed:
-                seen = (self._link.up, len(run.expected))
+                seen = (self._link.up, len(run.expected), run.more)
                 self._changed.wait_for(
-                    lambda seen=seen: run.inbox or seen != (self._link.up, len(run.expected)),  # type: ignore[misc]
+                    lambda seen=seen: run.inbox or seen != (self._link.up, len(run.expected), run.more),  # type: ignore[misc]
                     max(0.0, min(marks) - time.monotonic()),
                 )
                 if self._link.up and not seen[0]:
@@ -354,6 +448,8 @@ class SafetyController:
             run.left_ms,
             {name: each for name, each in answers.items() if each.stopped is True and each.claimed},
             alarms,
+            run.scope,
+            run.widened,
         )
         for name, each in {**report.not_stopped, **refused}.items():
             logger.critical("%s DID NOT STOP: %s", name, each.why or each.facts)
@@ -374,6 +470,16 @@ class SafetyController:
 
     def _receive(self, event: str, source: str, payload: bytes | int) -> None:
         at, wall = time.monotonic(), time.time()
+        if event == STOP_ROSTER:
+            self._reports.put(source, payload)
+            return
+        if self._others is not None and event in (ESTOP, VERDICT) and source != self.controller_id:
+            self._others(event, source, payload)
+        if event in (QUESTION, ANSWER):
+            self._missed.receive(event, source, payload)
+            return
+        if event == ESTOP:
+            return
         params = params_of(payload)
         if "estop_id" not in params:
             logger.warning("An answer of %s is not to be read; it counts as none.", shown(source))
@@ -403,7 +509,9 @@ class SafetyController:
     def _link_changed(self, up: bool) -> None:
         with self._changed:
             self._changed.notify_all()
-        self._on_link(up)
+            changed, self._linked = up != self._linked, up
+        if changed:
+            self._on_link(up)
 
     def _check_in_loop(self, interval_s: float) -> None:
         due = time.monotonic()
@@ -411,10 +519,13 @@ class SafetyController:
             due = max(due + interval_s, time.monotonic())
             self.check_in()
 
+    def _publish(self, event: str, source: str, fields: Mapping[str, Any]) -> bool:
+        return self._link.publish(source, event, notification(event, fields))
+
     def _signed(self, event: str, purpose: Purpose, params: Mapping[str, Any]) -> bytes:
         stated: dict[str, Any] = {**params, "purpose": purpose, "t": time.time(), "nonce": secrets.token_hex(16)}
         if self._key is not None:
-            stated["sig"] = ed25519.encode(self._key.sign(signed_bytes(purpose, self.controller_id, stated)))
+            stated = signed_stop(self._key, purpose, self.controller_id, stated)
         return notification(event, stated)
 
 
@@ -425,10 +536,15 @@ class _Running:
     started: float
     press: Press
     reason: str
+    scope: Scope = EVERY_ROBOT
+    known: KnownRobots | None = None
+    widened: bool = False
     inbox: dict[str, deque[Received]] = field(default_factory=dict)
     graded: Answers = field(default_factory=lambda: Answers({}, required=True, pressed_at=0.0))
     left: float | None = None
+    sent: bool | None = None
     changes: int = 0
+    more: bool = False
 
     def receive(self, source: str, received: Received) -> None:
         """Take a verdict; a flood in a robot's name pushes out only that robot's own."""
@@ -446,8 +562,27 @@ class _Running:
                 self.changes += sum(self.graded.take(source, each) for each in received)
 
     @property
+    def widens_at(self) -> float:
+        """Monotonic s at which it widens, unless a robot in its scope answers."""
+        scoped = self.left is not None and not (
+            self.scope.everything or self.widened or (self.known is not None and self.known.known)
+        )
+        return self.left + WIDEN_S if scoped and self.left is not None else float("inf")
+
+    @property
+    def settled_scope(self) -> bool:
+        """A robot in the scope has answered.
+
+        What is claimed for an enrolled one is no answer.
+        """
+        return any(
+            self.scope.names(name, each.facts.get("cell")) and not (each.claimed and each.enrolled)
+            for name, each in self.graded.by_robot.items()
+        )
+
+    @property
     def complete(self) -> bool:
-        return bool(self.expected) and not self.graded.unsettled(self.expected)
+        return bool(self.expected) and not self.more and not self.graded.unsettled(self.expected)
 
     @property
     def unanswered(self) -> bool:
@@ -468,4 +603,6 @@ class _Running:
         open_ = self.graded.unsettled(self.expected) if late or not link_up else ()
         elapsed_ms = self.since_press_ms(now)
         answers, alarms = dict(self.graded.by_robot), dict(self.graded.alarms)
-        return Progress(self.estop_id, answers, open_, link_up, elapsed_ms, self.left_ms, alarms)
+        return Progress(
+            self.estop_id, answers, open_, link_up, elapsed_ms, self.left_ms, alarms, self.scope, self.widened
+        )

@@ -40,14 +40,20 @@ def encode(data: bytes) -> str:
 
 def decode(text: object, length: int) -> bytes | None:
     """``length`` bytes of base64url, padded or not; None for anything else."""
-    if not isinstance(text, str) or not text.isascii() or len(text) > 4 * (length // 3 + 1):
+    data = decode_up_to(text, length)
+    return data if data is not None and len(data) == length else None
+
+
+def decode_up_to(text: object, longest: int) -> bytes | None:
+    """At most ``longest`` bytes of base64url, padded or not; None for anything else."""
+    if not isinstance(text, str) or not text.isascii() or len(text) > 4 * (longest // 3 + 1):
         return None
     bare = text.rstrip("=")
     try:
         data = base64.b64decode(bare + "=" * (-len(bare) % 4), altchars=b"-_", validate=True)
     except (binascii.Error, ValueError):
         return None
-    return data if len(data) == length else None
+    return data if len(data) <= longest else None
 
 
 def public_keys(items: Sequence[str], setting: str) -> tuple[bytes, ...]:

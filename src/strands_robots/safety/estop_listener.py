@@ -7,6 +7,7 @@ the stop executor: two hand-offs.
 
 from __future__ import annotations
 
+import functools
 import json
 import secrets
 import threading
@@ -17,9 +18,12 @@ from collections.abc import Callable, Collection, Hashable, Mapping
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from strands_robots.audit import audit_head, own_log_id, queue_safety_event
+from strands_robots.safety.awake import AWAKE
 from strands_robots.safety.checkin import CheckInRules
 from strands_robots.safety.head_witness import CheckInAnswers, HeadWitness
 from strands_robots.safety.identity import SigningIdentity
+from strands_robots.safety.missed_stops import ANSWER, QUESTION, MissedStops
+from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.orders import (
     LISTENER,
     PARSED_MAX_BYTES,
@@ -30,6 +34,7 @@ from strands_robots.safety.orders import (
     params_of,
 )
 from strands_robots.safety.plane import SafetyPlane, plane
+from strands_robots.safety.question_ports import Member, RobotsPort
 from strands_robots.safety.statements import Purpose, signed
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.turns import shorten_turns
@@ -41,6 +46,7 @@ ESTOP = "emergencyStop"
 VERDICT = "emergencyStopVerdict"
 CHECK_IN = "safetyCheckIn"
 CHECK_IN_ANSWER = "safetyCheckInAnswer"
+EVENTS = (ESTOP, CHECK_IN, CHECK_IN_ANSWER, QUESTION, ANSWER)
 
 ANSWER_AGAIN_S = 0.01
 """Seconds between two answers of a robot to the same stop."""
@@ -75,7 +81,10 @@ In place of more than :data:`~.orders.PARSED_MAX_BYTES` a link gives their numbe
 """
 
 OnState = Callable[[bool], None]
-"""Called with the link's state, True for up, on a thread of the link, at each change."""
+"""Called with the link's state, True for up, on a thread of the link, at each change.
+
+Also with True while it is up, when a connection is new or a peer that was lost is back.
+"""
 
 
 class StopLink(Protocol):
@@ -106,6 +115,15 @@ class RenewableLink(Protocol):
         """Open a connection in place of the present one; return at once."""
 
 
+@runtime_checkable
+class ReportingLink(Protocol):
+    """A link of a network that tells a sender what it refuses."""
+
+    @property
+    def denied(self) -> str:
+        """The broker's refusal of a stop of this connection, or ""."""
+
+
 def notification(event: str, params: Mapping[str, Any], event_id: str = "") -> bytes:
     """Encode an event as a JSON-RPC 2.0 notification with ``event_id`` and ``ts``."""
     stamp = {"event_id": event_id or uuid.uuid4().hex, "ts": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())}
@@ -113,12 +131,13 @@ def notification(event: str, params: Mapping[str, Any], event_id: str = "") -> b
 
 
 class StopEvent(NamedTuple):
-    """Event from a link: name, declared source, bytes, monotonic s at receipt."""
+    """Event from a link: name, source, bytes, monotonic s at receipt, network."""
 
     event: str
     source: str
     payload: bytes | int
     at: float
+    network: str = ""
 
 
 class _Bucket:
@@ -181,9 +200,9 @@ class FairQueue:
         """Return True when this source has a bucket of its own."""
         return source in self._vouched
 
-    def put(self, event: str, source: str, payload: bytes | int, *, urgent: bool = True) -> None:
+    def put(self, event: str, source: str, payload: bytes | int, *, urgent: bool = True, network: str = "") -> None:
         """Add an event; of those that are not urgent, a full bucket drops the new."""
-        received = StopEvent(event, source, payload, time.monotonic())
+        received = StopEvent(event, source, payload, time.monotonic(), network)
         bucket = self._vouched.get(source)
         if bucket is None:
             # Within one text: the hash of a pair keeps the same names together whatever the salt.
@@ -326,8 +345,13 @@ class ListenerRegistration:
         key: Hashable,
         link: StopLink,
         identity: Callable[[], SigningIdentity | None],
+        *,
+        network: NetworkKey | None,
+        was_here: bool,
     ) -> None:
         self.robot_id = robot_id
+        self.network = network
+        self.was_here = was_here
         self.identity = identity
         self.key = key
         self.link = link
@@ -350,12 +374,16 @@ class EstopListener:
         rules: makes the rules by which a stop counts; they are read when the first device registers.
     """
 
-    def __init__(self, of: SafetyPlane | None = None, rules: Callable[[], StopRules] = StopRules) -> None:
+    def __init__(
+        self,
+        of: SafetyPlane | None = None,
+        rules: Callable[[], StopRules] = StopRules,
+    ) -> None:
         self._plane = of or plane()
         self._make_rules = rules
         self._registering = threading.Lock()
         self._registrations: tuple[ListenerRegistration, ...] = ()
-        self._open: set[Hashable] = set()
+        self._open: dict[Hashable, MissedStops] = {}
         self._refusals = RefusalLog()
         self._budget = FailureBudget()
         self._latch_answers = LatchAnswers()
@@ -368,6 +396,7 @@ class EstopListener:
         self._queue: FairQueue | None = None
         self._thread: threading.Thread | None = None
         self._end_short_turns: Callable[[], None] = lambda: None
+        self._end_watch: Callable[[], None] = lambda: None
 
     @property
     def registrations(self) -> tuple[ListenerRegistration, ...]:
@@ -382,10 +411,14 @@ class EstopListener:
         identity: Callable[[], SigningIdentity | None] = lambda: None,
         *,
         opened: bool = True,
+        network: NetworkKey | None = None,
+        was_here: bool = False,
     ) -> ListenerRegistration:
         """Serve a robot over the link of ``key``; ``make`` the link if it is new.
 
         Args:
+            network: of the link; missed stops are asked for and answered within it alone, and not without one.
+            was_here: the robot was served from this machine in the ten minutes before.
             identity: returns what signs the robot's verdicts; None leaves them unsigned.
             opened: False to have a new link opened by :meth:`ListenerRegistration.open` only.
         """
@@ -393,7 +426,8 @@ class EstopListener:
             if self._queue is None:
                 self._start()
             link = next((each.link for each in self._registrations if each.key == key), None)
-            registration = ListenerRegistration(self, robot_id, key, make() if link is None else link, identity)
+            made = make() if link is None else link
+            registration = ListenerRegistration(self, robot_id, key, made, identity, network=network, was_here=was_here)
             self._registrations = (*self._registrations, registration)
         if opened:
             registration.open()
@@ -402,9 +436,12 @@ class EstopListener:
     def open(self, registration: ListenerRegistration) -> None:
         """Open the link of a registration, unless it is open."""
         with self._registering:
-            if registration in self._registrations and registration.key not in self._open:
-                registration.link.open((ESTOP, CHECK_IN, CHECK_IN_ANSWER), self.receive, lambda up: None)
-                self._open.add(registration.key)
+            if registration in self._registrations and registration.key in self._open:
+                self._open[registration.key].started()
+            elif registration in self._registrations:
+                missed = self._open[registration.key] = self._missed_stops(registration)
+                receive = functools.partial(self.receive, network=_text(registration.network), missed=missed)
+                registration.link.open(EVENTS, receive, lambda up: missed.link_up() if up else None)
 
     def unregister(self, registration: ListenerRegistration) -> None:
         """Serve a device no longer; the thread ends with the last one."""
@@ -413,14 +450,16 @@ class EstopListener:
                 return
             self._registrations = tuple(each for each in self._registrations if each is not registration)
             last_of_link = all(each.key != registration.key for each in self._registrations)
-            if last_of_link:
-                self._open.discard(registration.key)
+            missed = self._open.pop(registration.key, None) if last_of_link else None
             events, thread = (self._queue, self._thread) if not self._registrations else (None, None)
             if events is not None:
                 self._queue = self._thread = None
         if last_of_link:
             registration.link.close()
+        if missed is not None:
+            missed.close()
         if events is not None:
+            self._end_watch()
             self._end_short_turns()
             events.close()
         if thread is not None and thread is not threading.current_thread():
@@ -431,7 +470,19 @@ class EstopListener:
         """True when a stop needs a signature; else its source is what it says it is."""
         return self._rules.signed
 
-    def accept_params(self, source: str, params: Mapping[str, Any], path: str, raw: bytes | int | None = None) -> None:
+    def awake(self) -> None:
+        """Ask which stops were missed, after a time in which the process did not run."""
+        for missed in tuple(self._open.values()):
+            missed.ask("the process did not run for a while")
+
+    def accept_params(
+        self,
+        source: str,
+        params: Mapping[str, Any],
+        path: str,
+        raw: bytes | int | None = None,
+        network: NetworkKey | None = None,
+    ) -> None:
         """Act on a parsed emergency stop of another path; return at once.
 
         A source whose signatures keep failing is not checked again here for up to a second: its stops arrive at the
@@ -442,12 +493,13 @@ class EstopListener:
             params: its parameters, as far as it has any.
             path: how it arrived.
             raw: the message, or its number of bytes where it was too long to be read.
+            network: where it arrived.
         """
         if self._plane.under_way(params.get("estop_id")):
             return
         if self._rules.signed and not self._budget.allows(source, time.monotonic()):
             return
-        order = self._rules.order(source, params, path, raw)
+        order = self._rules.order(source, params, path, raw, network=_text(network))
         if isinstance(order, StopRefused):
             self._budget.record(source, time.monotonic())
             self._refusals.record(order, ESTOP)
@@ -458,8 +510,13 @@ class EstopListener:
         """Act on a stop that a device of this process raises; return at once."""
         self._plane.begin(order, self._answer)
 
-    def receive(self, event: str, source: str, payload: bytes | int) -> None:
+    def receive(
+        self, event: str, source: str, payload: bytes | int, network: str = "", missed: MissedStops | None = None
+    ) -> None:
         """Take an event from a link's thread; returns at once."""
+        if missed is not None and event in (QUESTION, ANSWER):
+            missed.receive(event, source, payload)
+            return
         events = self._queue
         if events is None:
             return
@@ -474,9 +531,29 @@ class EstopListener:
             return
         why = self._rules.source_refusal(source)
         if why is None:
-            events.put(event, source, payload, urgent=event == ESTOP)
+            events.put(event, source, payload, urgent=event == ESTOP, network=network)
         elif self._refusals.due(source):
             events.put(event, source, payload, urgent=False)
+
+    def _missed_stops(self, registration: ListenerRegistration) -> MissedStops:
+        key, link = registration.key, registration.link
+
+        def members() -> list[Member]:
+            here = [each for each in self._registrations if each.key == key and each.network is not None]
+            return [Member(each.robot_id, self._wire_id(each.robot_id), each.identity, each.was_here) for each in here]
+
+        def publish(event: str, source: str, fields: Mapping[str, Any]) -> bool:
+            return link.publish(source, event, notification(event, fields))
+
+        port = RobotsPort(
+            self._plane,
+            self._rules,
+            registration.network,
+            members=members,
+            publish=publish,
+            on_report=self._answer,
+        )
+        return MissedStops(port)
 
     def _start(self) -> None:
         self._rules = self._make_rules()
@@ -484,6 +561,7 @@ class EstopListener:
         self._check_ins = CheckInRules(self._rules)
         audit_head(), own_log_id()  # read from the disk now, so that no stop waits for it
         self._end_short_turns = shorten_turns()
+        self._end_watch = AWAKE.watch(self.awake)
         self._queue = FairQueue()
         self._thread = threading.Thread(target=self._run, args=(self._queue,), name="estop-listener", daemon=True)
         self._thread.start()
@@ -502,7 +580,9 @@ class EstopListener:
                 params = params_of(received.payload)
                 if self._plane.under_way(params.get("estop_id")):
                     continue
-                order = self._rules.order(received.source, params, LISTENER, received.payload, received.at)
+                order = self._rules.order(
+                    received.source, params, LISTENER, received.payload, received.at, network=received.network
+                )
                 if isinstance(order, StopRefused):
                     self._refusals.record(order, received.event)
                     if not events.vouched_for(received.source):
@@ -535,6 +615,12 @@ class EstopListener:
         entry = self._plane.robots.get(robot_id)
         return entry.wire_id if entry else robot_id
 
+    def _cell(self, report: RobotReport) -> dict[str, str]:
+        """Return the field ``cell``, which robots that read scopes have."""
+        entry = self._plane.robots.get(report.robot_id)
+        cells = frozenset[str]() if entry is None else entry.cells
+        return {"cell": report.scope.cell if report.scope.cell in cells else min(cells, default="")}
+
     def _answer(self, report: RobotReport) -> None:
         key, now = (report.robot_id, report.epoch), time.monotonic()
         if not report.names_its_epoch and not self._latch_answers.allows(report.robot_id, report.epoch, now):
@@ -565,12 +651,16 @@ class EstopListener:
         halted_now = report.received_at is not None and not report.repeated
         payload = None if halted_now else self._repeated.get(same)
         if payload is None:
-            fields = {**report.fields(), "device_id": device_id, "audit": audit_head()}
+            fields = {**report.fields(), "device_id": device_id, "audit": audit_head(), **self._cell(report)}
             payload = notification(VERDICT, signed(identity, Purpose.STOP_VERDICT, device_id, fields))
             if not halted_now:
                 self._repeated[same] = payload
                 _bound(self._repeated)
         return payload
+
+
+def _text(network: NetworkKey | None) -> str:
+    return "" if network is None else network.text
 
 
 def _bound(remembered: dict[Any, Any]) -> None:

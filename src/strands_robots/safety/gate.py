@@ -5,21 +5,30 @@ before it moves and looks at :attr:`Permit.valid` under the same lock as each wr
 :meth:`MotionGate.revoke` first and then waits for the write that may be in flight, so that after its verdict no
 action reaches the device. Revoking counts up by one; a renewal compares before it counts. Their lock is held for
 nothing else.
+
+A hold (:meth:`MotionGate.hold`) is none of this: it voids nothing. For a fraction of a second writers wait, or leave a
+beat out, while the process learns what it has missed; then they go on. A halt meanwhile voids their permits as ever.
 """
 
 from __future__ import annotations
 
 import functools
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from typing import ParamSpec, Protocol
+from typing import ParamSpec, Protocol, TypeVar
 
 from strands_robots.envelope import Envelope, error
 from strands_robots.errors import StrandsRobotsError
+from strands_robots.safety.awake import AWAKE, AwakeClock
 from strands_robots.utils import MissingExtraError, ValidationError
 
 P = ParamSpec("P")
+T = TypeVar("T")
+
+WAIT_S = 0.005
+"""Seconds between two looks of a writer that waits; a halt ends its wait within these."""
 
 
 class Latch(Protocol):
@@ -39,6 +48,10 @@ class MotionRefused(StrandsRobotsError, RuntimeError):  # noqa: N818 - a refusal
 
 class PermitVoidError(StrandsRobotsError, RuntimeError):
     """The permit was void at the write, so nothing was written."""
+
+
+class MotionsHeldError(StrandsRobotsError, RuntimeError):
+    """Motions were held at the write, so nothing was written; it may be tried again."""
 
 
 REFUSALS = (MotionRefused, PermitVoidError, ValidationError, MissingExtraError)
@@ -122,6 +135,39 @@ class Permit:
         if not self.valid:
             raise MotionRefused(error(_LATE.format(self.verb)))
 
+    @property
+    def held(self) -> bool:
+        """True while motions hold: nothing may be written now, and the permit lives on."""
+        return self._gate.held
+
+    @property
+    def holds(self) -> int:
+        """Rises with every hold of the robot."""
+        return self._gate.holds
+
+    def wait(self) -> None:
+        """Wait until no hold is on, or this permit is void.
+
+        A writer calls it without any lock that a halt needs.
+        """
+        while self._gate.held and self.valid:
+            time.sleep(WAIT_S)
+
+    def write(self, lock: AbstractContextManager[object], write: Callable[[], T]) -> T:
+        """Run ``write`` under ``lock`` once no hold is on, and return its result.
+
+        The lock is never kept while a hold is waited for. ``write`` looks whether the permit is still valid; where
+        it raises :class:`MotionsHeldError` it runs again after the hold.
+        """
+        while True:
+            self.wait()
+            try:
+                with lock:
+                    if not self.held or not self.valid:
+                        return write()
+            except MotionsHeldError:
+                continue
+
     def inside(self) -> AbstractContextManager[None]:
         """Make motions begun inside, on this thread, part of this one."""
         return self._gate.asked_at(self._asked)
@@ -160,7 +206,9 @@ class Waiting:
 class MotionGate:
     """Gate of one robot; thread-safe."""
 
-    def __init__(self, latch: Latch | None = None) -> None:
+    def __init__(self, latch: Latch | None = None, awake: AwakeClock = AWAKE) -> None:
+        self._awake = awake
+        self._held_until, self._holds = float("-inf"), 0
         self._latches: tuple[Latch, ...] = () if latch is None else (latch,)
         self._attaching = threading.Lock()
         self._counting = threading.Lock()
@@ -173,6 +221,27 @@ class MotionGate:
     def generation(self) -> int:
         """Rises with every halt; permits of an older one are void."""
         return self._generation
+
+    @property
+    def held(self) -> bool:
+        """True while motions hold: by :meth:`hold`, or after the process did not run."""
+        now = self._awake.look()
+        return self._awake.held_at(now) or now < self._held_until
+
+    @property
+    def holds(self) -> int:
+        """Rises with every hold."""
+        return self._holds + self._awake.pauses
+
+    def hold(self, seconds: float) -> None:
+        """Let no motion write for so long; return at once.
+
+        Nothing is voided, and a halt is not delayed. A hold under way is only ever made longer.
+        """
+        until = self._awake.look() + seconds
+        if until > self._held_until:
+            self._held_until = until
+            self._holds += 1
 
     @property
     def latches(self) -> tuple[Latch, ...]:

@@ -8,24 +8,28 @@ another user owns, may read or may write proves nothing, so it is refused by nam
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import hashlib
 import json
 import os
 import secrets
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety import ed25519
 from strands_robots.safety.approval import state_dir
+from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.state_files import OPEN, StateFileError, make_private, read_private, require_private
 from strands_robots.safety.stop_log import stop_logger
-from strands_robots.utils import identifier
+from strands_robots.utils import field_values, identifier
 
 logger = stop_logger(__name__)
+
+T = TypeVar("T")
 
 ROBOTS = "robots"
 """Folder of the keys of robots; a console's keys have a folder of their own."""
@@ -35,6 +39,14 @@ DEFAULT_TENANT = "default"
 VERSION = 1
 FILE_MAX_BYTES = 2**20
 SEED_BYTES = 32
+
+RETIRED, OFF = "retired", "off"
+EXEMPT_STATES = (RETIRED, OFF)
+
+NETWORKS_MAX = 8
+
+LOCK_S = 2.0
+"""Seconds that a change of the enrolled robots waits for another process."""
 
 
 class KeyFileError(StateFileError):
@@ -137,6 +149,14 @@ def local_name(tenant: str, device_id: str) -> str:
     return device_id if tenant == DEFAULT_TENANT else f"{tenant}.{device_id}"
 
 
+def of_tenant(robots: Mapping[str, T], tenant: str) -> dict[str, T]:
+    """Return the robots of one tenant of many, by the name that they have there."""
+    prefix = local_name(tenant, "")
+    own = {name.removeprefix(prefix): each for name, each in robots.items() if name.startswith(prefix)}
+    # A device id has no dot: what has one belongs to another tenant.
+    return {name: each for name, each in own.items() if "." not in name}
+
+
 def robot_identity(name: str) -> SigningIdentity | None:
     """Return the identity of a robot of this machine, made at its first start.
 
@@ -162,6 +182,44 @@ def robots_here(directory: Path | None = None) -> dict[str, SigningIdentity | st
     return found
 
 
+@dataclass(frozen=True, slots=True)
+class Exemption:
+    """Operator's decision that an enrolled robot need not answer a stop.
+
+    Attributes:
+        state: ``retired`` or ``off``.
+        by: the operator.
+        reason: or "".
+        at: wall-clock seconds.
+    """
+
+    state: str
+    by: str
+    reason: str
+    at: float
+
+
+@dataclass(frozen=True, slots=True)
+class EnrolledRobot:
+    """Record of an enrolled robot.
+
+    Attributes:
+        key: its public key.
+        networks: where it was enrolled, the latest last; empty in a record of an earlier release, which counts on
+            every network until the robot has answered signed.
+        exemption: None while it must answer.
+    """
+
+    key: bytes
+    networks: tuple[NetworkKey, ...] = ()
+    exemption: Exemption | None = None
+
+    def at(self, network: NetworkKey) -> EnrolledRobot:
+        """Return the record with this network besides those it has."""
+        others = (each for each in self.networks if not each.meets(network))
+        return replace(self, networks=(*others, network)[-NETWORKS_MAX:])
+
+
 class EnrolledKeys:
     """File ``enrolled.json``: public keys of robots, learnt once and compared since.
 
@@ -180,50 +238,173 @@ class EnrolledKeys:
             KeyFileError: the file belongs to another user or is open to others, or holds no keys.
             OSError: it cannot be read.
         """
+        return {name: robot.key for name, robot in self.robots().items()}
+
+    def robots(self) -> dict[str, EnrolledRobot]:
+        """Return the records by robot.
+
+        Raises:
+            KeyFileError, OSError: as :meth:`load`.
+        """
         try:
             content = _read_private(self.path, self._root)
         except FileNotFoundError:
             return {}
         try:
             data = json.loads(content)
-            keys = {str(name): ed25519.decode(each["key"], SEED_BYTES) for name, each in data["robots"].items()}
+            robots = {str(name): _robot(each) for name, each in data["robots"].items()}
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as exc:
             raise KeyFileError(f"{self.path} holds no enrolled keys: {exc!r}") from exc
-        known = {name: key for name, key in keys.items() if key is not None}
-        if data.get("v") != VERSION or len(known) != len(keys):
+        known = {name: robot for name, robot in robots.items() if robot is not None}
+        if data.get("v") != VERSION or len(known) != len(robots):
             raise KeyFileError(f"{self.path} holds no enrolled keys of version {VERSION}.")
         return known
 
-    def enroll(self, found: Mapping[str, bytes], *, replace: bool = False) -> None:
-        """Keep these public keys beside those already there.
+    def enroll(
+        self, found: Mapping[str, bytes], *, replace: bool = False, network: NetworkKey | None = None
+    ) -> dict[str, Exemption]:
+        """Keep these public keys beside those already there; return exemptions undone.
+
+        Args:
+            found: keys of robots that were heard with them.
+            replace: a robot's changed key is taken, and it is expected on this network alone of its kind.
+            network: where they were heard.
 
         Raises:
             KeyChangedError: a robot has another key here, and ``replace`` is false; nothing was kept.
             KeyFileError, OSError: as :meth:`load`, or the file cannot be written.
         """
-        known = self.load()
-        for name, public in found.items():
-            identifier("name", name)
-            if not replace and known.get(name, public) != public:
-                raise KeyChangedError(
-                    f"{name} shows the key {fingerprint(public)} and is enrolled with {fingerprint(known[name])}: "
-                    f"it was set up anew, or this is another machine. If you know why, enroll it with --replace."
-                )
-        self._save({**known, **found})
+        undone: dict[str, Exemption] = {}
+        with self._changing() as known:
+            for name, public in found.items():
+                identifier("name", name)
+                robot = known.get(name)
+                if robot is not None and not replace and robot.key != public:
+                    raise KeyChangedError(
+                        f"{name} shows the key {fingerprint(public)} and is enrolled with {fingerprint(robot.key)}: "
+                        f"it was set up anew, or this is another machine. If you know why, enroll it with --replace."
+                    )
+                if robot is not None and robot.exemption is not None:
+                    undone[name] = robot.exemption
+                networks = robot.networks if robot is not None else ()
+                if replace and network is not None:
+                    networks = tuple(each for each in networks if each.kind != network.kind)
+                record = EnrolledRobot(public, networks)
+                known[name] = record if network is None else record.at(network)
+        return undone
 
     def forget(self, name: str) -> bool:
-        """Remove a robot; False when it was not enrolled."""
-        known = self.load()
-        if known.pop(name, None) is None:
-            return False
-        self._save(known)
-        return True
+        """Remove a robot; False when it was not enrolled.
 
-    def _save(self, keys: Mapping[str, bytes]) -> None:
-        robots = {name: {"key": ed25519.encode(public)} for name, public in sorted(keys.items())}
-        content = json.dumps({"v": VERSION, "saved": time.time(), "robots": robots}, indent=1).encode()
-        self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        Raises:
+            KeyFileError, OSError: as :meth:`enroll`.
+        """
+        with self._changing() as known:
+            return known.pop(name, None) is not None
+
+    def exempt(self, name: str, exemption: Exemption) -> bool:
+        """Record that a robot need not answer; False when it is not enrolled.
+
+        Raises:
+            KeyFileError, OSError: as :meth:`enroll`.
+        """
+        with self._changing() as known:
+            if name in known:
+                known[name] = replace(known[name], exemption=exemption)
+            return name in known
+
+    def heard(self, name: str, key: bytes, network: NetworkKey) -> Exemption | None:
+        """Record that a robot answered, signed with ``key``; return the exemption undone.
+
+        Another key than the enrolled one changes nothing. A record of an earlier release takes the network; one that
+        has a network keeps it, because an answer may be relayed from there.
+
+        Raises:
+            KeyFileError, OSError: as :meth:`enroll`.
+        """
+        if not self._learns(self.robots().get(name), key):
+            return None
+        with self._changing() as known:
+            robot = known.get(name)
+            if robot is None or not self._learns(robot, key):
+                return None
+            where = robot if robot.networks else robot.at(network)
+            known[name] = replace(where, exemption=None)
+            return robot.exemption
+
+    @staticmethod
+    def _learns(robot: EnrolledRobot | None, key: bytes) -> bool:
+        if robot is None or robot.key != key:
+            return False
+        return not robot.networks or robot.exemption is not None
+
+    @contextlib.contextmanager
+    def _changing(self) -> Iterator[dict[str, EnrolledRobot]]:
+        """Yield the records for one process at a time; write them if changed."""
+        make_private(self._root)
+        descriptor = os.open(self._root, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        try:
+            _lock(descriptor, self.path)
+            known = self.robots()
+            before = dict(known)
+            yield known
+            if known != before:
+                self._save(known)
+        finally:
+            os.close(descriptor)
+
+    def _save(self, robots: Mapping[str, EnrolledRobot]) -> None:
+        records = {name: _record(robot) for name, robot in sorted(robots.items())}
+        content = json.dumps({"v": VERSION, "saved": time.time(), "robots": records}, indent=1).encode()
+        if len(content) >= FILE_MAX_BYTES:
+            raise KeyFileError(f"{self.path} would be too long: forget robots first.")
         _draft(self.path, content).replace(self.path)
+
+
+def _robot(record: Mapping[str, Any]) -> EnrolledRobot | None:
+    """Read a record; one of an earlier release has a key alone.
+
+    Raises:
+        ValueError, KeyError, TypeError, AttributeError: it is none.
+    """
+    key = ed25519.decode(record["key"], SEED_BYTES)
+    if key is None:
+        return None
+    networks = tuple(NetworkKey.parse(each) for each in record.get("networks", ()))
+    exempt = record.get("exempt")
+    if exempt is None:
+        return EnrolledRobot(key, networks)
+    if exempt["state"] not in EXEMPT_STATES:
+        raise ValueError(f"no state of an exempt robot: {exempt['state']!r}")
+    stated = Exemption(exempt["state"], str(exempt["by"]), str(exempt["reason"]), float(exempt["at"]))
+    return EnrolledRobot(key, networks, stated)
+
+
+def _record(robot: EnrolledRobot) -> dict[str, Any]:
+    record: dict[str, Any] = {"key": ed25519.encode(robot.key)}
+    if robot.networks:
+        record["networks"] = [each.text for each in robot.networks]
+    if robot.exemption is not None:
+        record["exempt"] = field_values(robot.exemption)
+    return record
+
+
+def _lock(descriptor: int, path: Path) -> None:
+    """Wait for other processes that change the file.
+
+    Raises:
+        KeyFileError: one of them has it for longer than :data:`LOCK_S`.
+    """
+    until = time.monotonic() + LOCK_S
+    while True:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            if time.monotonic() >= until:
+                raise KeyFileError(f"{path} is being changed by another process.") from None
+            time.sleep(0.01)
+        else:
+            return
 
 
 def _read_private(path: Path, root: Path) -> bytes:

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from strands_robots.envelope import Envelope, error
+from strands_robots.safety.scope import EVERY_ROBOT, SCOPE, Scope
 from strands_robots.utils import shown
 
 MAX_EPOCHS = 64
@@ -22,29 +23,38 @@ MAX_EPOCHS = 64
 SEEN_MAX = 256
 """Ids of emergency stops remembered besides those that lock; a forgotten one would halt again, on the safe side."""
 
+RESUMED_MAX = 4096
+"""Epochs that a robot was resumed from, and never locks by again. Only a resume adds one; the oldest go first."""
+
 OVERFLOW = "overflow"
 """Name of the epoch that stands for every stop beyond the first 64; no 32-hex id equals it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Lockout:
-    """One epoch that locks a robot: ``at`` in wall-clock s, declared ``source``."""
+    """One epoch that locks a robot: ``at`` in wall-clock s, declared ``source``.
+
+    ``scope`` is that of the message that locked it; a stop may have been widened since.
+    """
 
     epoch: str
     source: str = ""
     reason: str = ""
     at: float = 0.0
+    scope: Scope = EVERY_ROBOT
 
     @classmethod
     def of(cls, row: Mapping[str, Any]) -> Lockout:
         """Read a lockout that a robot reported, whatever its fields hold."""
         since = row.get("since")
         at = float(since) if isinstance(since, int | float) else 0.0
-        return cls(str(row.get("epoch", "")), str(row.get("source", "")), str(row.get("reason", "")), at)
+        epoch, source, reason = (str(row.get(name, "")) for name in ("epoch", "source", "reason"))
+        return cls(epoch, source, reason, at, Scope.read(row.get(SCOPE)))
 
     def fields(self) -> dict[str, Any]:
         """Return the lockout as a robot reports it."""
-        return {"epoch": self.epoch, "source": self.source, "reason": self.reason, "since": self.at}
+        stated = {"epoch": self.epoch, "source": self.source, "reason": self.reason, "since": self.at}
+        return {**stated, **self.scope.field()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,10 +114,12 @@ class LockoutLatch:
         state: LockoutState | None = None,
         seen: Iterable[str] = (),
         clock: Callable[[], float] = time.time,
+        resumed: Iterable[str] = (),
     ) -> None:
         self.robot_id = robot_id
         self._state = state or LockoutState()
         self._seen: dict[str, None] = dict.fromkeys([*seen, *self._state.resumable])
+        self._resumed = dict.fromkeys(resumed)
         self._clock = clock
         self._writing = threading.Lock()
 
@@ -122,17 +134,26 @@ class LockoutLatch:
         with self._writing:
             return tuple(self._seen)
 
+    @property
+    def resumed(self) -> Mapping[str, None]:
+        """Epochs that it was resumed from, oldest first; replaced when one is new."""
+        return self._resumed
+
+    def knows(self, epoch: str) -> bool:
+        """Return True for a stop that no longer engages."""
+        return epoch in self._seen or epoch in self._resumed
+
     def refusal(self, verb: str) -> Envelope | None:
         """Return the refusal of ``verb`` while locked, or None while free."""
         return refusal(self._state, self.robot_id, verb)
 
-    def engage(self, epoch: str, source: str, reason: str) -> bool:
+    def engage(self, epoch: str, source: str, reason: str, scope: Scope = EVERY_ROBOT) -> bool:
         """Lock under ``epoch``; False, without a change, when it was seen before."""
         with self._writing:
-            if epoch in self._seen:
+            if self.knows(epoch):
                 return False
             self._seen[epoch] = None
-            self._state = self._state.engage(Lockout(epoch, source, reason, self._clock()))
+            self._state = self._state.engage(Lockout(epoch, source, reason, self._clock(), scope))
             self._forget()
             return True
 
@@ -140,12 +161,23 @@ class LockoutLatch:
         """Clear ``epoch`` after its resume was verified."""
         with self._writing:
             self._state = self._state.resume(epoch)
+            self._add_resumed([epoch])
 
     def clear(self) -> tuple[Lockout, ...]:
         """Clear every lockout, for an operator at this machine; return them."""
         with self._writing:
             cleared, self._state = self._state.all, LockoutState()
+            # Those that the overflow stood for are among the seen.
+            self._add_resumed(self._seen)
             return cleared
+
+    def forgo(self, epochs: Iterable[str]) -> None:
+        """Never lock by these again, as after their resume."""
+        with self._writing:
+            self._add_resumed(epochs)
+
+    def _add_resumed(self, epochs: Iterable[str]) -> None:
+        self._resumed = with_resumed(self._resumed, epochs)
 
     def _forget(self) -> None:
         if len(self._seen) <= SEEN_MAX + MAX_EPOCHS:
@@ -155,6 +187,12 @@ class LockoutLatch:
         del self._seen[oldest]
 
 
+def with_resumed(resumed: dict[str, None], epochs: Iterable[str]) -> dict[str, None]:
+    """Return the latest resumed epochs with these; the same where all are known."""
+    new = [each for each in epochs if each not in resumed and each != OVERFLOW]
+    return dict.fromkeys([*resumed, *new][-RESUMED_MAX:]) if new else resumed
+
+
 def refusal(state: LockoutState, robot_id: str, verb: str) -> Envelope | None:
     """Return a locked robot's refusal of ``verb``; None while free."""
     if not state.locked:
@@ -162,10 +200,12 @@ def refusal(state: LockoutState, robot_id: str, verb: str) -> Envelope | None:
     first = state.all[0]
     why = f" ({shown(first.reason)})" if first.reason else ""
     more = len(state.all) - 1
+    scope = "" if first.scope.everything else f" for {first.scope}"
     others = f" and {more} more stop{'s' if more > 1 else ''}" if more else ""
     return error(
-        f"{verb} is refused: {robot_id} is locked by the emergency stop of {first.source or 'an unnamed source'}{why}, "
-        f"epoch {first.epoch}{others}, since {utc(first.at)}. To resume: {how_to_resume(state, robot_id)}.",
+        f"{verb} is refused: {robot_id} is locked by the emergency stop of {first.source or 'an unnamed source'}"
+        f"{scope}{why}, epoch {first.epoch}{others}, since {utc(first.at)}. "
+        f"To resume: {how_to_resume(state, robot_id)}.",
         locked=True,
         robot=robot_id,
         refused=verb,
@@ -173,6 +213,7 @@ def refusal(state: LockoutState, robot_id: str, verb: str) -> Envelope | None:
         stopped_by=first.source,
         stop_reason=first.reason,
         since=first.at,
+        **first.scope.field(),
     )
 
 

@@ -19,7 +19,9 @@ from strands_robots.safety import ed25519
 from strands_robots.safety.authorization import caller_name, entries, estop_refusal, matcher
 from strands_robots.safety.clocks import ObservedClocks, seconds_of
 from strands_robots.safety.lockout import OVERFLOW
+from strands_robots.safety.originals import ORIGINAL_MAX_BYTES
 from strands_robots.safety.resume import is_epoch
+from strands_robots.safety.scope import EVERY_ROBOT, SCOPE, SCOPE_SIGNATURE, Scope
 from strands_robots.safety.statements import Purpose, covered
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.utils import ValidationError
@@ -51,6 +53,9 @@ ANSWERED_MAX_BYTES = 8 * 2**10
 LISTENER = "lane"
 """``path`` of a stop that the e-stop listener received."""
 
+MISSED = "missed"
+"""``path`` of a stop that another process answered with, see :mod:`.missed_stops`."""
+
 REQUIRE_SIGNED = "STRANDS_ESTOP_REQUIRE_SIGNED"
 ALLOW = "DEVICE_CONNECT_ESTOP_ALLOW"
 
@@ -80,6 +85,10 @@ class StopOrder:
         received_at: this process's wall-clock seconds at receipt.
         clock_ahead_s: seconds by which this process's clock is ahead of the issuer's, or None where not measured.
         answered: devices whose answer the issuer has; one that stopped does not repeat it.
+        original: the message, where it can be passed on: it states its id, and is not too long.
+        network: where it was received.
+        age_s: seconds since the first process received it; not 0 for a missed stop only.
+        scope: the robots that it is for.
     """
 
     epoch: str
@@ -93,6 +102,10 @@ class StopOrder:
     received_at: float = field(default_factory=time.time, compare=False)
     clock_ahead_s: float | None = None
     answered: frozenset[str] = field(default=frozenset(), compare=False)
+    scope: Scope = EVERY_ROBOT
+    original: bytes | None = field(default=None, compare=False, repr=False)
+    network: str = field(default="", compare=False)
+    age_s: float = 0.0
 
     def delay_s(self, now: float) -> float | None:
         """Return the seconds from the press to wall-clock ``now``; None if not stated.
@@ -138,6 +151,7 @@ class RobotReport:
     late: bool = False
     sent_at: float | None = None
     received_at: float | None = None
+    scope: Scope = EVERY_ROBOT
 
     @property
     def stopped(self) -> bool | None:
@@ -164,6 +178,7 @@ class RobotReport:
             "repeated": self.repeated,
             "late": self.late,
             **({"settling": True} if self.verdict.settling else {}),
+            **self.scope.field(),
         }
 
 
@@ -207,6 +222,25 @@ def signed_bytes(purpose: Purpose, source: str, params: Mapping[str, Any]) -> by
         "reason": reason if isinstance(reason, str) and len(reason) <= REASON_MAX else None,
     }
     return covered(purpose, source, stated)
+
+
+def scope_bytes(source: str, params: Mapping[str, Any]) -> bytes:
+    """Return the signed bytes of a stop's scope.
+
+    They hold its own purpose, the source, id, both times and nonce of the stop, and the scope: those of one message.
+    """
+    pressed = params.get("pressed_at")
+    stated = {name: params.get(name) for name in ("estop_id", "nonce", "t", SCOPE)}
+    return covered(
+        Purpose.STOP_SCOPE, source, {**stated, "pressed_at": None if seconds_of(pressed) is None else pressed}
+    )
+
+
+def signed_stop(key: Any, purpose: Purpose, source: str, params: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a stop or check-in with its signature and that of its scope."""
+    sig = ed25519.encode(key.sign(signed_bytes(purpose, source, params)))
+    scoped = {SCOPE_SIGNATURE: ed25519.encode(key.sign(scope_bytes(source, params)))} if SCOPE in params else {}
+    return {**params, "sig": sig, **scoped}
 
 
 def estop_keys() -> tuple[bytes, ...]:
@@ -266,6 +300,11 @@ class StopRules:
         """True when a stop needs a signature; else its source is what it says it is."""
         return bool(self._keys)
 
+    @property
+    def keys(self) -> tuple[bytes, ...]:
+        """The public keys of which one must have signed."""
+        return self._keys
+
     def source_refusal(self, source: str) -> str | None:
         """Return the reason why this source may not stop, or None; costs next to nothing."""
         if self._may_stop(source):
@@ -282,6 +321,9 @@ class StopRules:
         path: str,
         raw: bytes | int | None = None,
         received: float | None = None,
+        *,
+        network: str = "",
+        age_s: float = 0.0,
     ) -> StopOrder | StopRefused:
         """Decide on the parameters of an ``emergencyStop``.
 
@@ -297,7 +339,9 @@ class StopRules:
             return StopOrder(epoch, source, why, path, remote=True, received=received)
         reason = params.get("reason")
         received_at, issued = self._clock() - (time.monotonic() - received), seconds_of(params.get("t"))
-        ahead = self._clocks.note(source, received_at - issued, received) if issued is not None else None
+        compared = issued is not None and path != MISSED
+        ahead = self._clocks.note(source, received_at - issued, received) if compared and issued is not None else None
+        stated = raw is not None and len(raw) <= ORIGINAL_MAX_BYTES and stated_epoch(source, params) != ""
         return StopOrder(
             self._epoch(source, params, received),
             source,
@@ -310,6 +354,10 @@ class StopRules:
             received_at=received_at,
             clock_ahead_s=ahead,
             answered=_names(params.get(ANSWERED)),
+            scope=self.scope(source, params) if SCOPE in params else EVERY_ROBOT,
+            original=raw if stated else None,
+            network=network,
+            age_s=age_s,
         )
 
     def _epoch(self, source: str, params: Mapping[str, Any], received: float) -> str:
@@ -341,6 +389,23 @@ class StopRules:
         if not ed25519.signed_by_one_of(self._keys, signature, signed_bytes(purpose, source, params)):
             return f"none of DEVICE_CONNECT_ESTOP_PUBLIC_KEYS signed it as {purpose.value}"
         return None
+
+    def scope(self, source: str, params: Mapping[str, Any], *, demanded: bool = True) -> Scope:
+        """Return the scope of a stop that counts; every robot where it is unfit.
+
+        Args:
+            demanded: False where unsigned stops count in spite of keys; a signature that is there has to be valid all
+                the same.
+        """
+        scope = Scope.read(params.get(SCOPE))
+        if scope.everything or not self._keys or not (demanded or SCOPE_SIGNATURE in params):
+            return scope
+        signature = ed25519.decode(params.get(SCOPE_SIGNATURE), 64)
+        shaped = is_epoch(params.get("estop_id")) and is_epoch(params.get("nonce"))
+        if signature is None or not shaped or seconds_of(params.get("t")) is None:
+            return EVERY_ROBOT
+        proven = ed25519.signed_by_one_of(self._keys, signature, scope_bytes(source, params))
+        return scope if proven else EVERY_ROBOT
 
     def compare_clock(self, source: str, params: Mapping[str, Any], received: float) -> None:
         """Take the time of a check-in that counts as a comparison of clocks."""

@@ -1,4 +1,4 @@
-"""Lockouts on disk: one file for each robot of this machine.
+"""Lockouts and resumed epochs on disk: two files for each robot of this machine.
 
 A robot is kept under a key that outlives the process (see :func:`hardware_key`); a robot without one, an unnamed
 simulation, is not kept. Files of different robots never wait for one another, whichever processes write them. A file
@@ -14,33 +14,68 @@ import os
 import re
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from strands_robots.safety.approval import state_dir
-from strands_robots.safety.lockout import MAX_EPOCHS, OVERFLOW, Lockout, LockoutState
+from strands_robots.safety.lockout import MAX_EPOCHS, OVERFLOW, Lockout, LockoutState, with_resumed
+from strands_robots.safety.originals import STORED_MAX_BYTES, Original, newest_within, since_boot
 from strands_robots.safety.resume import is_epoch
-from strands_robots.safety.state_files import StateFileError, adopt, make_private, read_private, require_private
+from strands_robots.safety.scope import SCOPE, Scope
+from strands_robots.safety.state_files import (
+    StateFileError,
+    adopt,
+    boot,
+    make_private,
+    read_private,
+    require_private,
+    uptime,
+)
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.utils import field_values
 
 logger = stop_logger(__name__)
 
 VERSION = 2
+RESUMED_VERSION = 1
+LONG_AGO = -1e12
 VERSION_OF_ALL = 1
 """Version of ``lockouts.json``, in which earlier releases kept all robots of a machine."""
 
 
 @dataclass(frozen=True, slots=True)
+class ResumedEpochs:
+    """Epochs that a robot was resumed from, and the beginning of that record.
+
+    Attributes:
+        since: seconds since boot at which the robot was first registered on this state directory.
+    """
+
+    epochs: Mapping[str, None] = field(default_factory=dict)
+    since: float = field(default_factory=uptime)
+
+    def more(self, epochs: Iterable[str]) -> ResumedEpochs:
+        """Return the record with these."""
+        return replace(self, epochs=with_resumed(dict(self.epochs), epochs))
+
+
+@dataclass(frozen=True, slots=True)
 class StoredLockout:
-    """State with which a robot starts: lockouts, seen stops, network name."""
+    """State with which a robot starts: lockouts, seen stops, network name.
+
+    Attributes:
+        originals: the stops that lock it, as they arrived.
+        resumed: None where there is no record yet; a lockout that is saved without leaves it as it is.
+    """
 
     state: LockoutState = field(default_factory=LockoutState)
     seen: tuple[str, ...] = ()
     name: str = ""
+    originals: tuple[Original, ...] = ()
+    resumed: ResumedEpochs | None = None
 
 
 def hardware_key(kind: str, stable_id: str) -> str:
@@ -78,10 +113,19 @@ class LockoutStore:
         """The one file of an earlier release."""
         return self.directory.with_suffix(".json")
 
+    @property
+    def resumed_directory(self) -> Path:
+        """The directory of the records of resumed epochs."""
+        return self.root / "resumed"
+
     def file(self, key: str) -> Path:
         """The file of one robot, named for a person and distinct by a hash."""
         readable = re.sub(r"[^A-Za-z0-9._-]+", "_", key)[:64]
         return self.directory / f"{readable}-{hashlib.sha256(key.encode()).hexdigest()[:16]}.json"
+
+    def resumed_file(self, key: str) -> Path:
+        """The record of one robot's resumed epochs."""
+        return self.resumed_directory / self.file(key).name
 
     def load(self, key: str) -> StoredLockout:
         """Return the record of ``key``: empty if absent, locked if unreadable.
@@ -109,7 +153,8 @@ class LockoutStore:
         for path in self._files():
             record = self._read(path, VERSION)
             if record is not None:
-                found[str(record.get("key", path.name))] = _kept(record)
+                key = str(record.get("key", path.name))
+                found[key] = replace(_kept(record), resumed=self._resumed(key))
         return found
 
     def save(self, kept: Mapping[str, StoredLockout]) -> None:
@@ -118,20 +163,38 @@ class LockoutStore:
         Raises:
             OSError: not written.
         """
-        directory = self.directory
+        records = {self.file(key): {"v": VERSION, "key": key, **_record(each)} for key, each in kept.items()}
+        self._put_aside()
+        self.save_resumed({key: each.resumed for key, each in kept.items() if each.resumed is not None})
+        self._save(self.directory, records)
+
+    def save_resumed(self, resumed: Mapping[str, ResumedEpochs]) -> None:
+        """Write the records of resumed epochs, and return when all are on the disk.
+
+        Raises:
+            OSError: not written.
+        """
+        if not resumed:
+            return
+        up, wall = uptime(), time.time()
+        records = {}
+        for key, each in resumed.items():
+            since = {"boot": boot(), "up": each.since, "wall": wall - (up - each.since)}
+            records[self.resumed_file(key)] = {"v": RESUMED_VERSION, "key": key, **since, "epochs": list(each.epochs)}
+        self._save(self.resumed_directory, records)
+
+    def _save(self, directory: Path, records: Mapping[Path, dict[str, Any]]) -> None:
         if not directory.exists():
             adopt(self.root)
             make_private(directory)
             _sync(directory.parent)
-        self._put_aside()
         with ExitStack() as files:
             # All are written before the first is waited for: the disk takes them together.
             drafts = []
-            for key, each in kept.items():
-                path = self.file(key)
+            for path, record in records.items():
                 draft = _draft_of(path)
                 descriptor = files.enter_context(_opened(draft))
-                _write(descriptor, {"v": VERSION, "key": key, **_record(each)})
+                _write(descriptor, record)
                 drafts.append((descriptor, draft, path))
             for descriptor, draft, path in drafts:
                 os.fsync(descriptor)
@@ -142,18 +205,40 @@ class LockoutStore:
         adopt(self.root)
         # A folder that others may write says nothing by what is not in it.
         require_private(self.directory, self.root)
-        path = self.file(key)
+        require_private(self.resumed_directory, self.root)
+        path, resumed = self.file(key), self._resumed(key)
         record = self._read(path, VERSION)
         if record is not None:
             if record.get("key") != key:
                 raise ValueError(f"{path.name} is of another robot")
-            return _kept(record)
+            return replace(_kept(record), resumed=resumed)
         earlier = self._of_all().get(key)
         if earlier is not None:
-            return _kept(earlier)
+            return replace(_kept(earlier), resumed=resumed)
         if self._aside.exists():
             raise ValueError(f"what was kept of this robot may stand in {self._aside.name}")
-        return StoredLockout()
+        return StoredLockout(resumed=resumed)
+
+    def _resumed(self, key: str) -> ResumedEpochs | None:
+        """Return the record of ``key``, None where there is none.
+
+        Raises:
+            OSError, ValueError: it cannot be read, or is none.
+        """
+        path = self.resumed_file(key)
+        record = self._read(path, RESUMED_VERSION)
+        if record is None:
+            return None
+        try:
+            epochs = dict.fromkeys(each for each in record["epochs"] if is_epoch(each))
+            # A clock that was set back since tells no age: every stop may be of its time.
+            set_back = record["boot"] != boot() and time.time() < float(record["wall"])
+            since = LONG_AGO if set_back else since_boot(record)
+        except (KeyError, TypeError) as exc:
+            raise ValueError(f"{path.name} is no record of resumed epochs: {exc!r}") from exc
+        if record.get("key") != key:
+            raise ValueError(f"{path.name} is of another robot")
+        return ResumedEpochs(epochs, since)
 
     @property
     def _aside(self) -> Path:
@@ -200,10 +285,20 @@ class LockoutStore:
 def _record(kept: StoredLockout) -> dict[str, Any]:
     return {
         "name": kept.name,
-        "holds": [field_values(each) for each in kept.state.lockouts],
-        "overflow": field_values(kept.state.overflow) if kept.state.overflow else None,
+        "holds": [_fields(each) for each in kept.state.lockouts],
+        "overflow": _fields(kept.state.overflow) if kept.state.overflow else None,
         "seen": list(kept.seen),
+        **({"originals": [each.record() for each in _fitting(kept.originals)]} if kept.originals else {}),
     }
+
+
+def _fitting(originals: tuple[Original, ...]) -> list[Original]:
+    return newest_within(originals, STORED_MAX_BYTES, lambda each: len(each.payload))
+
+
+def _fields(lockout: Lockout) -> dict[str, Any]:
+    # Releases that know no scope read the other fields, and write none.
+    return {**field_values(lockout), SCOPE: lockout.scope.value()}
 
 
 def _kept(record: Mapping[str, Any]) -> StoredLockout:
@@ -219,11 +314,12 @@ def _stored(record: Mapping[str, Any]) -> StoredLockout:
     if len(lockouts) > MAX_EPOCHS or len({each.epoch for each in lockouts}) != len(lockouts):
         raise ValueError("more epochs than a robot tells apart, or one of them twice")
     seen = tuple(each for each in record["seen"] if is_epoch(each))
-    return StoredLockout(LockoutState(lockouts, overflow), seen, str(record.get("name", "")))
+    originals = tuple(Original.of(each) for each in record.get("originals", ()))
+    return StoredLockout(LockoutState(lockouts, overflow), seen, str(record.get("name", "")), originals)
 
 
 def _lockout(data: Mapping[str, Any]) -> Lockout:
-    lockout = Lockout(data["epoch"], data["source"], data["reason"], float(data["at"]))
+    lockout = Lockout(data["epoch"], data["source"], data["reason"], float(data["at"]), Scope.read(data.get(SCOPE)))
     if not all(isinstance(part, str) for part in (lockout.epoch, lockout.source, lockout.reason)):
         raise ValueError("a lockout whose fields are not text")
     return lockout

@@ -6,7 +6,7 @@ import contextlib
 import functools
 import threading
 import time
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from concurrent.futures import Future
 from dataclasses import replace
 from typing import Any, Protocol
@@ -20,9 +20,12 @@ from strands_robots.safety.clearance import CLEARED, LEFT, NOT_KEPT, NOT_LOCKED,
 from strands_robots.safety.gate import MotionGate
 from strands_robots.safety.lockout import Lockout, LockoutLatch, LockoutState
 from strands_robots.safety.orders import LISTENER, RobotReport, StopOrder, new_epoch
-from strands_robots.safety.persistence import LockoutStore, StoredLockout
+from strands_robots.safety.originals import Original, Originals
+from strands_robots.safety.persistence import LockoutStore, ResumedEpochs, StoredLockout
 from strands_robots.safety.reporting import UNPACED, OnReport, Reporter, StopRun
 from strands_robots.safety.resume import REJECTED, Admitted, ResumeVerifier
+from strands_robots.safety.sightings import sightings
+from strands_robots.safety.state_files import uptime
 from strands_robots.safety.stop_count import StopCount
 from strands_robots.safety.stop_executor import StopExecutor, stop_executor
 from strands_robots.safety.stop_log import stop_logger
@@ -61,16 +64,29 @@ class Registered:
     """One robot in the plane. ``close`` takes it out; the lockout on disk stays."""
 
     def __init__(
-        self, plane: SafetyPlane, robot_id: str, robot: Stoppable, *, key: str | None, kept: StoredLockout, wire_id: str
+        self,
+        plane: SafetyPlane,
+        robot_id: str,
+        robot: Stoppable,
+        *,
+        key: str | None,
+        kept: StoredLockout,
+        wire_id: str,
+        cells: frozenset[str] = frozenset(),
     ) -> None:
         self.robot_id = robot_id
         self.wire_id = wire_id
+        self.cells = cells
         self.robot = robot
         self.key = key
         self.users = 1
         self.gates: tuple[MotionGate, ...] = (robot.gate,)
-        self.latch = LockoutLatch(wire_id, kept.state, kept.seen)
+        resumed = kept.resumed or ResumedEpochs()
+        self.latch = LockoutLatch(wire_id, kept.state, kept.seen, resumed=resumed.epochs)
         self.on_disk = kept.state
+        self.registered_before = kept.resumed is not None
+        self.resumed_on_disk = self.latch.resumed if self.registered_before else None
+        self._recorded_since, self._here_since = resumed.since, uptime()
         self.keep_again = False
         self.verdict = StopVerdict(unknown={robot_id: "its halt has not answered yet"})
         self._halted_at = float("-inf")
@@ -92,6 +108,24 @@ class Registered:
         return self.latch.state.locked
 
     @property
+    def resumed(self) -> ResumedEpochs:
+        """The record of the epochs that it was resumed from."""
+        return ResumedEpochs(self.latch.resumed, self._recorded_since)
+
+    @property
+    def unsaved(self) -> bool:
+        """True while the disk has an older state or none."""
+        resumed = self.latch.resumed
+        return bool(self.key) and (
+            self.latch.state is not self.on_disk or (bool(resumed) and resumed is not self.resumed_on_disk)
+        )
+
+    @property
+    def unrecorded(self) -> bool:
+        """True until the disk says since when there is this robot."""
+        return bool(self.key) and self.resumed_on_disk is None
+
+    @property
     def epochs(self) -> tuple[str, ...]:
         """The epochs held, oldest first."""
         return self.latch.state.epochs
@@ -105,14 +139,23 @@ class Registered:
         self._plane.unregister(self)
 
     def adopt(self, key: str, kept: StoredLockout) -> None:
-        """Store this robot under ``key``, and take over the lockouts stored there."""
+        """Store this robot under ``key``, and take over what is stored there."""
         self.key = key
+        if kept.resumed is not None:
+            self.registered_before, self._recorded_since = True, kept.resumed.since
+            self.latch.forgo(kept.resumed.epochs)
         self.inherit(kept.state)
 
     def inherit(self, state: LockoutState) -> None:
         """Take over the lockouts of another entry, except what was resumed here since."""
         for each in state.all:
-            self.latch.engage(each.epoch, each.source, each.reason)
+            self.latch.engage(each.epoch, each.source, each.reason, each.scope)
+
+    def returned(self) -> bool:
+        """Count as a robot that was here before its process; False for one that has no record of that."""
+        if self.registered_before:
+            self._here_since = min(self._here_since, self._recorded_since)
+        return self.registered_before
 
     def come_up_locked(self) -> None:
         """Halt motion that began before the lock was known; return at once."""
@@ -133,13 +176,15 @@ class Registered:
     def engage(self, order: StopOrder) -> bool:
         """Lock under the order; True when it has to be carried out.
 
-        A stop is known, or one of a flood that locks nothing more: the latest halt answers for it.
+        A stop is known, or one of a flood that locks nothing more: the latest halt answers for it. A missed one may be
+        from before its time.
         """
+        if order.age_s > uptime() - self._here_since:
+            return False
+        lock = functools.partial(self.latch.engage, order.epoch, order.source, order.reason, order.scope)
         if not self.crowded:
-            return self.latch.engage(order.epoch, order.source, order.reason)
-        if order.received - self._halted_at < HALT_AGAIN_S or not self.latch.engage(
-            order.epoch, order.source, order.reason
-        ):
+            return lock()
+        if order.received - self._halted_at < HALT_AGAIN_S or not lock():
             return False
         self._halted_at = order.received
         return True
@@ -162,7 +207,7 @@ class Registered:
             return RobotReport(
                 self.robot_id, order.epoch, self.verdict, state.epochs, 0.0, persisted=persisted, repeated=True
             )
-        if order.epoch in self.latch.seen:
+        if self.latch.knows(order.epoch):
             why = {self.robot_id: "this stop was resumed before it came again"}
             return RobotReport(self.robot_id, order.epoch, StopVerdict(unknown=why), state.epochs, 0.0)
         return None
@@ -214,6 +259,7 @@ class SafetyPlane:
         self._begun: tuple[str, dict[str, Registered]] | None = None
         self._issued: dict[str, int] = {}
         self._counted = StopCount(TOLD_EVERY_S)
+        self._originals = Originals()
         self._clearance = ClearanceInbox(self.robot_ids, self._clear_one)
         self.checkin = CheckIn(settings.number("STRANDS_CHECKIN_TIMEOUT_S"))
 
@@ -231,7 +277,9 @@ class SafetyPlane:
         """The ids of the robots held now."""
         return frozenset(self._robots)
 
-    def register(self, robot_id: str, robot: Stoppable, *, key: str | None = None, wire_id: str = "") -> Registered:
+    def register(
+        self, robot_id: str, robot: Stoppable, *, key: str | None = None, wire_id: str = "", cell: str = ""
+    ) -> Registered:
         """Put ``robot`` under the plane, which locks and halts it.
 
         Args:
@@ -239,6 +287,7 @@ class SafetyPlane:
             wire_id: the name it answers by on its network and that a resume targets; ``robot_id`` by default.
             key: under which its lockout is stored over a restart, from :func:`~.persistence.hardware_key` or
                 :func:`~.persistence.simulation_key`. None: it is not kept.
+            cell: the cell that it is in, if any; under a second name of its own a further one.
 
         Registering the same robot again under its name, as its second network does, returns the same entry, which
         lives until it was closed as often.
@@ -253,6 +302,7 @@ class SafetyPlane:
                 if body_of(known.robot) is not body_of(robot):
                     raise ValidationError(f"robot_id {shown(robot_id)} is taken by another robot of this process.")
                 known.users += 1
+                known.cells |= {cell} if cell else frozenset()
                 if robot.gate not in known.gates:
                     robot.gate.attach(known.latch)
                     known.gates = (*known.gates, robot.gate)
@@ -263,7 +313,17 @@ class SafetyPlane:
                         self._kept([known])
                 return known
             kept = self.store.load(key) if key else StoredLockout()
-            entry = Registered(self, robot_id, robot, key=key, kept=kept, wire_id=wire_id or robot_id)
+            for each in kept.originals:
+                self._originals.add(each)
+            entry = Registered(
+                self,
+                robot_id,
+                robot,
+                key=key,
+                kept=kept,
+                wire_id=wire_id or robot_id,
+                cells=frozenset({cell} if cell else ()),
+            )
             robot.gate.attach(entry.latch)
             self._inherit(entry)
             if not self._robots:
@@ -363,6 +423,7 @@ class SafetyPlane:
                     since=order.received,
                     answered=functools.partial(reporter.answer, run, entry.robot_id),
                 )
+            self._note_original(order)
             reporter.begin(run)
             followed = True
             if self._reporter is not reporter:
@@ -385,13 +446,18 @@ class SafetyPlane:
         return begun is not None and begun[0] == epoch and begun[1] is self._robots
 
     def _engage(self, order: StopOrder, by_name: dict[str, Registered]) -> tuple[list[Registered], list[Registered]]:
-        """Lock the robots; return those to halt, and those that know the stop."""
+        """Lock the robots in its scope; return those to halt, and those that know it.
+
+        A robot outside of the scope is neither: it remembers nothing of this stop, so that a wider one locks it.
+        """
         fresh: list[Registered] = []
         known: list[Registered] = []
-        listener = order.path == LISTENER
-        if listener:
+        listener, scope = order.path == LISTENER, order.scope
+        if listener and scope.everything:
             self._begun = (order.epoch, by_name)
         for entry in by_name.values():
+            if not scope.everything and not scope.covers(entry.wire_id, entry.cells):
+                continue
             if not listener and self.under_way(order.epoch):
                 # It came over another path meanwhile: the e-stop listener's thread halts and reports the others.
                 return fresh, []
@@ -467,6 +533,16 @@ class SafetyPlane:
         """Return the locked robots and their lockouts."""
         return {name: entry.latch.state.all for name, entry in self._robots.items() if entry.locked}
 
+    def originals(self, network: str) -> list[Original]:
+        """Return the stops of ``network`` that lock robots here, as they arrived."""
+        return self._originals.of(self._held(), network)
+
+    def hold(self, seconds: float) -> None:
+        """Hold the motions of every robot for so long; return at once."""
+        for entry in self._robots.values():
+            for gate in entry.gates:
+                gate.hold(seconds)
+
     def _clear_one(self, who: str, robot_id: str) -> str:
         entry = self._robots.get(robot_id)
         if entry is None or robot_id not in self.clear_local(who, [robot_id]):
@@ -482,12 +558,22 @@ class SafetyPlane:
             on_report(report)
         if any(entry.crowded and order.epoch not in entry.epochs for entry in robots):
             self._counted.add(order.source)
+        late = order.original is not None and not self._originals.has(order.epoch, order.network)
+        if late and any(entry.latch.state.can_resume(order.epoch) for entry in robots):
+            # It came without its bytes first, from the framework or from a device here.
+            self._note_original(order)
+
+    def _note_original(self, order: StopOrder) -> None:
+        if order.original is not None:
+            received = uptime() - (time.monotonic() - order.received) - order.age_s
+            self._originals.add(Original(order.epoch, order.source, order.original, order.network, received))
 
     def _keep(self, entries: Iterable[Registered]) -> None:
         # One at a time, so that no older state is written over a newer one.
         with self._keeping:
-            due = [each for each in entries if each.key and each.latch.state is not each.on_disk]
-            kept = {each: StoredLockout(each.latch.state, each.latch.seen, each.wire_id) for each in due}
+            due = [each for each in entries if each.unsaved]
+            self._originals.keep(self._held(due))
+            kept = {each: self._record_of(each) for each in due}
             try:
                 if kept:
                     self.store.save({entry.key: record for entry, record in kept.items() if entry.key})
@@ -497,10 +583,27 @@ class SafetyPlane:
                 raise
             for entry, record in kept.items():
                 entry.on_disk = record.state
+                if record.resumed is not None:
+                    entry.resumed_on_disk = record.resumed.epochs
                 if entry.keep_again:
                     entry.keep_again = False
                     logger.warning("The lockout file of %s is written now.", entry.robot_id)
                     queue_safety_event("lockout_kept", entry.robot_id, {"epochs": list(record.state.epochs)})
+
+    def _record_of(self, entry: Registered) -> StoredLockout:
+        latch, resumed = entry.latch, entry.resumed
+        state = latch.state
+        return StoredLockout(
+            state,
+            latch.seen,
+            entry.wire_id,
+            tuple(self._originals.of(frozenset(state.resumable))),
+            resumed if resumed.epochs and resumed.epochs is not entry.resumed_on_disk else None,
+        )
+
+    def _held(self, leaving: Iterable[Registered] = ()) -> frozenset[str]:
+        """Return the epochs by which a robot of this process is locked."""
+        return frozenset(each for entry in (*self._robots.values(), *leaving) for each in entry.latch.state.resumable)
 
     def _kept(self, entries: Iterable[Registered]) -> bool:
         try:
@@ -513,10 +616,18 @@ class SafetyPlane:
     def _keep_again(self) -> None:
         """Write what could not be written; the log and the audit say when it is."""
         due = [each for each in self._robots.values() if each.keep_again]
-        if due and time.monotonic() >= self._keep_at:
+        new = {each: each.resumed for each in self._robots.values() if each.unrecorded}
+        if (due or new) and time.monotonic() >= self._keep_at:
             self._keep_at = time.monotonic() + KEEP_AGAIN_S
             with contextlib.suppress(OSError):  # reported when it failed first
                 self._keep(due)
+                self._record_new(new)
+
+    def _record_new(self, resumed: Mapping[Registered, ResumedEpochs]) -> None:
+        with self._keeping:
+            self.store.save_resumed({entry.key: each for entry, each in resumed.items() if entry.key})
+            for entry, each in resumed.items():
+                entry.resumed_on_disk = each.epochs
 
     def _record(self, run: StopRun) -> None:
         order = run.order
@@ -534,6 +645,7 @@ class SafetyPlane:
                 "pressed_at": order.pressed,
                 "delay_s": order.delay_s(order.received_at),
                 "timing": order.timing(order.received_at),
+                **order.scope.field(),
             }
             queue_safety_event(event, report.robot_id, facts)
         if len(self._issued) < 1024 or order.source in self._issued:
@@ -557,6 +669,7 @@ class SafetyPlane:
 
     def _chore(self) -> None:
         self._keep_again()
+        sightings().refresh()
         if any(entry.locked for entry in self._robots.values()):
             self._clearance.look()
 

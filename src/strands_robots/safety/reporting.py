@@ -243,6 +243,7 @@ class Reporter:
             late=late,
             sent_at=run.order.issued,
             received_at=run.order.received_at,
+            scope=run.order.scope,
         )
         run.reports[robot_id] = report
         if report.stopped is not True:

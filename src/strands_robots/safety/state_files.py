@@ -67,12 +67,22 @@ def read_private(
     """
     descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK)
     with os.fdopen(descriptor, "rb") as file:
-        status = os.fstat(descriptor)
-        if not stat.S_ISREG(status.st_mode):
-            raise error(f"{path} is no plain file.")
-        _require_own(path, status, forbidden, "read or write it; run chmod 600 on it", error)
-        require_private(path.parent, root, error=error)
+        _require_private_status(path, root, os.fstat(descriptor), forbidden, error)
         return file.read(longest)
+
+
+def require_private_file(path: Path, root: Path, *, error: type[StateFileError] = StateFileError) -> int:
+    """Check a secret file without opening it; return its inode.
+
+    Closing a file would end the locks that SQLite holds on it for another thread of the process.
+
+    Raises:
+        StateFileError: as :func:`read_private`.
+        OSError: it is not there.
+    """
+    status = path.lstat()
+    _require_private_status(path, root, status, OPEN, error)
+    return status.st_ino
 
 
 def require_private(folder: Path, root: Path, *, error: type[StateFileError] = StateFileError) -> None:
@@ -100,6 +110,15 @@ def uptime() -> float:
     """Return seconds since boot, those asleep included where the system counts them."""
     clock = getattr(time, "CLOCK_BOOTTIME", None)
     return time.monotonic() if clock is None else time.clock_gettime(clock)
+
+
+def _require_private_status(
+    path: Path, root: Path, status: os.stat_result, forbidden: int, error: type[StateFileError]
+) -> None:
+    if not stat.S_ISREG(status.st_mode):
+        raise error(f"{path} is no plain file.")
+    _require_own(path, status, forbidden, "read or write it; run chmod 600 on it", error)
+    require_private(path.parent, root, error=error)
 
 
 def _require_own(path: Path, status: os.stat_result, forbidden: int, problem: str, error: type[StateFileError]) -> None:

@@ -22,11 +22,14 @@ class Purpose(StrEnum):
     """The use of a signature, part of the signed bytes."""
 
     EMERGENCY_STOP = "emergency-stop"
+    STOP_SCOPE = "emergency-stop-scope"
     CHECK_IN = "check-in"
     CHECK_IN_ANSWER = "check-in-answer"
     STOP_VERDICT = "stop-verdict"
     LOCKOUT_STATE = "lockout-state"
     RESUME_ANSWER = "resume-answer"
+    STOP_ROSTER = "stop-roster"
+    MISSED_STOPS = "missed-stops"
 
 
 def covered(purpose: Purpose, source: str, fields: Mapping[str, Any]) -> bytes:

@@ -86,7 +86,9 @@ PICTURE = Parameter(
     default="",
 )
 PLACE = Parameter("place", str, "Name of a saved place; home is always there", identifier)
-RESULT = "task_id, task_status, asked, reached, error_mm, holding, duration, why, picture"
+RESULT = (
+    "task_id, task_status, asked, reached, error_mm, holding, object_at, object_error_mm, moved, duration, why, picture"
+)
 
 _DIRECTION = Parameter(
     "direction",

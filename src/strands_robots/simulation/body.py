@@ -17,6 +17,7 @@ from strands_robots.policies.base import Observation, checked_speeds
 from strands_robots.safety.gate import Permit
 from strands_robots.simulation.catalog import ModelSource
 from strands_robots.simulation.engine import mujoco
+from strands_robots.simulation.fitting import load_named
 from strands_robots.simulation.pacing import WorldClock
 from strands_robots.simulation.physics import Physics, Snapshot
 from strands_robots.simulation.stage import Actuator, RobotParts
@@ -104,7 +105,7 @@ class RobotBody:
     def arm(self) -> Arm:
         """The robot's arm, planned in the frame of its base. Raises without one."""
         plan = next(each for each in self._present()[0].stage.plan.robots if each.name == self.name)
-        made, speeds = arm_of(plan.source, plan.position[2]), self.speeds
+        made, speeds = arm_of(plan.source, plan.position[2], plan.tip), self.speeds
         return replace(made, speeds=speeds) if speeds else made
 
     @property
@@ -217,13 +218,13 @@ class RobotBody:
 
 
 @cache
-def arm_of(source: ModelSource, height: float) -> Arm:
-    """Return the arm of a model whose base stands ``height`` metres above the floor.
+def arm_of(source: ModelSource, height: float, tip: str = "") -> Arm:
+    """Return the arm of a model whose base is ``height`` metres above the floor.
 
     Raises:
         ValidationError: the model has no arm.
     """
-    return Arm.of(Chain(source.load(), source.label, -height))
+    return Arm.of(Chain(load_named(source), source.label, -height, tip))
 
 
 def _mobile(snapshot: Snapshot, robot: RobotParts) -> bool:

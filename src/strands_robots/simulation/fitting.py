@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from strands_robots.simulation.catalog import ModelSource
 from strands_robots.simulation.engine import mujoco
 from strands_robots.simulation.plan import Plan, RobotPlan
 from strands_robots.utils import ValidationError, shown
@@ -46,10 +47,7 @@ def load_fitted(robot: RobotPlan, plan: Plan) -> Any:
     Raises:
         ValidationError: the file cannot be loaded, or needs what a shared world cannot give.
     """
-    child = robot.source.load()
-    name_parts(child)
-    if not child.actuators:
-        _add_servos(child)
+    child = load_named(robot.source)
     try:
         _require_medium(child.option, plan)
         _confine_flags(child)
@@ -60,6 +58,19 @@ def load_fitted(robot: RobotPlan, plan: Plan) -> Any:
             _make_common(geom)
         else:
             _make_scenery(geom)
+    return child
+
+
+def load_named(source: ModelSource) -> Any:
+    """Return the ``MjSpec`` of a model, every part with a name, and with actuators.
+
+    Raises:
+        ValidationError: the file cannot be loaded.
+    """
+    child = source.load()
+    name_parts(child)
+    if not child.actuators:
+        _add_servos(child)
     return child
 
 

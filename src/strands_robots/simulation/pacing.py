@@ -11,7 +11,7 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.simulation.physics import Physics
@@ -38,10 +38,15 @@ _CHUNK = 16
 
 
 class WorldClock:
-    """Pacing of one world; ``slipped_s`` is simulated time dropped when late."""
+    """Pacing of one world; ``slipped_s`` is simulated time dropped when late.
 
-    def __init__(self, physics: Physics, *, on_command: bool = True) -> None:
+    Args:
+        held: returns True while no robot of the world may move; its time then stands still, and is not made up for.
+    """
+
+    def __init__(self, physics: Physics, *, on_command: bool = True, held: Callable[[], bool] = lambda: False) -> None:
         self._physics = physics
+        self._held = held
         self._on_command = on_command
         self._lock = threading.Lock()
         self._leases = 0
@@ -101,7 +106,7 @@ class WorldClock:
     def tick(self, now: float) -> None:
         """Catch up with ``now``; called by the pacing thread alone."""
         timestep = self._physics.stage.plan.timestep
-        if self._due is None:
+        if self._due is None or self._held():
             self._due = now
             return
         behind = now - self._due

@@ -20,14 +20,16 @@ from __future__ import annotations
 
 import copy
 import threading
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 from strands_robots.safety.gate import Permit, PermitVoidError
 from strands_robots.simulation.engine import mujoco
 from strands_robots.simulation.stage import Floats, RobotParts, Stage
 from strands_robots.utils import ValidationError, shown, yaw_of
+
+T = TypeVar("T")
 
 CHUNK = 128
 """Steps between two snapshots when stepping by hand: about a millisecond for an arm, 1 % of it for the snapshot."""
@@ -124,7 +126,8 @@ class Physics:
             PermitVoidError: ``permit`` is void; nothing was written.
             ValidationError: no such robot or key; nothing was written.
         """
-        with self._command_lock:
+
+        def write() -> dict[str, float]:
             actuators = self._robot(robot_name).actuators
             sent: dict[str, float] = {}
             for key, value in action.items():
@@ -138,6 +141,8 @@ class Physics:
             for key, value in sent.items():
                 self._setpoints[actuators[key].index] = value
             return sent
+
+        return _written(self._command_lock, write, permit)
 
     def hold(self, robot_name: str | None = None, permit: Permit | None = None) -> None:
         """Freeze one robot, or all.
@@ -159,10 +164,13 @@ class Physics:
         Raises:
             PermitVoidError: ``permit`` is void; nothing was changed.
         """
-        with self._command_lock:
+
+        def write() -> None:
             if permit is not None and not permit.valid:
                 raise PermitVoidError(f"{robot_name} was halted")
             self._limp |= frozenset(self.stage.robots if robot_name is None else (self._robot(robot_name).name,))
+
+        _written(self._command_lock, write, permit)
 
     @property
     def limp(self) -> frozenset[str]:
@@ -175,6 +183,7 @@ class Physics:
         Raises:
             MotionRefused: ``permit`` is void; nothing was changed.
         """
+        permit.wait()
         with self._step_lock, self._command_lock:
             permit.check()
             self.snapshot = self._start(self.stage)
@@ -226,6 +235,14 @@ class Physics:
         data = self._data
         lengths = data.actuator_length.copy()
         return Snapshot(stage, data.time, self._steps, data.qpos.copy(), data.qvel.copy(), lengths)
+
+
+def _written(lock: threading.Lock, write: Callable[[], T], permit: Permit | None) -> T:
+    """Run a write under the command lock, once no hold is left for its permit."""
+    if permit is not None:
+        return permit.write(lock, write)
+    with lock:
+        return write()
 
 
 def _without_torque(stage: Stage, robots: Iterable[str]) -> Any:

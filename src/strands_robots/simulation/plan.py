@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from strands_robots.simulation.catalog import ModelSource, find
-from strands_robots.utils import ValidationError, choice, flag, identifier, number, shown
+from strands_robots.utils import ValidationError, choice, flag, identifier, number, shown, text
 
 Triple = tuple[float, float, float]
 
@@ -27,15 +27,18 @@ _RESERVED = ("floor", "world")
 
 @dataclass(frozen=True, slots=True)
 class RobotPlan:
-    """One robot: ``position`` in metres, ``yaw`` in radians."""
+    """One robot: ``position`` in m, ``yaw`` in rad, ``tip`` a site or a body."""
 
     name: str
     source: ModelSource
     position: Triple = (0.0, 0.0, 0.0)
     yaw: float = 0.0
+    tip: str = ""
 
     @classmethod
-    def checked(cls, name: object, model: str | Path | None, position: object, yaw: object) -> RobotPlan:
+    def checked(
+        cls, name: object, model: str | Path | None, position: object, yaw: object, tip: object = ""
+    ) -> RobotPlan:
         """Check a robot, and find its model, which may be fetched.
 
         :meth:`Simulation.add_robot` has the domains.
@@ -46,7 +49,8 @@ class RobotPlan:
         label = identifier("name", name)
         heading = number("yaw", yaw, low=-TURN_RAD, high=TURN_RAD)
         source = find(name if model is None else model)
-        return cls(label, source, (0.0, 0.0, 0.0) if position is None else _triple("position", position), heading)
+        place = (0.0, 0.0, 0.0) if position is None else _triple("position", position)
+        return cls(label, source, place, heading, text("tip", tip, longest=128, empty=True))
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from strands_robots.kinematics.chain import tip_site
+from strands_robots.kinematics.servos import is_servo, servo_line
+from strands_robots.kinematics.tip import mark_tip
 from strands_robots.simulation.engine import mujoco
 from strands_robots.simulation.fitting import is_floor, load_fitted, name_parts, set_options
 from strands_robots.simulation.plan import ObjectPlan, Plan, RobotPlan
@@ -97,6 +98,7 @@ def compile_stage(plan: Plan) -> Stage:
     """
     spec = mujoco.MjSpec()
     spec.modelname = "world"
+    tips: dict[str, str] = {}
     homes: dict[str, Floats] = {}
     controls: dict[str, float] = {}
     if hasattr(mujoco, "mjtConflict"):
@@ -106,6 +108,7 @@ def compile_stage(plan: Plan) -> Stage:
     children = [load_fitted(robot, plan) for robot in plan.robots]
     set_options(spec, children, plan)
     for robot, child in zip(plan.robots, children, strict=True):
+        tips[robot.name] = mark_tip(child, robot.tip)
         own_floor = own_floor and not any(map(is_floor, child.worldbody.geoms))
         own_lights = own_lights and not child.lights
         home, control = _attach(spec, robot, child)
@@ -119,7 +122,7 @@ def compile_stage(plan: Plan) -> Stage:
     except (ValueError, mujoco.FatalError) as exc:
         raise ValidationError(f"the world does not compile: {' '.join(str(exc).split())[:300]}") from exc
     model.opt.timestep = plan.timestep
-    robots = {robot.name: _map_robot(model, robot.name, robot.source.label) for robot in plan.robots}
+    robots = {r.name: _map_robot(model, r.name, r.source.label, tips[r.name]) for r in plan.robots}
     qpos, ctrl = _start(model, homes, controls)
     return Stage(plan, model, robots, qpos, ctrl)
 
@@ -215,14 +218,14 @@ def _start(model: Any, homes: dict[str, Floats], controls: dict[str, float]) -> 
         wanted = controls.get(name)
         if wanted is None:
             # A servo without a given target starts at its present position.
-            offset, slope = _servo_line(model, index)
-            wanted = offset + slope * float(data.actuator_length[index]) if _is_servo(model, index) else 0.0
+            offset, slope = servo_line(model, index)
+            wanted = offset + slope * float(data.actuator_length[index]) if is_servo(model, index) else 0.0
         low, high = model.actuator_ctrlrange[index] if model.actuator_ctrllimited[index] else (-np.inf, np.inf)
         ctrl[index] = min(max(wanted, low), high)
     return np.array(data.qpos), ctrl
 
 
-def _map_robot(model: Any, name: str, label: str) -> RobotParts:
+def _map_robot(model: Any, name: str, label: str, tip: str) -> RobotParts:
     """Find the parts whose names start with ``name`` and a slash."""
     prefix = f"{name}/"
     joints: dict[str, Joint] = {}
@@ -250,23 +253,9 @@ def _map_robot(model: Any, name: str, label: str) -> RobotParts:
         low, high = model.actuator_ctrlrange[index] if model.actuator_ctrllimited[index] else (-UNBOUNDED, UNBOUNDED)
         # MuJoCo computes an inherited range, which leaves 2.0 as 2.0000000000000004.
         bounds = round(float(low), 12), round(float(high), 12)
-        actuators[key] = Actuator(key, index, *bounds, _is_servo(model, index), *_servo_line(model, index))
+        actuators[key] = Actuator(key, index, *bounds, is_servo(model, index), *servo_line(model, index))
     cameras = tuple(n for n in (model.camera(i).name for i in range(model.ncam)) if n.startswith(prefix))
-    return RobotParts(name, label, joints, actuators, cameras, tip_site(model, prefix), _root(model, prefix), base)
-
-
-def _is_servo(model: Any, index: int) -> bool:
-    """Return True for a position servo: its bias pulls back with its length."""
-    return bool(model.actuator_biasprm[index][1] < 0.0)
-
-
-def _servo_line(model: Any, index: int) -> tuple[float, float]:
-    """Return offset and slope of the command by which a servo keeps its length.
-
-    Its force is gain * command + bias[0] + bias[1] * length, and zero where it stands.
-    """
-    gain, (constant, pull) = float(model.actuator_gainprm[index][0]), model.actuator_biasprm[index][:2]
-    return (-float(constant) / gain, -float(pull) / gain) if gain else (0.0, 1.0)
+    return RobotParts(name, label, joints, actuators, cameras, prefix + tip if tip else "", _root(model, prefix), base)
 
 
 def _root(model: Any, prefix: str) -> str:

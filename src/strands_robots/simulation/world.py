@@ -33,23 +33,13 @@ from strands_robots.safety.gate import MotionGate, Waiting, answered
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stop_targets import note_motion
 from strands_robots.safety.stopping import PendingVerdict, StopLevel, StopVerdict, halts_in_parts, read_verdict
-from strands_robots.simulation import projection
 from strands_robots.simulation.body import PICTURE, RobotBody
 from strands_robots.simulation.objects import targets_of
 from strands_robots.simulation.pacing import WorldClock
-from strands_robots.simulation.physics import CHUNK, Physics, Snapshot
+from strands_robots.simulation.physics import CHUNK, Physics
+from strands_robots.simulation.pictures import PicturesMixin
 from strands_robots.simulation.plan import ObjectPlan, Plan, RobotPlan
-from strands_robots.simulation.rendering import (
-    OVERVIEW,
-    CameraView,
-    Picture,
-    Renderer,
-    RenderingError,
-    camera_names,
-    camera_view,
-    draw_path,
-    picture_size,
-)
+from strands_robots.simulation.rendering import Renderer, camera_names
 from strands_robots.simulation.stage import compile_stage, in_floor, sunk_sentence
 from strands_robots.simulation.stop_torque import StopTorque
 from strands_robots.teleop_mixin import TeleopMixin
@@ -71,7 +61,7 @@ class _CleanedUp:
         return error(f"{verb} is refused: this simulation was cleaned up; make a new one.")
 
 
-class Simulation(ArmMixin, TeleopMixin):
+class Simulation(PicturesMixin, ArmMixin, TeleopMixin):
     """A world of simulated robots, each with its own rollout: a :class:`WorldRobot`.
 
     Physics keeps real time while a rollout or a teleoperation runs, and for a moment after a single command;
@@ -94,6 +84,8 @@ class Simulation(ArmMixin, TeleopMixin):
         ValidationError: an argument outside its domain.
     """
 
+    knows_objects = True
+
     def __init__(
         self,
         tool_name: str = "simulation",
@@ -113,7 +105,7 @@ class Simulation(ArmMixin, TeleopMixin):
         self.observers = RolloutObservers()
         self._torque = StopTorque(stop_level, rest_pose, self.gate, self.observers)
         self.physics = Physics(compile_stage(Plan.checked(timestep, gravity, density, viscosity)))
-        self._clock = WorldClock(self.physics, on_command=flag("realtime", realtime))
+        self._clock = WorldClock(self.physics, on_command=flag("realtime", realtime), held=lambda: self.gate.held)
         self._speed_limit = None if speed_limit is None else number("speed_limit", speed_limit, above=0, high=SPEED_MAX)
         self._bodies: dict[str, RobotBody] = {}
         self._rollouts: dict[str, Rollout] = {}
@@ -168,7 +160,13 @@ class Simulation(ArmMixin, TeleopMixin):
 
     @answered
     def add_robot(
-        self, name: str = "so100", model: str | Path | None = None, position: Any = None, yaw: float = 0.0
+        self,
+        name: str = "so100",
+        model: str | Path | None = None,
+        position: Any = None,
+        yaw: float = 0.0,
+        *,
+        tip: str = "",
     ) -> Envelope:
         """Put a robot into the world; the others keep their state.
 
@@ -178,10 +176,12 @@ class Simulation(ArmMixin, TeleopMixin):
                 name; by default ``name``.
             position: of its base, metres; by default beside the robots that are there.
             yaw: heading, radians from -2π to 2π.
+            tip: site or body of the model that motions place; by default as :mod:`~strands_robots.kinematics.tip`
+                finds it.
 
         ``in_floor`` of the answer has the depth of each body that starts in the floor, metres.
         """
-        robot = RobotPlan.checked(name, model, position, yaw)
+        robot = RobotPlan.checked(name, model, position, yaw, tip)
         with self.starting:
             self._require_idle("add_robot")
             self._rebuild(self.physics.stage.plan.with_robot(robot, beside=position is None))
@@ -503,70 +503,6 @@ class Simulation(ArmMixin, TeleopMixin):
         self._clock.close()
         self._renderer.close()
         return verdict.envelope()
-
-    def render(self, camera: str = OVERVIEW, width: int = 320, height: int = 240, *, quality: bool = False) -> Picture:
-        """Draw a picture by OpenGL: RGB, (height, width, 3), unsigned bytes.
-
-        Args:
-            camera: overview, front, side, top, table, or a robot's own (``wrist``, or ``arm/wrist`` where several
-                have one).
-            width: 16 to 1920 pixels.
-            height: 16 to 1440 pixels.
-            quality: with shadows and anti-aliasing, at many times the cost in software.
-
-        Raises:
-            ValidationError: an argument outside its domain.
-            RenderingError: OpenGL does not work on this machine; the message says which package is missing.
-        """
-        size, best = picture_size(width, height), flag("quality", quality)
-        self._require_open()
-        return self._renderer.render(self.physics.snapshot, camera, *size, quality=best)
-
-    def project(self, camera: str = OVERVIEW, width: int = 320, height: int = 240) -> Picture:
-        """Draw the same picture without OpenGL; arguments as for :meth:`render`."""
-        size = picture_size(width, height)
-        snapshot = self.physics.snapshot
-        data = snapshot.data()
-        return projection.draw(snapshot.stage, data, camera_view(snapshot.stage, data, camera), *size)
-
-    def picture(
-        self,
-        camera: str = OVERVIEW,
-        width: int = 640,
-        height: int = 480,
-        *,
-        path: Iterable[tuple[float, float, float]] = (),
-    ) -> tuple[Picture, Literal["opengl", "projection"]]:
-        """Draw the best possible picture and ``path`` (m); return it and its method."""
-        how: Literal["opengl", "projection"] = "opengl"
-        try:
-            picture = self.render(camera, width, height, quality=True)
-        except RenderingError:
-            how, picture = "projection", self.project(camera, width, height)
-        points = list(path)
-        if points:
-            picture = draw_path(picture, self.view(camera).pixels(points, width, height))
-        return picture, how
-
-    def camera_picture(self, camera: str, width: int, height: int) -> Picture:
-        """Draw a picture fast: by OpenGL, where that works, and without shadows.
-
-        Policies, recordings, the networks and agents have their pictures from here.
-        """
-        self._require_open()
-        return self._draw(self.physics.snapshot, camera, *picture_size(width, height))
-
-    def _draw(self, snapshot: Snapshot, camera: str, width: int = PICTURE[1], height: int = PICTURE[0]) -> Picture:
-        try:
-            return self._renderer.render(snapshot, camera, width, height, quality=False)
-        except RenderingError:
-            data = snapshot.data()
-            return projection.draw(snapshot.stage, data, camera_view(snapshot.stage, data, camera), width, height)
-
-    def view(self, camera: str = OVERVIEW) -> CameraView:
-        """Return the present view of ``camera``, which puts world points into a picture."""
-        snapshot = self.physics.snapshot
-        return camera_view(snapshot.stage, snapshot.data(), camera)
 
     def tip_position(self, robot_name: str | None = None) -> tuple[float, float, float]:
         """Return the place of one robot's tip, as :meth:`RobotBody.tip_position`."""

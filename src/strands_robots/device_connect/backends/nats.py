@@ -140,6 +140,10 @@ class NatsBackend(Backend):
         if connection is not None:
             await connection.leave(self)
 
+    def denied(self, subject: str) -> str:
+        """Return what the server said to refuse a message to ``subject``, or ""."""
+        return self._connection.denied.get(subject, "") if self._connection is not None else ""
+
     @property
     def is_connected(self) -> bool:
         """True while a server is there."""

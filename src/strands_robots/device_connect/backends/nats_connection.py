@@ -25,7 +25,7 @@ from nats.aio.subscription import Subscription
 
 from ...utils import redacted
 from ._compat import EncryptedClient, direct_parser
-from .config import LinkConfig
+from .config import DEFAULT_URL, LinkConfig
 from .dispatch import Throttled
 
 logger = logging.getLogger(__name__)
@@ -33,7 +33,6 @@ logger = logging.getLogger(__name__)
 RECONNECT_WAIT_S = 0.5
 """Seconds between attempts to reach a server that went away."""
 
-DEFAULT_URL = "nats://127.0.0.1:4222"
 
 Sign = Callable[[str | bytes], bytes]
 OnLink = Callable[[bool], Awaitable[None]]
@@ -57,6 +56,8 @@ class NatsConnection:
         self._declaring = asyncio.Lock()
         self._topics: dict[str, _Topic] = {}
         self._log = Throttled(logger)
+        self.denied: dict[str, str] = {}
+        """What the server said to refuse a message, by its subject; the last ones."""
 
     async def enter(self, user: object, on_link: OnLink) -> None:
         """Add a user; the first one connects, and the others wait for it.
@@ -134,6 +135,7 @@ class NatsConnection:
         async def on_error(error: Exception) -> None:
             problems.append(str(error))
             del problems[:-PROBLEMS_KEPT]
+            self._note_denied(str(error))
             self._log.warning("NATS: %s", error)
 
         options: dict[str, Any] = {
@@ -165,6 +167,14 @@ class NatsConnection:
             await self._abandon()
             raise
 
+    def _note_denied(self, problem: str) -> None:
+        """Keep a refusal to publish; the server names the subject in quotes."""
+        subject = problem.partition(DENIED)[2].strip().strip('"')
+        if subject:
+            self.denied[subject[:SUBJECT_MAX]] = problem[:SUBJECT_MAX]
+            while len(self.denied) > PROBLEMS_KEPT:
+                del self.denied[next(iter(self.denied))]
+
     async def _abandon(self) -> None:
         self._closing = True
         await self.client.close()
@@ -191,6 +201,11 @@ class _Topic:
         for sink in self.sinks:
             sink(message)
 
+
+DENIED = "Permissions Violation for Publish to"
+"""Words of a NATS server before the subject that a client may not publish to."""
+
+SUBJECT_MAX = 300
 
 PROBLEMS_KEPT = 8
 """Errors of a connection that are kept, to name the last one where it cannot be made."""

@@ -279,8 +279,10 @@ class MotionController:
             updates = None
             try:
                 updates = MoveUpdates(self._connection.host, self._connection.port)
+                motion.permit.wait()
                 if before is not None:
                     before()
+                    motion.permit.wait()
                 motion.check()
                 motion.permit.begin()  # an answer that is lost or unreadable may be that of a move
                 motion.uuid = _uuid(path, self._connection.rest.post(path))
@@ -308,11 +310,15 @@ class MotionController:
 
     def torque(self, change: Callable[[], None], name: str) -> None:
         """Run ``change``, a write of the motors' torque, after stopping every motion."""
+
+        def change_now() -> None:
+            motion.check()
+            change()
+
         with self._started(name, motors_may_be_off=True) as motion:
             try:
-                with self._write:  # so that a halt waits for it as for a frame
-                    motion.check()
-                    change()
+                # Under the lock, so that a halt waits for it as for a frame.
+                motion.permit.write(self._write, change_now)
             except Exception as exc:
                 self._end(motion, "error", str(exc))
                 raise
@@ -428,16 +434,18 @@ class MotionController:
 
     def _send(self, motion: ReachyMotion, target: Target) -> None:
         try:
-            with self._write:
-                motion.check()
-                self._connection.link().send_target(target)
-                motion.permit.begin()
+            motion.permit.write(self._write, lambda: self._send_now(motion, target))
         except (DaemonUnreachableError, MotionRefused) as exc:
             self._end(motion, "stopped" if isinstance(exc, MotionRefused) else "error", str(exc))
             raise
         self.frames_sent += 1
         self._sent = target.over(self.present())
         self._sent_on = self._connection.connects
+
+    def _send_now(self, motion: ReachyMotion, target: Target) -> None:
+        motion.check()
+        self._connection.link().send_target(target)
+        motion.permit.begin()
 
     def _play(self, motion: ReachyMotion, frames: Frames) -> None:
         self._pace()

@@ -159,6 +159,7 @@ class AckermannRosRobot(MobileBaseRobot):
                 if refusal is not None:
                     return refusal
             for service, kind, fields in self._services:
+                permit.wait()
                 if not permit.valid:
                     return error(f"The handshake was stopped before {service}.")
                 try:

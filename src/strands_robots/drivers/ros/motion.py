@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple
 from strands_robots.contract import RolloutEvent
 from strands_robots.drivers.ros.velocity_publisher import VelocityPublisher
 from strands_robots.envelope import Envelope, error, is_error, success, text_of
-from strands_robots.safety.gate import Permit, PermitVoidError
+from strands_robots.safety.gate import MotionsHeldError, Permit, PermitVoidError
 from strands_robots.utils import ValidationError
 
 COUNT_MAX = 10**12
@@ -178,15 +178,28 @@ class Drive(BaseMotion):
     def _send_all(self) -> None:
         period_s = 1 / self.order.rate_hz
         due = time.monotonic()
-        for _ in range(self.order.messages):
-            self._publisher.send(self.order.fields, self._permit)
-            self.sent += 1
+        while self.sent < self.order.messages:
+            try:
+                self._publisher.send(self.order.fields, self._permit)
+                self.sent += 1
+            except MotionsHeldError:
+                self._stand()
+                if self.order.latches:
+                    continue
             # A late message is not made up for: the ones after it would come faster than the rate.
             due = max(due + period_s, time.monotonic())
             if self.order.latches:
                 return
             if self._stopped.wait(min(due - time.monotonic(), threading.TIMEOUT_MAX)):
                 raise PermitVoidError("the drive was stopped")
+
+    def _stand(self) -> None:
+        """Let the base stand for this beat of a hold."""
+        if self.order.latches:
+            # It is not told to move yet, and its only message is still to come.
+            self._permit.wait()
+        else:
+            self._publisher.zero()
 
     def _send_zero(self) -> str:
         try:

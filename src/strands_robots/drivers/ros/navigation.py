@@ -94,6 +94,8 @@ class Navigation(BaseMotion):
                 logger.warning("The %s could not be cancelled: %s", self.instruction, exc)
 
     def run(self) -> Envelope:
+        # A goal that was sent is the robot's own: only one that is not sent yet waits for the end of a hold.
+        self._permit.wait()
         try:
             self.report = run_goal(
                 self._link,

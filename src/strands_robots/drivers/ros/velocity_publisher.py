@@ -16,7 +16,7 @@ from strands_robots.ros.link import (
     RosLink,
     UrgentLink,
 )
-from strands_robots.safety.gate import Permit, PermitVoidError
+from strands_robots.safety.gate import MotionsHeldError, Permit, PermitVoidError
 from strands_robots.safety.stop_log import stop_logger
 
 logger = stop_logger(__name__)
@@ -45,10 +45,17 @@ class VelocityPublisher:
         self._clogged = False
 
     def send(self, fields: Mapping[str, Any], permit: Permit) -> None:
-        """Send one command; :class:`PermitVoidError` when a stop came first."""
+        """Send one command.
+
+        Raises:
+            PermitVoidError: a stop came first.
+            MotionsHeldError: motions hold; nothing was sent.
+        """
         with self._lock:
             if not permit.valid:
                 raise PermitVoidError("the drive was stopped")
+            if permit.held:
+                raise MotionsHeldError("the drive holds")
             if self._urgent is not None:
                 try:
                     self._urgent.prepare_urgent(self.topic, self.kind)

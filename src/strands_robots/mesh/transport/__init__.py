@@ -163,6 +163,10 @@ class Transport(ABC):
         """True while tokens of other sessions can reach us."""
         return True
 
+    def links_back(self) -> int:
+        """Return how often a link came up after one had been lost."""
+        return 0
+
     def lost_link_at(self) -> float | None:
         """Return the time of the last loss of the hub, monotonic s, or None."""
         return None

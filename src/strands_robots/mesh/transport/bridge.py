@@ -234,6 +234,9 @@ class BridgeTransport(Transport):
     def anchored(self) -> bool:
         return self._local.anchored()
 
+    def links_back(self) -> int:
+        return self._local.links_back()
+
     def lost_link_at(self) -> float | None:
         # A local leg that comes up late is judged like one whose link can be lost.
         at = self._local.lost_link_at()

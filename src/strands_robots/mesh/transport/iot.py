@@ -310,7 +310,8 @@ class IotMqttTransport(Transport):
         client = self._require()
         if topic.name == "presence" and not self._up.is_set():
             return None  # the client would store every heartbeat of an outage
-        retain = topic.retain and self._may_retain(key)
+        # A stop of some robots must not take the place of one of every robot at the broker.
+        retain = topic.retain and b'"scope"' not in data and self._may_retain(key)
         packet = self._crt.PublishPacket(topic=key, payload=data, qos=self._crt.QoS(topic.qos), retain=retain)
         try:
             future: Future[Any] = client.publish(packet)

@@ -70,6 +70,8 @@ class MemoryBus:
     def partition(self, transport: MemoryTransport, cut: bool = True) -> None:
         """Lose every message from and to a session; ``cut=False`` heals it."""
         with self._lock:
+            if not cut and transport in self._cut:
+                transport.healed += 1
             (self._cut.add if cut else self._cut.discard)(transport)
 
     def deliver(self, sender: MemoryTransport, sample: Sample) -> None:
@@ -117,6 +119,7 @@ class MemoryTransport(Transport):
         self._id = session or secrets.token_hex(16)
         self._sessionless = sessionless
         self._open = False
+        self.healed = 0
 
     @property
     def session_id(self) -> str | None:
@@ -131,6 +134,9 @@ class MemoryTransport(Transport):
 
     def is_alive(self) -> bool:
         return self._open
+
+    def links_back(self) -> int:
+        return self.healed
 
     def put(self, key: str, payload: bytes | Mapping[str, Any]) -> None:
         self._require_open()

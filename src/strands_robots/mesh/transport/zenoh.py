@@ -47,6 +47,7 @@ class ZenohTransport(Transport):
         self._links: Any = None
         self._hub = False
         self._lost_link_at = -math.inf
+        self._links_lost = self._links_back = 0
         self._numbers = count()
         self._publishers: dict[str, tuple[Any, Any]] = {}
         self._closing = threading.Event()
@@ -78,11 +79,12 @@ class ZenohTransport(Transport):
             self._zenoh = zenoh
             posture = self._posture = self._posture or Posture.from_settings()
             self._closing.clear()
-            self._hub = False
+            self._hub, self._links_lost = False, 0
             if posture.hub is None:
                 self._session = self._open(zenoh_config.explicit(posture, self._id))
             else:
                 self._session = self._open_on_loopback(posture)
+            self._watch_links(self._session, of_hub=posture.hub is not None and not self._hub)
             if posture.credentials is None:
                 logger.info("The mesh runs without certificates, on this machine alone or by the operator's opt-in.")
 
@@ -125,6 +127,9 @@ class ZenohTransport(Transport):
 
     def lost_link_at(self) -> float | None:
         return self._lost_link_at
+
+    def links_back(self) -> int:
+        return self._links_back
 
     def put(self, key: str, payload: bytes | Mapping[str, Any]) -> None:
         topic = topics.topic_of(key)
@@ -247,12 +252,17 @@ class ZenohTransport(Transport):
                 raise TransportError(
                     f"{posture.hub} is taken and no mesh of ours answers there ({exc}); set STRANDS_MESH_PORT."
                 ) from None
-            self._watch_hub(session)
             return session
 
-    def _watch_hub(self, session: Any) -> None:
+    def _watch_links(self, session: Any, *, of_hub: bool) -> None:
         def changed(event: Any) -> None:
-            if event.kind != self._zenoh.SampleKind.PUT and not self._closing.is_set():
+            if event.kind == self._zenoh.SampleKind.PUT:
+                if self._links_lost:
+                    self._links_lost -= 1
+                    self._links_back += 1
+                return
+            self._links_lost += 1
+            if of_hub and not self._closing.is_set():
                 self._lost_link_at = time.monotonic()
                 threading.Thread(target=self._rescue, name="mesh-rescue", daemon=True).start()
 

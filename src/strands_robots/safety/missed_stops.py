@@ -1,0 +1,483 @@
+"""Missed stops: the question of a process that was away, and its answers.
+
+A process with a robot that is locked by a stop answers with the original, verbatim, and the asker judges it as if it
+had come directly. An answer can therefore lock nothing that its original would not lock, and hides nothing: the asker
+unites all answers.
+Everything here happens on a thread of its own; a link's thread only hands over.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import random
+import secrets
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from strands_robots.audit import queue_safety_event
+from strands_robots.safety import ed25519
+from strands_robots.safety.answer_slots import AnswerSlots
+from strands_robots.safety.clocks import seconds_of
+from strands_robots.safety.identity import SigningIdentity
+from strands_robots.safety.orders import params_of
+from strands_robots.safety.originals import ORIGINAL_MAX_BYTES, STOPS_MAX, Original, newest_within
+from strands_robots.safety.resume import is_epoch
+from strands_robots.safety.state_files import uptime
+from strands_robots.safety.statements import Purpose, own_key, signed
+from strands_robots.safety.stop_log import stop_logger
+from strands_robots.utils import shown
+
+logger = stop_logger(__name__)
+
+QUESTION = "missedStops"
+ANSWER = "missedStopsAnswer"
+
+STARTED, BACK = "the process started", "its link is back"
+
+UNITE_S = 0.3
+"""Seconds from the question for which motions hold, while the answers come in."""
+
+LISTEN_S = 1.9
+"""Seconds from the question in which an answer counts; a busy machine answers late."""
+
+ASK_EVERY_S = 1.0
+ASK_AGAIN_S = 2.0
+ASKS_MAX = 5
+"""Questions after one reason: two, and more only while answers had to be dropped."""
+
+WAIT_MAX_S = 0.2
+"""Longest wait of an answerer, drawn so that few of many answer early."""
+
+STEEPNESS = 6.0
+"""Exponent of that distribution: of 400 answerers three are due in its first quarter."""
+
+ANSWERS_ENOUGH = 3
+ANSWER_EVERY_S = 0.1
+"""Seconds between two answers of a process; one answer serves every question before it."""
+
+DEVICES_MAX = 64
+QUESTION_MAX_BYTES = 8 * 2**10
+QUESTIONS_MAX = 16
+"""Questions that wait for one answer."""
+
+ANSWER_MAX_BYTES = 60 * 2**10
+"""Bound of an encoded answer. Every stop link reads 64 KiB; a NATS server carries 1 MiB and Zenoh more."""
+
+STOPS_MAX_BYTES = ANSWER_MAX_BYTES - 4 * 2**10
+
+BUCKETS = 32
+BUCKET_CAPACITY = 2
+"""Answers of the sources that share a bucket: 4 MiB in all at their bound, whoever sends how many."""
+
+REFUSED_MAX = 4
+"""Stops of one answer that do not count, after which the rest of it is not read."""
+
+JUDGED_MAX = 4096
+AUDIT_EVERY_S = 10.0
+
+
+class MissedStopsPort(Protocol):
+    """A process as asker and answerer on one network.
+
+    A network supplies it. No method blocks on the network, and none raises for its state.
+    """
+
+    def was_here(self) -> bool:
+        """Return True where a robot was served from here before its start."""
+
+    def devices(self) -> Sequence[str]:
+        """Return the names of the robots that ask; none, and nothing is asked."""
+
+    def publish(self, event: str, source: str, fields: Mapping[str, Any]) -> bool:
+        """Send a question or an answer as ``source``; False when the link is down."""
+
+    def signer(self) -> tuple[str, SigningIdentity | None]:
+        """Return the name that answers and what signs, None where there is no key."""
+
+    def originals(self) -> Sequence[Original]:
+        """Return the stops to answer with, as of now."""
+
+    def learn(self, source: str, payload: bytes, age_s: float, answerer: str) -> bool:
+        """Judge a stop and lock by it; False when it does not count.
+
+        Args:
+            age_s: seconds since it was first received, as ``answerer`` says.
+        """
+
+    def knows_key(self, source: str, key: bytes) -> bool:
+        """Return True where ``key`` is known to be that of ``source``."""
+
+    def hold(self, seconds: float) -> None:
+        """Hold the motions of the robots for so long; return at once."""
+
+
+class AnswerQueue:
+    """Bounded answers that wait to be read: few for each share of the sources.
+
+    Adding is atomic and takes no lock; one thread takes.
+    """
+
+    def __init__(self) -> None:
+        self._salt = secrets.token_hex(8)
+        self._buckets: list[deque[tuple[str, bytes]]] = [deque(maxlen=BUCKET_CAPACITY) for _ in range(BUCKETS)]
+        self._turn = 0
+        self.dropped = False
+
+    def put(self, source: str, payload: bytes) -> None:
+        """Add an answer, in place of the oldest one of its bucket if that is full."""
+        bucket = self._buckets[hash(self._salt + source) % BUCKETS]
+        self.dropped = self.dropped or len(bucket) == BUCKET_CAPACITY
+        bucket.append((source, payload))
+
+    def take(self) -> tuple[str, bytes] | None:
+        """Return the newest answer of the next bucket in turn."""
+        for _ in self._buckets:
+            self._turn = (self._turn + 1) % BUCKETS
+            if self._buckets[self._turn]:
+                return self._buckets[self._turn].pop()
+        return None
+
+    def clear(self) -> None:
+        """Forget what waits."""
+        for bucket in self._buckets:
+            bucket.clear()
+        self.dropped = False
+
+
+class Asker:
+    """Times of the questions, in monotonic s."""
+
+    def __init__(self) -> None:
+        self._due = self._asked = float("-inf")
+        self._asks = 0
+        self.listens_until = float("-inf")
+
+    @property
+    def due(self) -> float:
+        """The moment of the next question; infinite where none is wanted."""
+        return self._due if self._asks else float("inf")
+
+    def want(self, now: float) -> None:
+        """Ask, at once or as soon as a second has passed since the last question."""
+        self._due, self._asks = max(now, self._asked + ASK_EVERY_S), ASKS_MAX
+
+    def asked(self, now: float) -> None:
+        """Note that a question leaves, and plan the next one."""
+        self._asked, self._due, self._asks = now, now + ASK_AGAIN_S, self._asks - 1
+        self.listens_until = now + LISTEN_S
+
+    def not_asked(self) -> None:
+        """Note that none can leave; the link's return is a new reason."""
+        self._asks = 0
+
+    def settle(self, now: float, *, dropped: bool) -> None:
+        """End the questions after the second one, unless answers were dropped."""
+        if self._asks <= ASKS_MAX - 2 and now > self.listens_until and not dropped:
+            self._asks = 0
+
+    def listens(self, now: float) -> bool:
+        """Return True while answers count."""
+        return now <= self.listens_until
+
+
+class Answerer:
+    """Questions that wait for an answer; times are monotonic s.
+
+    Args:
+        chance: returns a number from 0 to 1.
+    """
+
+    def __init__(self, chance: Callable[[], float] = random.random) -> None:
+        self._chance = chance
+        self._questions: dict[str, dict[str, set[str]]] = {}
+        self._due, self._answered = float("inf"), float("-inf")
+
+    @property
+    def due(self) -> float:
+        """The moment of the next answer; infinite where no question waits."""
+        return self._due
+
+    @property
+    def waits(self) -> bool:
+        """True while a question is not answered."""
+        return bool(self._questions)
+
+    @property
+    def nonces(self) -> tuple[str, ...]:
+        """The questions that wait."""
+        return tuple(self._questions)
+
+    @property
+    def full(self) -> bool:
+        """True while no further question is taken; the next answer serves its asker too."""
+        return len(self._questions) >= QUESTIONS_MAX
+
+    def ask(self, nonce: str, now: float) -> None:
+        """Take a question; one that comes again changes nothing."""
+        if nonce in self._questions or self.full:
+            return
+        if not self._questions:
+            self._due = max(now + waiting_s(self._chance()), self._answered + ANSWER_EVERY_S)
+        self._questions[nonce] = {}
+
+    def given(self, nonce: str, answerer: str, epochs: Iterable[str]) -> None:
+        """Note an answer that is proven; it serves every question that waits here."""
+        if nonce in self._questions:
+            named = tuple(epochs)
+            for given in self._questions.values():
+                for epoch in named:
+                    given.setdefault(epoch, set()).add(answerer)
+
+    def take(self, originals: Iterable[Original], now: float) -> tuple[str, list[Original]]:
+        """Return one question and the stops that it is still to be told; end all."""
+        questions, self._questions, self._due = self._questions, {}, float("inf")
+        rest = [
+            each
+            for each in originals
+            if any(len(given.get(each.epoch, ())) < ANSWERS_ENOUGH for given in questions.values())
+        ]
+        if rest:
+            self._answered = now
+        return next(iter(questions), ""), rest
+
+
+def waiting_s(chance: float) -> float:
+    """Return how long to wait: few of many answerers wait shortly, most long."""
+    return WAIT_MAX_S * math.log1p(chance * math.expm1(STEEPNESS)) / STEEPNESS
+
+
+@dataclass(frozen=True, slots=True)
+class _Row:
+    """One stop of an answer."""
+
+    source: str
+    payload: bytes
+    age_s: float
+
+
+def answer_fields(nonce: str, originals: Sequence[Original]) -> dict[str, Any]:
+    """Return an answer: its stops, newest last, and the number of those left out."""
+    fitting = newest_within(originals, STOPS_MAX_BYTES, encoded_length)
+    now = uptime()
+    rows = [
+        {"source": each.source, "event": ed25519.encode(each.payload), "age_s": round(max(0.0, now - each.received), 3)}
+        for each in fitting
+    ]
+    return {"nonce": nonce, "stops": rows, "more": len(originals) - len(fitting)}
+
+
+def encoded_length(original: Original) -> int:
+    """Return an upper bound of the bytes of a stop within an answer."""
+    return 4 * (len(original.payload) // 3 + 1) + 12 * len(original.source) + 64
+
+
+def rows_of(fields: Mapping[str, Any]) -> list[_Row]:
+    """Return the stops of an answer, leaving out what is none."""
+    stops = fields.get("stops")
+    found = []
+    for each in stops[:STOPS_MAX] if isinstance(stops, list) else ():
+        if not isinstance(each, Mapping):
+            continue
+        source, event, age_s = each.get("source"), each.get("event"), each.get("age_s")
+        payload = ed25519.decode_up_to(event, ORIGINAL_MAX_BYTES)
+        age = seconds_of(age_s)
+        if isinstance(source, str) and source and payload and age is not None and age >= 0:
+            found.append(_Row(source, payload, age))
+    return found
+
+
+class MissedStops:
+    """Asker and answerer of one process on one network.
+
+    Args:
+        port: the process on this network.
+        parse: returns the fields of a message.
+        clock: monotonic seconds.
+    """
+
+    def __init__(
+        self,
+        port: MissedStopsPort,
+        parse: Callable[[bytes | int], Mapping[str, Any]] = params_of,
+        clock: Callable[[], float] = time.monotonic,
+        chance: Callable[[], float] = random.random,
+    ) -> None:
+        self._port, self._parse, self._clock = port, parse, clock
+        self._slots = AnswerSlots()
+        self._asker, self._answerer = Asker(), Answerer(chance)
+        self._reasons: deque[str] = deque(maxlen=8)
+        self._questions: deque[tuple[str, bytes]] = deque(maxlen=QUESTIONS_MAX)
+        self._answers = AnswerQueue()
+        self._judged: set[bytes] = set()
+        self._own = ""
+        self._linked = False
+        self._audited = float("-inf")
+        self._waiting, self._starting = threading.Event(), threading.Lock()
+        self._closed = False
+        self._thread: threading.Thread | None = None
+
+    def ask(self, reason: str) -> None:
+        """Hold the motions and ask; return at once.
+
+        Args:
+            reason: why this process may have missed a stop, for the log.
+        """
+        self._port.hold(UNITE_S)
+        self._reasons.append(reason)
+        self._wake()
+
+    def link_up(self) -> None:
+        """Ask because the link is back, or at its first time :meth:`started`."""
+        if self._linked:
+            self.ask(BACK)
+        else:
+            self._linked = True
+            self.started()
+
+    def started(self) -> None:
+        """Ask because a robot is served from now on, unless it is a newcomer."""
+        self._reasons.append(STARTED)
+        self._wake()
+
+    def receive(self, event: str, source: str, payload: bytes | int) -> None:
+        """Take a question or an answer from a link's thread; return at once."""
+        if isinstance(payload, int) or len(payload) > (QUESTION_MAX_BYTES if event == QUESTION else ANSWER_MAX_BYTES):
+            return
+        if event == QUESTION:
+            if len(self._questions) < QUESTIONS_MAX and not self._answerer.full:
+                self._questions.append((source, payload))
+                self._wake()
+        elif self._asker.listens(self._clock()) or self._answerer.waits or self._questions:
+            self._answers.put(source, payload)
+            self._wake()
+
+    def close(self) -> None:
+        """End the thread. Safe to call twice."""
+        with self._starting:
+            self._closed, thread = True, self._thread
+        self._waiting.set()
+        if thread is not None and thread is not threading.current_thread():
+            thread.join(2.0)
+
+    def _wake(self) -> None:
+        if self._thread is None:
+            with self._starting:
+                if self._thread is None and not self._closed:
+                    self._thread = threading.Thread(target=self._run, name="missed-stops", daemon=True)
+                    self._thread.start()
+        if not self._waiting.is_set():
+            self._waiting.set()
+
+    def _run(self) -> None:
+        while not self._closed:
+            due = min(self._asker.due, self._answerer.due) - self._clock()
+            if due > 0:
+                self._waiting.wait(None if due == float("inf") else due)
+            self._waiting.clear()
+            try:
+                self.step()
+            except Exception:
+                logger.critical("A question for missed stops failed.", exc_info=True)
+
+    def step(self) -> None:
+        """Do what is due now; the thread does so whenever something is."""
+        while self._reasons:
+            reason = self._reasons.popleft()
+            if reason == STARTED:
+                if not self._port.was_here():
+                    continue
+                self._port.hold(UNITE_S)
+            logger.info("Asking for the stops missed: %s.", reason)
+            self._asker.want(self._clock())
+        self._take_questions()
+        if self._asker.listens(self._clock()):
+            self._take_answers()
+        now = self._clock()
+        if now >= self._asker.due:
+            self._ask()
+        if now >= self._answerer.due:
+            self._answer()
+
+    def _ask(self) -> None:
+        now = self._clock()
+        self._asker.settle(now, dropped=self._answers.dropped)
+        devices = self._port.devices() if self._asker.due <= now else ()
+        if not devices:
+            self._asker.not_asked()
+            return
+        self._answers.clear()
+        self._judged.clear()
+        # Before it leaves: the first answer may be back before this thread runs again.
+        self._asker.asked(now)
+        self._own = secrets.token_hex(16)
+        fields = {"nonce": self._own, "devices": list(devices[:DEVICES_MAX]), "t": time.time()}
+        if not self._port.publish(QUESTION, devices[0], fields):
+            self._asker.not_asked()
+
+    def _take_questions(self) -> None:
+        answers = bool(self._questions) and bool(self._port.originals())
+        while self._questions:
+            _, payload = self._questions.popleft()
+            if answers:
+                nonce = self._parse(payload).get("nonce")
+                if is_epoch(nonce) and nonce != self._own:
+                    self._answerer.ask(str(nonce), self._clock())
+
+    def _take_answers(self) -> None:
+        while (answer := self._answers.take()) is not None:
+            source, fields = answer[0], self._parse(answer[1])
+            rows = rows_of(fields)
+            if self._answerer.waits:
+                self._note_given(source, fields, rows)
+            if self._asker.listens(self._clock()):
+                self._learn(source, rows)
+
+    def _note_given(self, source: str, fields: Mapping[str, Any], rows: Sequence[_Row]) -> None:
+        """Count an answer that another process gave, if a known key signed it."""
+        nonce, key = fields.get("nonce"), ed25519.decode(fields.get("key"), 32)
+        if not isinstance(nonce, str) or key is None or not self._port.knows_key(source, key):
+            return
+        if own_key(Purpose.MISSED_STOPS, source, fields) == key:
+            told = {(each.source, each.payload) for each in rows}
+            epochs = [each.epoch for each in self._port.originals() if (each.source, each.payload) in told]
+            self._answerer.given(nonce, source, epochs)
+
+    def _learn(self, answerer: str, rows: Collection[_Row]) -> None:
+        refused = 0
+        for each in rows:
+            digest = hashlib.sha256(each.source.encode("utf-8", "replace") + b"\0" + each.payload).digest()
+            if digest in self._judged:
+                continue
+            if len(self._judged) < JUDGED_MAX:
+                self._judged.add(digest)
+            if not self._port.learn(each.source, each.payload, each.age_s, answerer):
+                refused += 1
+                if refused >= REFUSED_MAX:
+                    logger.info("An answer of %s is not read on: its stops do not count.", shown(answerer))
+                    return
+
+    def _answer(self) -> None:
+        originals = self._port.originals()
+        if originals and self._slots.take(self._answerer.nonces, [each.epoch for each in originals]):
+            # What others answered is checked now: most processes get no slot and need not.
+            self._take_answers()
+        else:
+            originals = ()
+        now = self._clock()
+        nonce, rest = self._answerer.take(originals, now)
+        if not self._asker.listens(now):
+            self._answers.clear()
+        if not rest:
+            return
+        name, identity = self._port.signer()
+        fields = answer_fields(nonce, rest)
+        self._port.publish(ANSWER, name, signed(identity, Purpose.MISSED_STOPS, name, fields))
+        if now - self._audited >= AUDIT_EVERY_S:
+            self._audited = now
+            epochs = [each.epoch for each in rest]
+            queue_safety_event("missed_stops_answered", name, {"epochs": epochs, "more": fields["more"]})

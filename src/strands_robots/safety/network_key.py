@@ -1,0 +1,67 @@
+"""Name of a network, so that a robot is asked for where it is."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from strands_robots.utils import ValidationError
+
+DEVICE_CONNECT, MESH = "device-connect", "mesh"
+KINDS = (DEVICE_CONNECT, MESH)
+
+ENDPOINTS_MAX = 64
+TEXT_MAX = 4096
+
+
+@dataclass(frozen=True, slots=True)
+class NetworkKey:
+    """One network as this machine reaches it.
+
+    Attributes:
+        kind: :data:`DEVICE_CONNECT` or :data:`MESH`.
+        where: endpoints, server lists or the meeting point, without credentials; sorted.
+        tenant: of Device Connect; the mesh has the default one.
+    """
+
+    kind: str
+    where: tuple[str, ...]
+    tenant: str = "default"
+
+    @classmethod
+    def of(cls, kind: str, endpoints: Iterable[str], tenant: str = "default") -> NetworkKey:
+        """Return the key for these endpoints, which may be written in several ways."""
+        return cls(kind, tuple(sorted({_plain(each) for each in endpoints}))[:ENDPOINTS_MAX], tenant)
+
+    @classmethod
+    def parse(cls, text: str) -> NetworkKey:
+        """Read what :attr:`text` wrote.
+
+        Raises:
+            ValidationError: it is no network key.
+        """
+        kind, _, rest = text.partition(" ")
+        tenant, _, where = rest.partition(" ")
+        if len(text) > TEXT_MAX or kind not in KINDS or not tenant or not where:
+            raise ValidationError(f"network must be kind, tenant and endpoints, not {text[:80]!r}.")
+        return cls(kind, tuple(where.split(",")), tenant)
+
+    @property
+    def text(self) -> str:
+        """The key in one line, for a file."""
+        return f"{self.kind} {self.tenant} {','.join(self.where)}"
+
+    def meets(self, other: NetworkKey) -> bool:
+        """True when both have one kind and tenant, and a common endpoint."""
+        return (self.kind, self.tenant) == (other.kind, other.tenant) and not set(self.where).isdisjoint(other.where)
+
+
+def _plain(endpoint: str) -> str:
+    """Return an endpoint as host and port, without credentials and scheme."""
+    rest = endpoint.strip().lower().rsplit("@", 1)[-1]
+    rest = rest.partition("://")[2] or rest
+    rest = rest.partition("/")[2] if rest.split("/", 1)[0] in ("tcp", "tls", "quic", "udp", "ws", "wss") else rest
+    rest = rest.split("#", 1)[0].split("?", 1)[0].rstrip("/")
+    host, colon, port = rest.rpartition(":")
+    here = host in ("localhost", "[::1]", "0.0.0.0", "[::]", "127.0.0.1")
+    return f"127.0.0.1{colon}{port}" if here else rest.replace(",", "_").replace(" ", "_")

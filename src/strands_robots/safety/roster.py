@@ -1,0 +1,179 @@
+"""Roster of a network: the robots that must answer a stop.
+
+Exit code rule: where no robot is enrolled for the network, every row counts. Where some are, rows that are ENROLLED,
+SERVED or SIGNED count; names that were only HEARD are told and do not alter the exit code, so made-up names cannot.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+from strands_robots.errors import StrandsRobotsError
+from strands_robots.safety.identity import EnrolledKeys, EnrolledRobot, Exemption, of_tenant
+from strands_robots.safety.network_key import NetworkKey
+from strands_robots.safety.sightings import Known, Sighting, Sightings, sightings, this_moment
+from strands_robots.safety.state_files import uptime
+from strands_robots.utils import field_values
+
+REPORTED_MAX = 64
+
+
+@dataclass(frozen=True, slots=True)
+class RosterRow:
+    """A robot that must answer.
+
+    Attributes:
+        name: its id on the network.
+        known: the surest way in which it is known.
+        age_s: seconds since it was last heard here; None where it was not within ten minutes, below 0 after the press.
+        order: lower for a robot that was heard first earlier.
+        cell: or "".
+        signed_only: it locks for signed stops alone (``--key``); None where that is unknown.
+        stoppable: False for a device without a stop: told, not counted. None where that is unknown.
+        departed: it said, unsigned, that it left.
+        alive: its process on this machine lives; None where it is not served from here.
+        pid: of that process.
+        exemption: of rows of :attr:`Roster.exempt`.
+        reported_by: the controller that reported it, "" where this machine heard it.
+    """
+
+    name: str
+    known: Known
+    age_s: float | None = None
+    order: int = 0
+    cell: str = ""
+    signed_only: bool | None = None
+    stoppable: bool | None = None
+    departed: bool = False
+    alive: bool | None = None
+    pid: int | None = None
+    exemption: Exemption | None = None
+    reported_by: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Roster:
+    """Robots of one network.
+
+    Attributes:
+        network: asked for.
+        rows: that must answer, in the order of :class:`Known`, then longest heard first; devices without a stop too.
+        exempt: robots that are retired or off. ``age_s`` tells whether one of this name was heard all the same.
+        elsewhere: number of enrolled or served robots of other networks of this user.
+        enrolled: number of robots enrolled for this network, without the exempt ones.
+        problems: sentences on what could not be read; with one of them no exit code is 0.
+    """
+
+    network: NetworkKey
+    rows: tuple[RosterRow, ...] = ()
+    exempt: tuple[RosterRow, ...] = ()
+    elsewhere: int = 0
+    enrolled: int = 0
+    problems: tuple[str, ...] = ()
+
+    @classmethod
+    def of(
+        cls,
+        network: NetworkKey,
+        pressed: float | None = None,
+        *,
+        store: Sightings | None = None,
+    ) -> Roster:
+        """Read the roster from the disk; call it once the stop has left.
+
+        Args:
+            network: of the stop.
+            pressed: :func:`~.state_files.uptime` at the press; now by default. Robots count that were heard from ten
+                minutes before it until now.
+            store: in place of the state directory's.
+        """
+        store = store or sightings()
+        now = this_moment()
+        at = now if pressed is None else now.earlier(uptime() - pressed)
+        found, problem = store.read(at)
+        problems = [problem] if problem else []
+        try:
+            enrolled = of_tenant(EnrolledKeys(store.directory).robots(), network.tenant)
+        except (StrandsRobotsError, OSError) as exc:
+            enrolled = {}
+            problems.append(f"the enrolled robots cannot be read: {exc}")
+        rows: dict[str, RosterRow] = {}
+        for each in sorted((each for each in found if each.network.meets(network)), key=_surest_first):
+            rows.setdefault(each.name, _row_of(each))
+        here = {name: robot for name, robot in enrolled.items() if _is_at(robot, network)}
+        exempt: list[RosterRow] = []
+        for name, robot in here.items():
+            known = replace(rows.get(name, RosterRow(name, Known.ENROLLED)), exemption=robot.exemption)
+            if robot.exemption is not None and not known.alive:
+                exempt.append(known)
+                rows.pop(name, None)
+            else:
+                # A robot that this machine serves now is there, whatever was decided about it.
+                rows[name] = replace(known, known=Known.ENROLLED, stoppable=True, exemption=None)
+        others = {name for name, robot in enrolled.items() if name not in here and robot.exemption is None}
+        served = {each.name for each in found if each.alive and not each.network.meets(network)}
+        return cls(
+            network,
+            in_order(rows.values()),
+            in_order(exempt),
+            len(others | served),
+            sum(robot.exemption is None for robot in here.values()),
+            tuple(problems),
+        )
+
+    def counts(self, row: RosterRow) -> bool:
+        """True when the exit code depends on this row."""
+        return row.stoppable is not False and (not self.enrolled or row.known is not Known.HEARD)
+
+    @property
+    def must_answer(self) -> tuple[RosterRow, ...]:
+        """The rows that the exit code depends on."""
+        return tuple(row for row in self.rows if self.counts(row))
+
+    @property
+    def told_only(self) -> tuple[RosterRow, ...]:
+        """The rows that are printed as a group and do not alter the exit code."""
+        return tuple(row for row in self.rows if not self.counts(row))
+
+    def with_reported(self, rows: Iterable[RosterRow], by: str) -> Roster:
+        """Return the roster with rows that the controller ``by`` reported.
+
+        A row of this machine stays, and takes the surer of the two grades. Where the controller's signature is not
+        verified the caller passes every row as HEARD.
+        """
+        united = {row.name: row for row in self.rows}
+        exempt = {row.name for row in self.exempt}
+        for row in rows:
+            known = united.get(row.name)
+            if known is None and row.name not in exempt:
+                united[row.name] = replace(row, reported_by=by)
+            elif known is not None and row.known < known.known:
+                united[row.name] = replace(known, known=row.known, stoppable=True, reported_by=by)
+        return replace(self, rows=in_order(united.values()))
+
+
+def _is_at(robot: EnrolledRobot, network: NetworkKey) -> bool:
+    """Return True where a robot is enrolled here; an old record is for all."""
+    return not robot.networks or any(map(network.meets, robot.networks))
+
+
+def _surest_first(sighting: Sighting) -> tuple[int, float]:
+    return sighting.known, sighting.age_s
+
+
+def _row_of(sighting: Sighting) -> RosterRow:
+    fields = field_values(sighting)
+    del fields["network"]
+    return RosterRow(**fields)
+
+
+def in_order(rows: Iterable[RosterRow]) -> tuple[RosterRow, ...]:
+    """Return the rows, surest first, then longest heard first."""
+    return tuple(sorted(rows, key=lambda row: (row.known, row.order, row.name)))
+
+
+def bounded(rows: Sequence[RosterRow], most: int = REPORTED_MAX) -> tuple[tuple[RosterRow, ...], int]:
+    """Return the first ``most`` rows in order, and the number of the others."""
+    kept = in_order(rows)[:most]
+    return kept, len(rows) - len(kept)

@@ -1,0 +1,490 @@
+"""SQLite file of the robots that were heard or served from this machine.
+
+It is private, bounded and in WAL mode; each use opens it anew and waits 0.2 s at most for another process. A damaged
+file is put aside and begun again; for ten minutes from then every reader is told so.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from enum import IntEnum
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from strands_robots.errors import StrandsRobotsError
+from strands_robots.safety.network_key import NetworkKey
+from strands_robots.safety.state_files import StateFileError, adopt, boot, make_private, require_private_file, uptime
+from strands_robots.safety.stop_log import stop_logger
+from strands_robots.utils import ValidationError
+
+if TYPE_CHECKING:
+    import sqlite3
+
+logger = stop_logger(__name__)
+
+VERSION = 1
+BUSY_MS = 200
+ROWS_MAX = 4096
+"""Robots that were heard. Beyond it the stale are forgotten first, then the latest of those that never signed."""
+
+SERVED_MAX = 1024
+
+RECENT_S = 600.0
+"""A robot that was heard longer ago than this does not count."""
+
+LEAVING_S = 1.0
+"""Seconds after a robot's orderly end in which its last presence may still be heard."""
+
+_SCHEMA = """
+CREATE TABLE IF NOT EXISTS heard (
+    id INTEGER PRIMARY KEY, network TEXT NOT NULL, name TEXT NOT NULL,
+    boot TEXT NOT NULL, uptime REAL NOT NULL, wall REAL NOT NULL,
+    signed_boot TEXT, signed_uptime REAL, signed_wall REAL,
+    cell TEXT, signed_only INTEGER, stoppable INTEGER, departed INTEGER NOT NULL,
+    UNIQUE (network, name));
+CREATE TABLE IF NOT EXISTS served (
+    id INTEGER PRIMARY KEY, network TEXT NOT NULL, name TEXT NOT NULL, pid INTEGER NOT NULL, started TEXT NOT NULL,
+    boot TEXT NOT NULL, uptime REAL NOT NULL, wall REAL NOT NULL,
+    cell TEXT NOT NULL, signed_only INTEGER NOT NULL, ended INTEGER NOT NULL,
+    UNIQUE (network, name, pid, started));
+CREATE TABLE IF NOT EXISTS lost (boot TEXT NOT NULL, uptime REAL NOT NULL, wall REAL NOT NULL);
+"""
+
+# The same boot by the clock since boot, another one by the wall clock.
+_STALE = "(CASE WHEN {row}.boot = {now_boot} THEN {now_uptime} - {row}.uptime ELSE {now_wall} - {row}.wall END > 600)"
+_REPLACED = _STALE.format(row="heard", now_boot="excluded.boot", now_uptime="excluded.uptime", now_wall="excluded.wall")
+
+_NOTE = f"""
+INSERT INTO heard (network, name, boot, uptime, wall, signed_boot, signed_uptime, signed_wall, cell, signed_only,
+    stoppable, departed) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)
+ON CONFLICT (network, name) DO UPDATE SET
+    boot = excluded.boot, wall = excluded.wall,
+    uptime = CASE WHEN boot = excluded.boot THEN max(uptime, excluded.uptime) ELSE excluded.uptime END,
+    signed_boot = coalesce(excluded.signed_boot, signed_boot),
+    signed_uptime = coalesce(excluded.signed_uptime, signed_uptime),
+    signed_wall = coalesce(excluded.signed_wall, signed_wall),
+    cell = CASE WHEN excluded.cell IS NULL THEN cell
+        WHEN cell IS NULL OR cell = excluded.cell OR {_REPLACED} THEN excluded.cell ELSE '' END,
+    signed_only = coalesce(excluded.signed_only, signed_only),
+    stoppable = nullif(max(coalesce(stoppable, -1), coalesce(excluded.stoppable, -1)), -1),
+    departed = excluded.departed
+"""
+
+_SERVE = """
+INSERT INTO served (network, name, pid, started, boot, uptime, wall, cell, signed_only, ended)
+VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)
+ON CONFLICT (network, name, pid, started) DO UPDATE SET boot = excluded.boot, uptime = excluded.uptime,
+    wall = excluded.wall, cell = excluded.cell, signed_only = excluded.signed_only, ended = excluded.ended
+"""
+
+_EVICT = f"""
+DELETE FROM heard WHERE id IN (
+    SELECT id FROM heard ORDER BY
+        {_STALE.format(row="heard", now_boot=":boot", now_uptime=":uptime", now_wall=":wall")} DESC,
+        (signed_boot IS NOT NULL) ASC, id DESC
+    LIMIT max(0, (SELECT count(*) FROM heard) - :most))
+"""
+
+
+class SightingFileError(StrandsRobotsError, OSError):
+    """The file could not be read or written; the message says why."""
+
+
+class Known(IntEnum):
+    """Grades of knowledge of a robot, the surest first."""
+
+    ENROLLED = 0
+    SERVED = 1
+    SIGNED = 2
+    HEARD = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """A point in time that outlives a process.
+
+    Attributes:
+        boot: id of the boot of the machine.
+        uptime: seconds since boot, those asleep included.
+        wall: wall-clock seconds; they count across boots alone.
+    """
+
+    boot: str
+    uptime: float
+    wall: float
+
+    def age_s(self, now: Moment) -> float:
+        """Return the seconds from this moment to ``now``.
+
+        Of an earlier boot it is the difference of the wall clocks, and at least the time since boot: the wall clock may
+        have been reset.
+        """
+        if self.boot == now.boot and self.boot:
+            return now.uptime - self.uptime
+        return max(now.wall - self.wall, now.uptime)
+
+    def earlier(self, seconds: float) -> Moment:
+        """Return the moment ``seconds`` before this one."""
+        return Moment(self.boot, self.uptime - seconds, self.wall - seconds)
+
+
+def this_moment() -> Moment:
+    """Return the present moment."""
+    return Moment(boot(), uptime(), time.time())
+
+
+@dataclass(frozen=True, slots=True)
+class Sighting:
+    """One robot as this machine remembers it.
+
+    Attributes:
+        network: where.
+        name: its id there.
+        known: SERVED, SIGNED or HEARD, by what happened in the last ten minutes.
+        age_s: seconds since it was heard, or since its process wrote last; below 0 after the press.
+        order: lower for a robot that was heard first earlier.
+        cell: of the robot, or "".
+        signed_only: it locks for signed stops alone; None where that is unknown.
+        stoppable: it has a stop; None where that is unknown.
+        departed: it said, unsigned, that it left.
+        alive: of a robot served from this machine: its process lives.
+        pid: of that process, else None.
+    """
+
+    network: NetworkKey
+    name: str
+    known: Known
+    age_s: float
+    order: int = 0
+    cell: str = ""
+    signed_only: bool | None = None
+    stoppable: bool | None = None
+    departed: bool = False
+    alive: bool | None = None
+    pid: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Note:
+    """A robot that was heard ``at`` a moment, and when it last answered signed."""
+
+    network: NetworkKey
+    name: str
+    at: Moment
+    signed: Moment | None = None
+    cell: str | None = None
+    signed_only: bool | None = None
+    stoppable: bool | None = None
+    departed: bool = False
+
+    def merged(self, later: Note) -> Note:
+        """Return this note with what a later one adds, by the rules of the file."""
+        told = (self.cell, later.cell)
+        cell = self.cell if later.cell is None else later.cell if self.cell in (None, later.cell) else ""
+        stops = [each for each in (self.stoppable, later.stoppable) if each is not None]
+        return replace(
+            later,
+            signed=later.signed or self.signed,
+            cell=None if told == (None, None) else cell,
+            signed_only=self.signed_only if later.signed_only is None else later.signed_only,
+            stoppable=any(stops) if stops else None,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Served:
+    """A robot that a process of this machine serves, or served when it ``ended``."""
+
+    network: NetworkKey
+    name: str
+    pid: int
+    started: str
+    at: Moment
+    cell: str = ""
+    signed_only: bool = False
+    ended: bool = False
+
+    def lives(self, now: Moment) -> bool:
+        """True while its process lives and serves it."""
+        return not self.ended and self.at.boot == now.boot and process_start(self.pid) == self.started != ""
+
+
+def process_start(pid: int) -> str:
+    """Return the start of a process, in ticks since boot; "" where there is none.
+
+    Where the system does not say, it is ``unknown`` for every live process.
+    """
+    try:
+        # The name in brackets may hold anything.
+        fields = Path(f"/proc/{pid}/stat").read_bytes().rpartition(b")")[2].split()
+        return "" if fields[0] in (b"Z", b"X") else fields[19].decode("ascii")
+    except (OSError, IndexError):
+        if Path("/proc/self/stat").exists():
+            return ""
+    try:
+        os.kill(pid, 0)
+    except (ProcessLookupError, OverflowError):
+        return ""
+    except PermissionError:
+        return "unknown"
+    return "unknown"
+
+
+class SightingFile:
+    """The file ``sightings.db`` of one state directory."""
+
+    def __init__(self, directory: Path) -> None:
+        self.path = directory / "sightings.db"
+        self._root = directory
+
+    def write(self, notes: Sequence[Note], served: Sequence[Served], now: Moment) -> None:
+        """Write these rows, and forget what is too much.
+
+        Raises:
+            SightingFileError: nothing was written.
+        """
+        with self._opened(make=True) as connection:
+            connection.execute("BEGIN IMMEDIATE")
+            connection.executemany(_NOTE, [_note_row(each) for each in notes])
+            connection.executemany(_SERVE, [_served_row(each) for each in served])
+            if notes:
+                facts = {"boot": now.boot, "uptime": now.uptime, "wall": now.wall, "most": ROWS_MAX}
+                connection.execute(_EVICT, facts)
+            if served:
+                self._forget_served(connection, now)
+            connection.execute("COMMIT")
+
+    def read(self, now: Moment) -> tuple[list[Sighting], str]:
+        """Return the robots of the ten minutes before ``now``, and a problem or "".
+
+        Raises:
+            SightingFileError: nothing could be read.
+        """
+        if not self.path.exists() and not self.path.is_symlink():
+            return [], ""
+        with self._opened() as connection:
+            problem = _held(connection)
+            lost = [Moment(*row) for row in connection.execute("SELECT boot, uptime, wall FROM lost")]
+            heard = connection.execute(
+                "SELECT network, name, boot, uptime, wall, signed_boot, signed_uptime, signed_wall, cell, signed_only,"
+                " stoppable, departed, id FROM heard ORDER BY id LIMIT ?",
+                (2 * ROWS_MAX,),
+            ).fetchall()
+            served = self._served(connection)
+        if any(each.age_s(now) < RECENT_S for each in lost):
+            problem = (
+                "sightings.db was damaged and begun again less than ten minutes ago; robots heard before may be missing"
+            )
+        return _united(heard, served, now), problem
+
+    def served(self) -> list[Served]:
+        """Return the rows of served robots, those that ended included.
+
+        Raises:
+            SightingFileError: they could not be read.
+        """
+        if not self.path.exists() and not self.path.is_symlink():
+            return []
+        with self._opened() as connection:
+            return self._served(connection)
+
+    def _served(self, connection: sqlite3.Connection) -> list[Served]:
+        rows = connection.execute(
+            "SELECT network, name, pid, started, boot, uptime, wall, cell, signed_only, ended FROM served"
+            " ORDER BY id DESC LIMIT ?",
+            (2 * SERVED_MAX,),
+        )
+        found = []
+        for network, name, pid, started, since_boot, since, wall, cell, signed_only, ended in rows:
+            with contextlib.suppress(ValidationError):  # of a later release
+                key, at = NetworkKey.parse(network), Moment(since_boot, since, wall)
+                found.append(Served(key, name, pid, started, at, cell, bool(signed_only), bool(ended)))
+        return found
+
+    def _forget_served(self, connection: sqlite3.Connection, now: Moment) -> None:
+        """Forget served robots whose process is gone and ten minutes are over."""
+        gone = [
+            (each.network.text, each.name, each.pid, each.started)
+            for each in self._served(connection)
+            if each.at.age_s(now) >= RECENT_S and not each.lives(now)
+        ]
+        connection.executemany("DELETE FROM served WHERE network = ? AND name = ? AND pid = ? AND started = ?", gone)
+        connection.execute(
+            "DELETE FROM served WHERE id IN (SELECT id FROM served ORDER BY ended DESC, uptime"
+            " LIMIT max(0, (SELECT count(*) FROM served) - ?))",
+            (SERVED_MAX,),
+        )
+
+    @contextlib.contextmanager
+    def _opened(self, *, make: bool = False) -> Iterator[sqlite3.Connection]:
+        import sqlite3  # noqa: PLC0415 - a process that hears no robot does not load it
+
+        try:
+            if make:
+                self._make()
+            inode = require_private_file(self.path, self._root)
+            connection = sqlite3.connect(self.path, timeout=BUSY_MS / 1000, isolation_level=None)
+        except (OSError, StateFileError, sqlite3.Error) as exc:
+            raise SightingFileError(f"{self.path.name} cannot be used: {exc}") from exc
+        try:
+            with contextlib.closing(connection):
+                self._prepare(connection, make=make)
+                yield connection
+        except sqlite3.OperationalError as exc:
+            raise SightingFileError(f"{self.path.name} cannot be used: {exc}") from exc
+        except (sqlite3.Error, TypeError, ValueError, OverflowError) as exc:
+            # SQLite says so of a malformed file; any other error is no reason to begin anew.
+            if make and type(exc) is sqlite3.DatabaseError:
+                self._put_aside(inode)
+            raise SightingFileError(f"{self.path.name} is damaged: {exc}") from exc
+
+    def _prepare(self, connection: sqlite3.Connection, *, make: bool) -> None:
+        connection.execute(f"PRAGMA busy_timeout = {BUSY_MS}")
+        connection.execute("PRAGMA synchronous = NORMAL")
+        until = time.monotonic() + BUSY_MS / 1000
+        # Another process may be making it.
+        while not (version := connection.execute("PRAGMA user_version").fetchone()[0]) and not make:
+            if time.monotonic() > until:
+                break
+            time.sleep(0.01)
+        if version not in (0, VERSION):
+            raise SightingFileError(f"{self.path.name} is of another release (version {version})")
+        if version == VERSION:
+            return
+        if not make:
+            raise SightingFileError(f"{self.path.name} was never written whole")
+        connection.execute("PRAGMA journal_mode = WAL")
+        connection.execute("BEGIN IMMEDIATE")
+        for statement in filter(str.strip, _SCHEMA.split(";")):
+            connection.execute(statement)
+        if self._aside.exists() and connection.execute("SELECT count(*) FROM lost").fetchone()[0] == 0:
+            at = this_moment()
+            aged = max(0.0, at.wall - self._aside.stat().st_mtime)
+            earlier = at.earlier(aged)
+            connection.execute("INSERT INTO lost VALUES (?, ?, ?)", (earlier.boot, earlier.uptime, earlier.wall))
+        connection.execute(f"PRAGMA user_version = {VERSION}")
+        connection.execute("COMMIT")
+
+    def _make(self) -> None:
+        adopt(self._root)
+        make_private(self._root)
+        with contextlib.suppress(FileExistsError):
+            os.close(os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600))
+
+    @property
+    def _aside(self) -> Path:
+        return self.path.with_suffix(".damaged")
+
+    def _put_aside(self, inode: int) -> None:
+        """Keep a damaged file for a person to look at; the next write begins anew."""
+        with contextlib.suppress(OSError):  # another process was first
+            if self.path.stat().st_ino != inode:
+                return
+            for suffix in ("-wal", "-shm"):
+                self.path.with_name(self.path.name + suffix).unlink(missing_ok=True)
+            os.utime(self.path)
+            self.path.replace(self._aside)
+            logger.critical("%s is damaged and was put aside as %s.", self.path.name, self._aside.name)
+
+
+def _held(connection: sqlite3.Connection) -> str:
+    """Return a problem while another process keeps all others from writing."""
+    import sqlite3  # noqa: PLC0415 - as above
+
+    try:
+        connection.execute("BEGIN IMMEDIATE")
+        connection.execute("ROLLBACK")
+    except sqlite3.OperationalError as exc:
+        return f"sightings.db cannot be written ({exc}); robots heard last may be missing"
+    return ""
+
+
+def _note_row(note: Note) -> tuple[object, ...]:
+    signed = note.signed
+    return (
+        note.network.text,
+        note.name,
+        *_moment_row(note.at),
+        *((None, None, None) if signed is None else _moment_row(signed)),
+        note.cell,
+        note.signed_only,
+        # A robot that signs its answers has a stop.
+        note.stoppable if signed is None else True,
+        note.departed,
+    )
+
+
+def _served_row(row: Served) -> tuple[object, ...]:
+    at = _moment_row(row.at)
+    return (row.network.text, row.name, row.pid, row.started, *at, row.cell, row.signed_only, row.ended)
+
+
+def _moment_row(at: Moment) -> tuple[str, float, float]:
+    return at.boot, at.uptime, at.wall
+
+
+def _united(heard: Sequence[tuple[object, ...]], served: Sequence[Served], now: Moment) -> list[Sighting]:
+    """Return the sightings of the ten minutes before ``now``, one a robot and key."""
+    latest: dict[tuple[NetworkKey, str], Served] = {}
+    for row in served:
+        known = latest.get((row.network, row.name))
+        if known is None or (row.lives(now), -row.at.age_s(now)) > (known.lives(now), -known.at.age_s(now)):
+            latest[row.network, row.name] = row
+    by_name: dict[str, list[Served]] = {}
+    for row in latest.values():
+        by_name.setdefault(row.name, []).append(row)
+    found: dict[tuple[NetworkKey, str], Sighting] = {}
+    for each in heard:
+        seen = _sighting(each, now)
+        if seen is None or seen.age_s >= RECENT_S:
+            continue
+        ended = [row for row in by_name.get(seen.name, ()) if row.ended and row.network.meets(seen.network)]
+        if not any(seen.age_s >= row.at.age_s(now) - LEAVING_S for row in ended):
+            found[seen.network, seen.name] = seen
+    for key, own in latest.items():
+        alive, age = own.lives(now), own.at.age_s(now)
+        if own.ended or not (alive or age < RECENT_S):
+            continue
+        seen = found.get(key) or Sighting(own.network, own.name, Known.SERVED, age)
+        found[key] = replace(
+            seen,
+            known=Known.SERVED,
+            age_s=min(age, seen.age_s),
+            cell=own.cell,
+            signed_only=own.signed_only,
+            stoppable=True,
+            alive=alive,
+            pid=own.pid,
+        )
+    return list(found.values())
+
+
+def _sighting(row: tuple[object, ...], now: Moment) -> Sighting | None:
+    network, name, *rest = row
+    try:
+        key = NetworkKey.parse(str(network))
+    except ValidationError:  # of a later release
+        return None
+    since_boot, since, wall, signed_boot, signed_since, signed_wall, cell, signed_only, stoppable, departed, order = (
+        rest
+    )
+    signed = signed_boot is not None and _moment(signed_boot, signed_since, signed_wall).age_s(now) < RECENT_S
+    return Sighting(
+        key,
+        str(name),
+        Known.SIGNED if signed else Known.HEARD,
+        _moment(since_boot, since, wall).age_s(now),
+        int(str(order)),
+        str(cell or ""),
+        None if signed_only is None else bool(signed_only),
+        None if stoppable is None else bool(stoppable),
+        bool(departed),
+    )
+
+
+def _moment(since_boot: object, since: object, wall: object) -> Moment:
+    return Moment(str(since_boot), float(str(since)), float(str(wall)))

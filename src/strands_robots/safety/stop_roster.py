@@ -1,0 +1,354 @@
+"""Robots that must answer one stop: remembered, named, found and reported."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from strands_robots.audit import queue_safety_event
+from strands_robots.safety.answers import Answer
+from strands_robots.safety.controller import StopReport
+from strands_robots.safety.network_key import NetworkKey
+from strands_robots.safety.roster import Roster, RosterRow
+from strands_robots.safety.roster_report import RosterReport
+from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope
+from strands_robots.safety.sightings import Known, sightings
+from strands_robots.safety.silence import Sending, reason_of
+from strands_robots.safety.state_files import uptime
+from strands_robots.safety.statements import Purpose
+
+OTHERS_AWAITED = 64
+"""Names that do not alter the exit code, and for whose answer a stop goes on all the same."""
+
+TRUSTED_MAX, UNPROVEN_MAX = 64, 16
+"""Controllers whose reports are kept, with a signature that counts and without one."""
+
+NAMED_MAX = 64
+"""Robots of each kind that the audit names; the others are counted."""
+
+READ_WITHIN_S = 0.5
+"""Seconds that the end of a stop waits for a roster that is still being read."""
+
+REMEMBERED_MAX = 512
+"""Answers to one stop that are remembered."""
+
+ENROLL = "strands-robots enroll"
+
+
+@dataclass(frozen=True, slots=True)
+class StopOutcome:
+    """Outcome of a stop, measured by the roster.
+
+    Attributes:
+        report: of the robots that count.
+        others: of the names that do not.
+        roster: all rows: remembered, reported, named, found, and those that only answered.
+        no_stop: devices that have no stop.
+        unproven: robots that controllers without a known signature say they miss, and who says so.
+        reasons: of silent robots.
+        problems: why the roster may lack robots; with one of them no exit code is 0.
+    """
+
+    report: StopReport
+    others: StopReport
+    roster: Roster
+    no_stop: tuple[str, ...] = ()
+    unproven: Mapping[str, str] = field(default_factory=dict)
+    reasons: Mapping[str, str] = field(default_factory=dict)
+    problems: tuple[str, ...] = ()
+    sending: Sending = field(default_factory=Sending)
+
+    @property
+    def ok(self) -> bool:
+        """True when every robot of the roster is known to stand still."""
+        return self.report.ok and not self.problems
+
+    @property
+    def size(self) -> int:
+        """Number of robots that had to answer."""
+        return len(self.report.answered.keys() | {*self.report.silent, *self.report.alarms})
+
+    @property
+    def sentence(self) -> str:
+        """The number of robots that are known to stand still, in a sentence."""
+        still, size = len(self.report.stopped), self.size
+        if not size:
+            return "The roster has no robot."
+        if size == 1:
+            return f"The one robot of the roster is {'' if still else 'not '}known to stand still."
+        if still == size:
+            return f"All {size} robots of the roster are known to stand still."
+        return f"{still} of the {size} robots of the roster {'is' if still == 1 else 'are'} known to stand still."
+
+    @property
+    def worth(self) -> str:
+        """The limit of that sentence where no robot is enrolled, else ""."""
+        if self.roster.enrolled:
+            return ""
+        return f"No robot is enrolled here, so one that was not heard for ten minutes is not missed: {ENROLL}"
+
+    def facts(self) -> dict[str, Any]:
+        """Return what a script reads besides the report's own fields."""
+        return {
+            "roster": {"size": self.size, "still": len(self.report.stopped), "enrolled": self.roster.enrolled},
+            "reasons": dict(list(self.reasons.items())[:NAMED_MAX]),
+            "retired": [row.name for row in self.roster.exempt if row.exemption and row.exemption.state == "retired"],
+            "off": [row.name for row in self.roster.exempt if row.exemption and row.exemption.state == "off"],
+            "elsewhere": self.roster.elsewhere,
+            "no_stop": list(self.no_stop[:NAMED_MAX]),
+            "others": _others(self),
+            "problems": list(self.problems),
+        }
+
+    def record(self, controller: str) -> None:
+        """Write the outcome into this console's own audit; one bounded record a stop."""
+        report = self.report
+        moving = {**report.not_stopped, **report.refused}
+        queue_safety_event(
+            "estop_outcome",
+            controller,
+            {
+                "estop_id": report.estop_id,
+                "roster": self.size,
+                "stopped": len(report.stopped),
+                "not_stopped": {name: moving[name].why[:200] for name in sorted(moving)[:NAMED_MAX]},
+                "claimed": sorted(report.claimed)[:NAMED_MAX],
+                "silent": {name: self.reasons.get(name, "") for name in report.silent[:NAMED_MAX]},
+                "silent_in_all": len(report.silent),
+                "others": {name: count for name, count in _others(self).items() if name != "names"},
+                "retired_or_off": [row.name for row in self.roster.exempt][:NAMED_MAX],
+                "denied": self.sending.denied,
+                "problems": list(self.problems),
+                "ok": self.ok,
+                **report.scope.field(),
+                **({"widened": True} if report.widened else {}),
+            },
+        )
+
+
+class StopRoster:
+    """Robots that must answer one stop; every method may be called from any thread.
+
+    Args:
+        network: of the stop.
+        named: robots that the caller says must answer, besides the roster.
+        scope: the robots that the stop is for. Those that stop all the same must answer as well.
+    """
+
+    def __init__(self, network: NetworkKey, named: Collection[str] = (), scope: Scope = EVERY_ROBOT) -> None:
+        self._network, self._pressed = network, uptime()
+        self._lock, self._is_read = threading.Lock(), threading.Event()
+        self._named, self._asked, self.scope = frozenset(named) | scope.only, scope, scope
+        self._roster = Roster(network, problems=("the roster was not read in time",))
+        self._found: dict[str, bool] = {}
+        self._cells: dict[str, str | None] = {}
+        self._trusted: dict[str, RosterReport] = {}
+        self._unproven: dict[str, RosterReport] = {}
+
+    def read(self) -> None:
+        """Read the roster from the disk; call it once the stop has left, off its thread."""
+        try:
+            roster = Roster.of(self._network, self._pressed)
+        except Exception as exc:  # noqa: BLE001 - a roster that cannot be read is said, and the stop goes on
+            roster = Roster(self._network, problems=(f"the roster cannot be read: {exc}",))
+        with self._lock:
+            self._roster = roster
+        self._is_read.set()
+
+    def find(self, devices: Mapping[str, bool], cells: Mapping[str, str | None] | None = None) -> None:
+        """Take devices that were found since the press, and whether each has a stop.
+
+        Args:
+            cells: of each; None for one that states none, and reads no scope.
+        """
+        with self._lock:
+            self._found |= devices
+            self._cells |= cells or {}
+
+    def widen(self) -> None:
+        """Have every robot answer: the stop has become one of all."""
+        with self._lock:
+            self.scope = EVERY_ROBOT
+
+    def take(self, report: RosterReport) -> bool:
+        """Take a controller's report in place of its last; False where nothing changed."""
+        with self._lock:
+            kept, most = (self._trusted, TRUSTED_MAX) if report.trusted else (self._unproven, UNPROVEN_MAX)
+            if kept.get(report.source) == report or (report.source not in kept and len(kept) >= most):
+                return False
+            kept[report.source] = report
+        return True
+
+    @property
+    def incomplete(self) -> bool:
+        """True while a controller misses more robots than it has named."""
+        with self._lock:
+            return any(each.more for each in self._trusted.values())
+
+    def awaited(self, answered: Mapping[str, Answer] | None = None) -> frozenset[str]:
+        """Return the robots for whose answer the stop goes on.
+
+        Args:
+            answered: what came so far.
+        """
+        answers = answered or {}
+        with self._lock:
+            roster = self._whole(answers.items())
+            heard = {name for name, stops in self._found.items() if stops} | answers.keys()
+            others = [row.name for row in roster.rows if row.name in heard and not counts(roster, row)]
+            return frozenset((*(row.name for row in roster.rows if counts(roster, row)), *others[:OTHERS_AWAITED]))
+
+    def outcome(self, report: StopReport, sending: Sending | None = None, problem: str = "") -> StopOutcome:
+        """Measure the report of the stop.
+
+        Args:
+            report: with every answer.
+            sending: how the stop was sent.
+            problem: why robots may be missing that were to be found.
+        """
+        sending = sending or Sending(report.link)
+        if report.widened:
+            self.widen()
+        report = replace(report, scope=self._asked, widened=self.scope != self._asked)
+        # The stop is over; a disk that hangs is given this long.
+        self._is_read.wait(READ_WITHIN_S)
+        with self._lock:
+            roster, found = self._whole(report.answered.items()), dict(self._found)
+            unproven = _missed_by(self._unproven, roster)
+            problems = [*roster.problems, *([problem] if problem else [])]
+            problems += [f"no robot was there for {self._asked}: every robot was stopped"] if report.widened else []
+            problems += [
+                f"{each.source} misses {each.more} more robots than it names"
+                for each in self._trusted.values()
+                if each.more
+            ]
+        rows = {row.name: row for row in roster.rows}
+        must = {row.name for row in roster.rows if counts(roster, row)} | report.alarms.keys()
+        no_stop = tuple(row.name for row in roster.rows if row.stoppable is False and row.name not in must)
+        told = {*rows} - must - {*no_stop}
+        counted, others = _part(report, must), _part(report, told)
+        elsewhere = self._elsewhere({*counted.silent})
+        reasons = {
+            name: reason_of(rows[name], sending, found=name in found, elsewhere=elsewhere)
+            for name in counted.silent
+            if name in rows
+        }
+        return StopOutcome(counted, others, roster, no_stop, unproven, reasons, tuple(problems), sending)
+
+    def _whole(self, answered: Collection[tuple[str, Answer]]) -> Roster:
+        """Return the roster with all that was named, found, reported and answered since."""
+        roster = self._roster
+        for each in self._trusted.values():
+            roster = roster.with_reported(each.rows, each.source)
+        rows = {row.name: row for row in roster.rows}
+        marked = {row.name: row for row in roster.exempt}
+        for name, stops in self._found.items():
+            row = rows.get(name)
+            if row is None:
+                # What is retired or off and only heard under its name stays so; its signed answer counts.
+                rows |= {} if name in marked else {name: RosterRow(name, Known.HEARD, stoppable=stops)}
+            elif row.stoppable is None:
+                rows[name] = replace(row, stoppable=stops)
+        for name, answer in answered:
+            if name not in rows and (name not in marked or answer.enrolled):
+                rows[name] = RosterRow(name, Known.ENROLLED if answer.enrolled else Known.HEARD, stoppable=True)
+            elif name in rows and rows[name].stoppable is False:
+                rows[name] = replace(rows[name], stoppable=True)
+        for name in self._named:
+            # As surely as if it were enrolled: the caller says so.
+            rows[name] = replace(rows.get(name, RosterRow(name, Known.ENROLLED)), known=Known.ENROLLED, stoppable=True)
+        kept = tuple(row for name, row in marked.items() if name not in rows)
+        inside = self._named | dict(answered).keys()
+        return replace(
+            roster, rows=tuple(row for row in rows.values() if row.name in inside or self._covers(row)), exempt=kept
+        )
+
+    def _covers(self, row: RosterRow) -> bool:
+        cell = self._cells.get(row.name, row.cell)
+        return self.scope.everything or cell is None or self.scope.covers(row.name, {cell} - {""})
+
+    def _elsewhere(self, silent: Collection[str]) -> dict[str, tuple[NetworkKey, float]]:
+        """Return where else robots of these names were heard last, and seconds since."""
+        if not silent:
+            return {}
+        heard: dict[str, tuple[NetworkKey, float]] = {}
+        for each in sightings().read()[0]:
+            if each.name in silent and not each.network.meets(self._network):
+                last = heard.get(each.name)
+                if last is None or each.age_s < last[1]:
+                    heard[each.name] = each.network, each.age_s
+        return heard
+
+    def remember(self, report: StopReport) -> None:
+        """Have this machine remember who answered; returns at once."""
+        store = sightings()
+        for name, answer in list(report.answered.items())[:REMEMBERED_MAX]:
+            store.note_answer(
+                self._network, name, Purpose.STOP_VERDICT, dict(answer.facts), {"estop_id": report.estop_id}
+            )
+
+
+def robots_known_at(network: Callable[[], NetworkKey]) -> Remembers:
+    """Return what says whether this machine's roster has a robot that a scope means.
+
+    A name that was only heard counts no more than for the exit code.
+    """
+
+    def remembers(scope: Scope) -> bool:
+        roster = Roster.of(network())
+        return any(scope.names(row.name, row.cell) for row in roster.rows if counts(roster, row))
+
+    return remembers
+
+
+def counts(roster: Roster, row: RosterRow) -> bool:
+    """Return True when the exit code depends on this row.
+
+    That a device has no stop is said by its presence, which is not signed: it exempts no robot that has shown a key.
+    """
+    if row.known is not Known.HEARD:
+        return True
+    return row.stoppable is not False and not roster.enrolled
+
+
+def _part(report: StopReport, names: Collection[str]) -> StopReport:
+    """Return the part of a report about these robots, silent ones included."""
+
+    def of(answers: Mapping[str, Answer]) -> dict[str, Answer]:
+        return {name: each for name, each in answers.items() if name in names}
+
+    alarms = {name: why for name, why in report.alarms.items() if name in names}
+    silent = tuple(sorted({*names} - report.answered.keys() - alarms.keys()))
+    return replace(
+        report,
+        stopped=of(report.stopped),
+        not_stopped=of(report.not_stopped),
+        refused=of(report.refused),
+        claimed=of(report.claimed),
+        silent=silent,
+        alarms=alarms,
+    )
+
+
+def _missed_by(reports: Mapping[str, RosterReport], roster: Roster) -> dict[str, str]:
+    """Return unknown names of unproven reports, and the reporter of each."""
+    known = {row.name for row in (*roster.rows, *roster.exempt)}
+    return {row.name: each.source for each in reports.values() for row in each.rows if row.name not in known}
+
+
+def _others(outcome: StopOutcome) -> dict[str, Any]:
+    """Return the count of names that do not alter the exit code, and a few of them."""
+    others = outcome.others
+    moving = sorted({**others.not_stopped, **others.refused})
+    names = [*moving, *others.silent, *sorted(others.claimed), *sorted(others.stopped)]
+    return {
+        "count": len(names),
+        "stopped": len(others.stopped),
+        "not_stopped": len(moving),
+        "silent": len(others.silent),
+        "claimed": len(others.claimed),
+        "unproven": len(outcome.unproven),
+        "names": names[:NAMED_MAX],
+    }
