@@ -282,7 +282,6 @@ class StopRoster:
         return [pid for run, pid in row.processes if run not in runs]
 
         """Return the run ids in answers that the robot's key has signed; "" where none is."""
-        """Return the run ids in answers that the robot's key has signed, "" for none stated."""
         if self._network.kind != DEVICE_CONNECT or not answer.facts:
             return frozenset(answer.runs or ("",))
         if name not in self._keys:
