@@ -1,4 +1,4 @@
-.PHONY: help demo dashboard soak test test-all lint bench serve api system venv clean mcp bridge real-arm real-arm-next lerobot lerobot-next dds-security models
+.PHONY: help demo dashboard soak test test-all lint bench serve api system venv clean mcp bridge real-arm real-arm-test real-arm-next lerobot lerobot-next dds-security models
 .DEFAULT_GOAL := help
 VENV := .venv
 BIN := $(VENV)/bin
@@ -13,7 +13,7 @@ WORKERS := --numprocesses 4 --dist loadfile
 GL_PACKAGES := libegl1 libgl1 libgl1-mesa-dri libosmesa6
 
 help:  ## Show these targets
-	@grep -E '^[a-z-]+:.*##' Makefile | sed 's/:.*##/\t/' | expand -t 12
+	@grep -E '^[a-z-]+:.*##' Makefile | sed 's/:.*##/\t/' | expand -t 16
 
 venv:  ## What tests, examples and every extra but bridge and lerobot need, in .venv
 	@./scripts/venv.sh $(VENV) requirements/dev.lock
@@ -66,11 +66,13 @@ dds-security:  ## DDS Security on a Cyclone DDS that has it, in .venv-dds-securi
 	@./scripts/dds-security.sh
 	@./scripts/tests.sh $(DDS_SECURITY)/python $(DDS_TESTS) $(ARGS)
 
-real-arm:  ## LeRobot's own SO-100/SO-101 driver without torch, in .venv-lerobot, and its tests
+real-arm:  ## LeRobot's own SO-100/SO-101 driver without torch, in .venv-lerobot
 	@./scripts/real-arm.sh
+
+real-arm-test: real-arm  ## The tests of a real arm, on emulated servos
 	@./scripts/tests.sh $(REAL_ARM)/python tests/integration/hardware $(ARGS)
 
-models:  ## The models of four other projects in a world of ours, in .venv-models, and their test
+models:  ## The models of eight other projects in a world of ours, in .venv-models, and their test
 	@./scripts/models.sh
 	@./scripts/tests.sh $(MODELS)/python tests/integration/simulation $(ARGS)
 

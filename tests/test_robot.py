@@ -141,3 +141,11 @@ def test_every_public_name_exists_and_no_other() -> None:
     assert dir(strands_robots) == sorted(strands_robots.__all__)
     with pytest.raises(AttributeError, match="no attribute 'Robots'"):
         _ = strands_robots.Robots
+
+
+def test_tip_of_a_model_is_the_site_or_body_that_the_caller_names() -> None:
+    robot = Robot("so100", tip="wrist")
+    assert robot.body().parts.tip == "so100/tip"
+    robot.cleanup()
+    with pytest.raises(ValidationError, match=r"tip must be a site or a body of .*gripper_tip, .*, not 'claw'"):
+        Robot("so100", tip="claw")

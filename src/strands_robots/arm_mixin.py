@@ -5,9 +5,11 @@ from __future__ import annotations
 import functools
 import itertools
 import math
+import threading
+import time
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, ParamSpec
 
@@ -16,20 +18,27 @@ from strands_robots.envelope import Envelope, error, success
 from strands_robots.policies.rollout import Body, Rollout, RolloutObservers
 from strands_robots.recording.cameras import frames_of
 from strands_robots.safety.gate import Permit, answered
+from strands_robots.safety.stop_log import stop_logger
 from strands_robots.utils import WAIT_S as WAIT_S  # noqa: PLC0414 - part of what callers of the motions import
 from strands_robots.utils import ValidationError, choice, identifier, missing_extra, number, shown
 
 if TYPE_CHECKING:  # numpy and MuJoCo are loaded with the first motion
     from strands_robots.kinematics.arm import Arm, ArmState
     from strands_robots.kinematics.detector import ObjectDetector
-    from strands_robots.kinematics.grasp import Held, SeenObject
     from strands_robots.kinematics.motion import Motion
     from strands_robots.kinematics.moves import Start
+    from strands_robots.kinematics.objects import Held, SeenObject
+    from strands_robots.kinematics.sight import Sight
+
+logger = stop_logger(__name__)
 
 P = ParamSpec("P")
 
 FRESH_S = 0.02
 """Greatest age of joints that are not read again, so that a pose takes no turn on the bus from a running motion."""
+
+PLAN_S = 2.0
+"""Longest search for a way around objects."""
 
 HOME = "home"
 """Place that every arm has: the home pose of its model."""
@@ -46,12 +55,28 @@ class ArmTask:
 
     Attributes:
         outcome: how it ended, once it was asked for; it stays as it was then.
+        sight: the objects before and after it; None where none can be seen.
+        looked: set once the objects were looked at after it.
     """
 
     task_id: str
     rollout: Rollout
     motion: Motion
     outcome: dict[str, Any] | None = None
+    sight: Sight | None = None
+    looked: threading.Event = field(default_factory=threading.Event)
+
+    @property
+    def running(self) -> bool:
+        """True until the motion has ended and its end was looked at."""
+        return self.rollout.running or (self.sight is not None and not self.looked.is_set())
+
+    def join(self, seconds: float) -> None:
+        """Wait for the end and the look at it."""
+        until = time.monotonic() + seconds
+        self.rollout.join(seconds)
+        if self.sight is not None:
+            self.looked.wait(max(0.0, until - time.monotonic()))
 
 
 def motion_rollout(body: Body, motion: Motion, permit: Permit, hz: float, observers: RolloutObservers) -> Rollout:
@@ -96,6 +121,9 @@ class ArmMixin:
     detector: ObjectDetector | None = None
     """Sees the objects of a real robot; a simulation knows its own."""
 
+    knows_objects = False
+    """True where :meth:`objects` costs no picture, so that every motion may ask it."""
+
     @abstractmethod
     def body(self, robot_name: str | None = None) -> Body:
         """Return the body of that name, or the first; raises :class:`ValidationError`."""
@@ -123,8 +151,11 @@ class ArmMixin:
         return detected(self.detector, {} if frames is None else frames())
 
     @abstractmethod
-    def start_motion(self, robot_name: str, verb: str, plan: Callable[[float], Motion]) -> Rollout:
-        """Plan with the control rate (Hz) and start, once the body is found free."""
+    def start_motion(self, robot_name: str, verb: str, plan: Callable[[float, Permit], Motion]) -> Rollout:
+        """Plan with the control rate (Hz) and start, once the body is found free.
+
+        The plan's search ends when its permit is void.
+        """
 
     @planned
     def arm_pose(self, robot_name: str = "") -> Envelope:
@@ -160,12 +191,20 @@ class ArmMixin:
 
     @planned
     def move_joints(
-        self, joints: Mapping[str, float], speed: float = 0.5, wait: bool = True, robot_name: str = ""
+        self,
+        joints: Mapping[str, float],
+        speed: float = 0.5,
+        wait: bool = True,
+        robot_name: str = "",
+        *,
+        around: bool = True,
     ) -> Envelope:
         """Move joints to positions in degrees, by name; the others stay."""
         from strands_robots.kinematics import moves  # noqa: PLC0415 - loaded with the first motion
 
-        return self._move("moveJoints", partial(moves.move_joints, degrees=joints), speed, wait, robot_name, whole=True)
+        return self._move(
+            "moveJoints", partial(moves.move_joints, degrees=joints), speed, wait, robot_name, whole=True, around=around
+        )
 
     @planned
     def move_to(
@@ -178,12 +217,13 @@ class ArmMixin:
         speed: float = 0.5,
         wait: bool = True,
         robot_name: str = "",
+        around: bool = True,
     ) -> Envelope:
         """Move the tip to a point; ``approach`` is the steepest reachable by default."""
         from strands_robots.kinematics import moves  # noqa: PLC0415 - loaded with the first motion
 
         plan = partial(moves.move_to, position=_vector(x, y, z), approach=approach)
-        return self._move("moveTo", plan, speed, wait, robot_name)
+        return self._move("moveTo", plan, speed, wait, robot_name, around=around)
 
     @planned
     def move_by(
@@ -197,6 +237,7 @@ class ArmMixin:
         speed: float = 0.5,
         wait: bool = True,
         robot_name: str = "",
+        around: bool = True,
     ) -> Envelope:
         """Move the tip on a straight line, by an offset or a distance in a direction."""
         from strands_robots.kinematics import moves  # noqa: PLC0415 - loaded with the first motion
@@ -208,7 +249,7 @@ class ArmMixin:
             offset = distance * _vector(*moves.DIRECTIONS[choice("direction", direction, tuple(moves.DIRECTIONS))])
         if not offset.any():
             raise ValidationError("moveBy needs dx, dy or dz, or a direction.")
-        return self._move("moveBy", partial(moves.move_by, offset=offset), speed, wait, robot_name)
+        return self._move("moveBy", partial(moves.move_by, offset=offset), speed, wait, robot_name, around=around)
 
     @planned
     def set_gripper(self, opening: float, wait: bool = True, robot_name: str = "") -> Envelope:
@@ -247,27 +288,32 @@ class ArmMixin:
         speed: float = 0.5,
         wait: bool = True,
         robot_name: str = "",
+        around: bool = True,
     ) -> Envelope:
         """Pick up an object by its name, or one of a width at a point."""
-        from strands_robots.kinematics import grasp  # noqa: PLC0415 - loaded with the first motion
+        from strands_robots.kinematics import grasp, objects, sight  # noqa: PLC0415 - loaded with the first motion
 
-        body = self.body(robot_name)
+        body, seen = self.body(robot_name), self._seen(robot_name, "pick")
         if object:
-            target = self._object(object, body.name)
+            target = _of_name(object, self.objects(body.name) if seen is None else seen)
+            sight.require_uncovered(target, seen or ())
         elif x is None or y is None or z is None:
             raise ValidationError("pick needs object, or x, y and z.")
         else:
-            target = grasp.SeenObject("", _vector(x, y, z), math.radians(yaw), _vector(width, width, 2 * min(z, width)))
+            given, size = _vector(x, y, z), _vector(width, width, 2 * min(z, width))
+            target = objects.SeenObject(sight.nearest(given, seen or ()), given, math.radians(yaw), size)
         held: list[Held] = []
 
         def plan(start: Start) -> Motion:
             motion, grasped = grasp.pick(start, target, approach)
             held.append(grasped)
+            if looked is not None:
+                looked.wanted = grasped.centre(motion.end)
             return motion
 
-        return self._move(
-            "pick", plan, speed, wait, robot_name, started=lambda: self._held.update({body.name: held[-1]})
-        )
+        looked = None if seen is None else sight.Sight(seen, target.name, within_mm=sight.CARRIED_MM)
+        kept = lambda: self._held.update({body.name: held[-1]})  # noqa: E731 - one argument of the call below
+        return self._move("pick", plan, speed, wait, robot_name, started=kept, sight=looked, around=around)
 
     @planned
     def place(
@@ -281,11 +327,12 @@ class ArmMixin:
         speed: float = 0.5,
         wait: bool = True,
         robot_name: str = "",
+        around: bool = True,
     ) -> Envelope:
         """Put the held object down on the table at a point, or on another object."""
-        from strands_robots.kinematics import grasp  # noqa: PLC0415 - loaded with the first motion
+        from strands_robots.kinematics import grasp, sight  # noqa: PLC0415 - loaded with the first motion
 
-        body = self.body(robot_name)
+        body, seen = self.body(robot_name), self._seen(robot_name, "place")
         held = self._held.get(body.name)
         holding = self._holding(body.name, self.arm(robot_name))
         if held is None or holding is False:
@@ -295,17 +342,22 @@ class ArmMixin:
                 f"{body.name} was stopped, so what it holds is not known; setGripper with opening 0 tells."
             )
         if on:
-            under = self._object(on, body.name)
+            under = _of_name(on, self.objects(body.name) if seen is None else seen)
             position = under.position + _vector(0.0, 0.0, float(under.size[2]) / 2)
         elif x is None or y is None:
             raise ValidationError("place needs on, or x and y.")
         else:
             position = _vector(x, y, self.arm(robot_name).chain.table_z if z is None else z)
-        plan = partial(grasp.place, position=position, approach=approach, held=held)
-        return self._move("place", plan, speed, wait, robot_name)
+        sight.require_vacant(position, held, seen or (), on)
+        plan = partial(grasp.place, position=position, approach=approach, held=held, on=on)
+        stands = position + _vector(0.0, 0.0, held.below)
+        looked = None if seen is None else sight.Sight(seen, held.name, stands)
+        return self._move("place", plan, speed, wait, robot_name, sight=looked, around=around)
 
     @planned
-    def go_to(self, place: str, speed: float = 0.5, wait: bool = True, robot_name: str = "") -> Envelope:
+    def go_to(
+        self, place: str, speed: float = 0.5, wait: bool = True, robot_name: str = "", *, around: bool = True
+    ) -> Envelope:
         """Move to the joints of a saved place, or to ``home``."""
         from strands_robots.kinematics import moves  # noqa: PLC0415 - loaded with the first motion
 
@@ -316,7 +368,7 @@ class ArmMixin:
         if name not in places:
             raise ValidationError(f"place must be one of {', '.join(places)}, not {shown(name)}.")
         plan = partial(moves.go_to, place=name, degrees=places[name])
-        return self._move("goTo", plan, speed, wait, robot_name, whole=True)
+        return self._move("goTo", plan, speed, wait, robot_name, whole=True, around=around)
 
     @planned
     def save_place(self, place: str, robot_name: str = "") -> Envelope:
@@ -362,7 +414,7 @@ class ArmMixin:
         if task is None:
             known = ", ".join(each.task_id for each in self._recent) or "none"
             raise ValidationError(f"task_id must be a motion of this robot ({known}), not {shown(task_id)}.")
-        task.rollout.join(number("seconds", seconds, low=0, high=WAIT_S))
+        task.join(number("seconds", seconds, low=0, high=WAIT_S))
         return self._result(task)
 
     def outcome_of(self, rollout: Rollout | None) -> dict[str, Any] | None:
@@ -374,7 +426,8 @@ class ArmMixin:
             return None
         task = self._tasks.get(rollout.robot)
         if task is not None and task.rollout is rollout:
-            return self._outcome(task)
+            outcome = self._outcome(task)
+            return None if outcome["task_status"] in RUNNING else outcome
         why = rollout.error or ("it is done" if rollout.state == "completed" else "it was stopped")
         return {
             "task_status": rollout.state,
@@ -405,12 +458,20 @@ class ArmMixin:
     def _task_numbers(self) -> itertools.count[int]:
         return itertools.count(1)
 
-    def _object(self, name: str, robot_name: str) -> SeenObject:
-        known = {each.name: each for each in self.objects(robot_name)}
-        if name not in known:
-            known_names = ", ".join(known) or "those in getObjects, which sees none"
-            raise ValidationError(f"object must be one of {known_names}, not {shown(name)}.")
-        return known[name]
+    def _seen(self, robot_name: str, verb: str) -> list[SeenObject] | None:
+        """Return the objects before a motion; None where they are not looked for."""
+        asked = self.knows_objects or (self.detector is not None and verb in ("pick", "place"))
+        return self.objects(robot_name) if asked else None
+
+    def _look(self, task: ArmTask, sight: Sight) -> None:
+        """Wait for the end of a motion, then look at the objects."""
+        task.rollout.join()
+        try:
+            sight.after = self.objects(task.rollout.robot)
+        except ValidationError as exc:
+            logger.warning("The objects after %s of %s are not known: %s", task.task_id, task.rollout.robot, exc)
+        finally:
+            task.looked.set()
 
     def _move(
         self,
@@ -422,27 +483,41 @@ class ArmMixin:
         *,
         whole: bool = False,
         started: Callable[[], object] = lambda: None,
+        sight: Sight | None = None,
+        around: bool = False,
     ) -> Envelope:
         from strands_robots.kinematics.moves import Start  # noqa: PLC0415 - loaded with the first motion
+        from strands_robots.kinematics.sight import Sight  # noqa: PLC0415 - as above
 
         body, arm = self.body(robot_name), self.arm(robot_name)
         arm = arm.whole() if whole else arm
+        seen: Sequence[SeenObject] = () if sight is None else sight.before
+        if sight is None and (self.knows_objects or (around and self.detector is not None)):
+            seen = self.objects(robot_name)
+            sight = Sight(seen) if self.knows_objects else None
         planned: list[Motion] = []
 
-        def planned_at(hz: float) -> Motion:
-            state = arm.state(_observed(body)[1]).told(arm.told(self.targets(body.name)))
-            motion = plan(Start(arm, state, hz, speed))
+        def planned_at(hz: float, permit: Permit) -> Motion:
+            observed = arm.state(_observed(body)[1])
+            state = observed.told(arm.told(self.targets(body.name)))
+            held = self._held.get(body.name) if self._holding(body.name, arm, observed) else None
+            until = time.monotonic() + PLAN_S
+            going = lambda: permit.valid and time.monotonic() < until  # noqa: E731 - one argument of the next call
+            motion = plan(Start(arm, state, hz, speed, seen if around else (), held, going))
             motion.clock = getattr(body, "clock", motion.clock)
+            motion.stall_lag = getattr(body, "stall_lag", motion.stall_lag)
             planned.append(motion)
             return motion
 
         rollout = self.start_motion(body.name, verb, planned_at)
-        task = ArmTask(f"{verb}-{next(self._task_numbers)}", rollout, planned[-1])
+        task = ArmTask(f"{verb}-{next(self._task_numbers)}", rollout, planned[-1], sight=sight)
         self._tasks[body.name] = task
         self._recent[:] = [*self._recent[-15:], task]
         started()
+        if sight is not None:
+            threading.Thread(target=self._look, args=(task, sight), name=f"look-{body.name}", daemon=True).start()
         if wait:
-            rollout.join(WAIT_S)
+            task.join(WAIT_S)
         return self._result(task)
 
     def _result(self, task: ArmTask) -> Envelope:
@@ -454,25 +529,31 @@ class ArmMixin:
 
     def _outcome(self, task: ArmTask) -> dict[str, Any]:
         """Return what was asked, what was reached, and why the motion ended."""
-        if task.rollout.running:
+        if not task.rollout.running and task.sight is not None and self.knows_objects and not task.looked.is_set():
+            self._look(task, task.sight)
+        if task.running:
             return self._measured(task, running=True)
         if task.outcome is None:
             task.outcome = self._measured(task, running=False)
         return task.outcome
 
     def _measured(self, task: ArmTask, *, running: bool) -> dict[str, Any]:
-        rollout, motion = task.rollout, task.motion
+        rollout, motion, sight = task.rollout, task.motion, task.sight
         state = rollout.state
         reached, error_mm = self._reached(motion)
         why = "it is under way"
         holding = None if running else self._holding(rollout.robot, motion.arm, motion.state)
         if not running:
-            why = rollout.error or "it was stopped"
+            why = motion.contact or rollout.error or "it was stopped"
             if state == "completed":
                 problem = (
-                    motion.problem(error_mm, holding) if motion.finished else "its time was over before it was done"
+                    motion.problem(error_mm, holding) or (sight.problem() if sight is not None else "")
+                    if motion.finished
+                    else "its time was over before it was done"
                 )
                 state, why = ("error", problem) if problem else (state, "it is done")
+            if sight is not None and sight.moved:
+                why += f"; {sight.remark()}"
         return {
             "task_id": task.task_id,
             "verb": motion.verb,
@@ -481,6 +562,7 @@ class ArmMixin:
             "reached": reached,
             "error_mm": error_mm,
             "holding": holding,
+            **(sight.row() if sight is not None else {}),
             "duration": round(rollout.elapsed_s, 3),
             "why": why,
         }
@@ -526,6 +608,14 @@ def _observed(body: Body) -> tuple[float, Mapping[str, float]]:
         return 0.0, body.get_joints()
     except OSError as exc:
         raise ValidationError(f"the joints of {body.name} could not be read: {exc}") from exc
+
+
+def _of_name(name: str, objects: Iterable[SeenObject]) -> SeenObject:
+    known = {each.name: each for each in objects}
+    if name not in known:
+        known_names = ", ".join(known) or "those in getObjects, which sees none"
+        raise ValidationError(f"object must be one of {known_names}, not {shown(name)}.")
+    return known[name]
 
 
 def _vector(x: float, y: float, z: float) -> Any:

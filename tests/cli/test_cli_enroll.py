@@ -10,12 +10,14 @@ import pytest
 from tests.cli.conftest import Run, connect
 from tests.cli.test_cli_safety_controller import FakeController, drawn
 
+from strands_robots.audit import read_audit_log
 from strands_robots.cli.output import Exit
-from strands_robots.cli.resume import LockoutReport
+from strands_robots.cli.resume import LockoutReport, operator
 from strands_robots.cli.safety_controller import FleetScreen, StopButton
 from strands_robots.cli.stop_report import exit_code, report_rows, style_of, summary
 from strands_robots.device_connect.backends import loopback_config
 from strands_robots.device_connect.client import Peer
+from strands_robots.device_connect.enrollment import network_of
 from strands_robots.envelope import Envelope, success
 from strands_robots.safety import statements
 from strands_robots.safety.answers import Answer
@@ -262,3 +264,83 @@ def test_text_that_is_no_key_enrolls_no_console(run: Run) -> None:
     assert result.exit_code == 1
     assert "keys console" in result.stderr and "laptop" in result.stderr
     assert enrolled_consoles().load() == {}
+
+
+def test_an_enrolled_robot_has_its_network(run: Run, fleet: SigningFleet) -> None:
+    run("enroll")
+    (network,) = EnrolledKeys().robots()["arm-1"].networks
+    assert network == network_of(fleet.link)
+    listed = json.loads(run("enroll", "--list", "--json").stdout)["robots"]["arm-1"]
+    assert (listed["networks"], listed["exempt"]) == ([network.text], None)
+    assert "must answer" in run("enroll", "--list").stdout
+
+
+@pytest.mark.parametrize("state", ["retired", "off"])
+def test_an_exemption_has_a_name_and_a_reason_and_is_audited(run: Run, fleet: SigningFleet, state: str) -> None:
+    run("enroll")
+    flag = "--retire" if state == "retired" else "--off"
+    result = run("enroll", flag, "arm-1", "--reason", "moved house")
+    assert result.exit_code == 0, result.output
+    assert f"arm-1 is {state}: every stop prints that" in result.stdout
+    exempt = json.loads(run("enroll", "--list", "--json").stdout)["robots"]["arm-1"]["exempt"]
+    assert (exempt["state"], exempt["by"], exempt["reason"]) == (state, operator(), "moved house")
+    record = read_audit_log()[-1]
+    assert (record["event"], record["peer_id"]) == (f"enrolment_{state}", "arm-1")
+    assert record["payload"]["who"] == operator() and record["payload"]["reason"] == "moved house"
+    # It was asked and answered signed: it must answer again.
+    assert run("enroll").exit_code == 0
+    assert EnrolledKeys().robots()["arm-1"].exemption is None
+    assert read_audit_log()[-1]["event"] == "exemption_undone"
+
+
+def test_an_enrolment_is_undone(run: Run, fleet: SigningFleet) -> None:
+    run("enroll")
+    assert run("enroll", "--forget", "arm-1").exit_code == 0
+    assert EnrolledKeys().load() == {}
+    assert read_audit_log()[-1]["event"] == "enrolment_forgotten"
+    assert "No robot is enrolled" in run("enroll", "--list").stdout
+
+
+@pytest.mark.parametrize("flag", ["--retire", "--off", "--forget"])
+def test_a_robot_that_is_not_enrolled_is_named(run: Run, fleet: SigningFleet, flag: str) -> None:
+    run("enroll")
+    result = run("enroll", flag, "arm-7")
+    assert result.exit_code == 1
+    assert "'arm-7' is not enrolled. Enrolled: arm-1." in result.stderr
+
+
+def test_a_robot_of_another_tenant_is_exempted_by_its_tenant(run: Run) -> None:
+    EnrolledKeys().enroll({"fleet.arm-1": b"1" * 32, "arm-1": b"2" * 32})
+    assert run("enroll", "--off", "arm-1", "--tenant", "fleet").exit_code == 0
+    robots = EnrolledKeys().robots()
+    assert robots["fleet.arm-1"].exemption is not None
+    assert robots["arm-1"].exemption is None
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--retire", "arm-1", "--off", "arm-1"), "one at a time"),
+        (("--retire", "arm-1", "--list"), "go with no other"),
+        (("--forget", "arm-1", "arm-2"), "go with no other"),
+        (("--forget", "arm-1", "--reason", "x"), "--reason goes with"),
+        (("--reason", "x"), "--reason goes with"),
+        (("--off", "arm-1", "--reason", "x" * 201), "--reason"),
+        (("--off", "arm-1", "--reason", "a\nb"), "--reason"),
+    ],
+)
+def test_a_change_that_says_two_things_is_refused(run: Run, arguments: tuple[str, ...], said: str) -> None:
+    EnrolledKeys().enroll({"arm-1": b"1" * 32})
+    result = run("enroll", *arguments)
+    assert result.exit_code == 2, result.output
+    assert said in result.stderr
+    assert EnrolledKeys().robots()["arm-1"].exemption is None
+
+
+def test_a_file_that_cannot_be_used_changes_nothing(run: Run) -> None:
+    EnrolledKeys().enroll({"arm-1": b"1" * 32})
+    EnrolledKeys().path.chmod(0o666)
+    for arguments in (("--list",), ("--retire", "arm-1")):
+        result = run("enroll", *arguments)
+        assert result.exit_code == 1
+        assert "enrolled.json" in result.stderr

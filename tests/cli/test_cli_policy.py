@@ -19,7 +19,7 @@ JOINTS = ["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_ro
 @pytest.fixture
 def file(tmp_path: Path) -> Path:
     write_checkpoint(tmp_path / "act", state=6, action=6, images={})
-    write_dataset(tmp_path / "data", JOINTS, low=-90, high=90)
+    write_dataset(tmp_path / "data", JOINTS, low=[*[-90.0] * 5, -10.0], high=[90.0] * 6)
     path = tmp_path / "policies.toml"
     lines = [
         "[pick]",

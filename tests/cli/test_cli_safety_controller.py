@@ -26,6 +26,7 @@ class FakeController:
 
     controller_id = "safety-1"
     link_up = True
+    network = None
 
     def __init__(self) -> None:
         self.ids: list[str] = []

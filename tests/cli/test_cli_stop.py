@@ -26,7 +26,7 @@ from strands_robots.envelope import Envelope, error, success
 from strands_robots.safety.answers import Answer
 from strands_robots.safety.controller import Progress, StopReport
 from strands_robots.safety.silence import Sending
-from strands_robots.tools.networks import stop_outcome
+from strands_robots.tools.roster_verdict import stop_outcome
 
 
 def answer(name: str, stopped: bool | None = True, ms: float = 3.0, why: str = "") -> Answer:

@@ -12,6 +12,7 @@ from strands_robots.dashboard.emergency import FleetStop, verdict_of
 from strands_robots.dashboard.fleet_model import FleetModel
 from strands_robots.safety.answers import Answer
 from strands_robots.safety.controller import Progress, StopReport
+from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.safety.statements import Proof
 
 
@@ -41,6 +42,7 @@ class Controller:
     def __init__(self, report: StopReport) -> None:
         self.link_up = True
         self.controller_id = "dashboard"
+        self.network = None
         self.report = report
         self.expected: Collection[str] = ()
 
@@ -134,3 +136,39 @@ def test_page_is_told_that_it_cannot_stop_when_the_link_is_down_or_all_robots_ar
     controller.link_up = True
     model.clock = lambda: 10e9
     assert stop.state()["can_stop"] is False
+
+
+class ScopedController(Controller):
+    """Notes the scope of each stop."""
+
+    network = None
+
+    def __init__(self, report: StopReport) -> None:
+        super().__init__(report)
+        self.scopes: list[Scope] = []
+
+    def stop(  # type: ignore[override]
+        self, expected: Collection[str], reason: str, *, estop_id: str, on_progress: Any, scope: Scope = EVERY_ROBOT
+    ) -> StopReport:
+        self.scopes.append(scope)
+        return super().stop(expected, reason, estop_id=estop_id, on_progress=on_progress)
+
+
+def test_button_of_one_robot_stops_it_alone_and_shows_no_other_as_silent() -> None:
+    model = FleetModel()
+    controller = ScopedController(StopReport("e" * 32, {"arm-1": answer()}, {}, {}, (), True, 9.0))
+    for name in ("arm-1", "arm-2"):
+        model.update("dc", name, expected=True)
+    stop = FleetStop(model, [Fed(controller)])  # type: ignore[list-item]
+    stop.press_one("dc", "arm-1")
+    eventually(lambda: controller.scopes and not stop.running)
+    stop.refresh()
+    assert controller.scopes == [Scope.named(["arm-1"])]
+    rows = {row.id: row.stop for row in model.rows()}
+    assert rows["arm-1"] is not None and rows["arm-1"]["state"] == "stopped"
+    assert rows["arm-2"] is None
+    # What is no robot's button is that of all.
+    stop.press_one("mesh", "arm-1")
+    stop.press_one("dc", "arm 1")
+    eventually(lambda: len(controller.scopes) >= 2 and not stop.running)
+    assert set(controller.scopes[1:]) == {EVERY_ROBOT}

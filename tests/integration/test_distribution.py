@@ -18,8 +18,10 @@ from email.message import Message
 from email.parser import HeaderParser
 from importlib import metadata
 from pathlib import Path
+from urllib.request import urlopen
 
 import pytest
+from fixtures.command_line import Machine
 from packaging.requirements import Requirement
 
 from strands_robots import __version__, settings
@@ -157,3 +159,42 @@ def test_the_demo_runs_from_the_installed_wheel(installed: Path, tmp_path: Path)
     assert report["status"] == "success"
     assert all(step["ok"] for step in report["steps"])
     assert (tmp_path / "demo-output" / "arm-path.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_page_starts_from_the_installed_wheel(installed: Path, tmp_path: Path) -> None:
+    machine = Machine(tmp_path / "state")
+    command = [installed / "strands-robots", "dashboard", "--no-browser", "--port", "0", "--json"]
+    page = subprocess.Popen(command, cwd=tmp_path, env=machine.environment, stdout=subprocess.PIPE, text=True)
+    try:
+        assert page.stdout is not None
+        url = json.loads(page.stdout.readline())["url"]
+        with urlopen(url, timeout=20) as answer:
+            assert b"<title>" in answer.read()
+    finally:
+        page.terminate()
+        page.communicate(timeout=60)
+
+
+def test_the_mcp_server_starts_from_the_installed_wheel(installed: Path, tmp_path: Path) -> None:
+    machine = Machine(tmp_path / "state")
+    client = {"name": "test", "version": "1"}
+    params = {"protocolVersion": "2025-06-18", "capabilities": {}, "clientInfo": client}
+    question = {"jsonrpc": "2.0", "id": 1, "method": "initialize", "params": params}
+    server = subprocess.Popen(
+        [installed / "strands-robots", "mcp"],
+        cwd=tmp_path,
+        env=machine.environment,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert server.stdin is not None
+        assert server.stdout is not None
+        server.stdin.write(json.dumps(question) + "\n")
+        server.stdin.flush()
+        assert json.loads(server.stdout.readline())["result"]["serverInfo"]
+    finally:
+        server.kill()
+        server.communicate()

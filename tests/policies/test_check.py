@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fixtures.checkpoints import write_checkpoint, write_dataset, write_safetensors
+from fixtures.checkpoints import statistics, write_checkpoint, write_dataset, write_safetensors
 
 from strands_robots.policies.base import numbers
-from strands_robots.policies.check import PolicyCheck, RobotFacts, check_policy, statements_of
+from strands_robots.policies.check import PolicyCheck, check_policy, statements_of
+from strands_robots.policies.check_rows import RobotFacts
 from strands_robots.policies.profiles import load_profiles
 
 KEYS = ["pan.pos", "lift.pos", "grip.pos"]
@@ -203,8 +204,8 @@ REFUSED: dict[str, tuple[Callable[[Scene], None], str]] = {
         both(without("chunk"), entry(horizon=21)),
         "horizon",
     ),
-    "statistics of the action are absent": (made(statistics=("observation.state",)), "statistics of action"),
-    "statistics of the state are absent": (made(statistics=("action",)), "statistics of observation.state"),
+    "statistics of the action are absent": (made(after={"observation.state": statistics()}), "statistics of action"),
+    "statistics of the state are absent": (made(before={"action": statistics()}), "statistics of observation.state"),
     "the processors are absent": (remove("policy_preprocessor.json"), "statistics of action"),
     "the weights are absent": (remove("model.safetensors"), "checkpoint"),
     "the weights are cut off": (damaged(cut), "checkpoint"),

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from strands_robots.safety.answers import Answers, Received
+from strands_robots.safety.answers import RUNS_MAX, Answers, Received
 from strands_robots.safety.identity import ROBOTS, KeyFile, SigningIdentity
 from strands_robots.safety.statements import Proof, Purpose, signed
 
@@ -125,3 +125,29 @@ def test_without_the_robots_clock_no_delay_is_stated(clock: dict[str, Any]) -> N
     book = answers()
     book.take("arm-1", verdict(True, **clock))
     assert book.by_robot["arm-1"].delay_s is None
+
+
+def test_a_process_that_moves_on_outweighs_another_one_of_its_name(robot: SigningIdentity) -> None:
+    for order in itertools.permutations([verdict(True, robot, run="a"), verdict(False, robot, run="b")]):
+        book = answers(robot)
+        assert outcome(book, *order) == (False, False)
+        assert {run: each.stopped for run, each in book.by_robot["arm-1"].runs.items()} == {"a": True, "b": False}
+
+
+def test_a_process_that_stops_after_all_is_one_that_stopped(robot: SigningIdentity) -> None:
+    book = answers(robot)
+    assert outcome(book, verdict(False, robot, run="a"), verdict(True, robot, run="a")) == (True, False)
+
+
+def test_an_unsigned_answer_stands_for_no_process_of_an_enrolled_robot(robot: SigningIdentity) -> None:
+    book = answers(robot)
+    assert outcome(book, verdict(True, robot, run="a"), verdict(True, run="b")) == (True, False)
+    assert set(book.by_robot["arm-1"].runs) == {"a", ""}
+    assert book.by_robot["arm-1"].runs[""].claimed
+
+
+def test_made_up_processes_hide_no_answer_and_take_no_memory() -> None:
+    book = answers()
+    assert outcome(book, *(verdict(True, run=f"made-up {each}") for each in range(100))) == (True, False)
+    assert outcome(book, verdict(True, run="x" * 100), verdict(False, run="a")) == (False, False)
+    assert len(book.by_robot["arm-1"].runs) <= RUNS_MAX + 1

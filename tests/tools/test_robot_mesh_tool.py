@@ -17,7 +17,8 @@ from strands_robots.mesh.session import clear_peers
 from strands_robots.mesh.transport import zenoh_config
 from strands_robots.mesh.transport.zenoh_config import Posture
 from strands_robots.tools import networks, robot_mesh
-from strands_robots.tools.networks import DeviceConnect, NativeMesh, combined_verdict
+from strands_robots.tools.networks import DeviceConnect, NativeMesh
+from strands_robots.tools.roster_verdict import combined_verdict
 
 
 class FakeNetwork:
@@ -247,8 +248,11 @@ class TimedMesh:
     def peers(self) -> list[dict[str, Any]]:
         return [{"peer_id": name, "reachable": True} for name, at in self.arrivals.items() if at <= self.now]
 
-    def emergency_stop(self, signing_key: Any = None, *, estop_id: str = "") -> list[dict[str, Any]]:
+    def emergency_stop(
+        self, signing_key: Any = None, *, estop_id: str = "", on_answers: Callable[[list[Any]], None]
+    ) -> list[dict[str, Any]]:
         self.stops.append(self.now)
+        on_answers([])
         # One press is one stop, however often it is sent.
         self.ids.add(estop_id)
         assert len(self.ids) == 1
@@ -260,6 +264,16 @@ class TimedMesh:
 
     def sleep(self, seconds: float) -> None:
         self.now += seconds
+
+    @property
+    def peers_by_id(self) -> dict[str, dict[str, Any]]:
+        return {row["peer_id"]: row for row in self.peers}
+
+    def listen(self, topic: str, heard: object, name: str) -> bool:
+        return True
+
+    def unsubscribe(self, name: str) -> None:
+        """Nothing to undo."""
 
     def close(self) -> None:
         self.alive = False

@@ -32,6 +32,10 @@ def main() -> None:
         _leave(exit_.code)
 
 
+AUDIT_S = 1.0
+"""Seconds that the end of a command waits for its last record."""
+
+
 def _leave(code: object) -> NoReturn:
     """End the process after flushing all output.
 
@@ -41,10 +45,17 @@ def _leave(code: object) -> NoReturn:
     policies = sys.modules.get("strands_robots.policies.unfinished")
     if policies is not None:
         policies.name_unfinished()
+    sightings = sys.modules.get("strands_robots.safety.sightings")
+    if sightings is not None:
+        # What runs at an interpreter's end does not run here.
+        sightings.flush_sightings()
     logging.shutdown()
     for stream in (sys.stdout, sys.stderr):
         try:
             stream.flush()
         except BrokenPipeError:
             code = code or 1
+    audit = sys.modules.get("strands_robots.audit")
+    if audit is not None:
+        audit.flush_audit(AUDIT_S)
     os._exit(code if isinstance(code, int) else int(code is not None))

@@ -34,7 +34,7 @@ def enroll(
     network: Network,
     *,
     devices: Annotated[list[str] | None, typer.Argument(metavar="DEVICE...", help="Which; else all found.")] = None,
-    replace: Annotated[bool, typer.Option("--replace", help="Accept the new key of a robot set up anew.")] = False,
+    replace: Annotated[bool, typer.Option("--replace", help="Accept a robot's new key, or its new network.")] = False,
     console: Annotated[str, typer.Option(help="Let a console elsewhere move hardware: its `keys console`.")] = "",
     retire: Retire = "",
     off: Off = "",

@@ -73,7 +73,8 @@ def apply(screen: Screen, change: Change, tenant: str) -> None:
     file, who = EnrolledKeys(), operator()
     try:
         known = file.robots()
-        name = change.name if change.name in known else local_name(tenant, change.name)
+        own = local_name(tenant, change.name)
+        name = own if own in known else change.name
         if name not in known:
             there = f" Enrolled: {', '.join(sorted(known))}." if known else " No robot is enrolled."
             raise CliError(plain(f"{shown(change.name)} is not enrolled.{there}", 2000), robots={})

@@ -56,6 +56,10 @@ def check(
     show(screen, found)
     if not found.passed:
         raise CliError(f"{name} may not move {facts.name}: {len(found.failures)} of {len(found.rows)} rows fail.")
+    if found.unanswered:
+        screen.say(
+            f"{len(found.unanswered)} rows are unverified: no source states them. They keep nothing from moving."
+        )
 
 
 def bench(

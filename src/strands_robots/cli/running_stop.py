@@ -11,6 +11,7 @@ from strands_robots.cli.output import plain
 from strands_robots.safety.controller import Progress, SafetyController, StopReport
 from strands_robots.safety.orders import new_epoch
 from strands_robots.safety.roster_report import RosterReport
+from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.safety.stop_roster import StopOutcome, StopRoster
 
 if TYPE_CHECKING:
@@ -30,7 +31,14 @@ class RunningStop:
     """
 
     def __init__(
-        self, controller: SafetyController, named: list[str], reason: str, deadline_s: float, link: LinkConfig
+        self,
+        controller: SafetyController,
+        named: list[str],
+        reason: str,
+        deadline_s: float,
+        link: LinkConfig,
+        *,
+        scope: Scope = EVERY_ROBOT,
     ) -> None:
         from strands_robots.device_connect.enrollment import network_of  # noqa: PLC0415 - loaded when it is used
 
@@ -39,7 +47,8 @@ class RunningStop:
         self._deadline_s, self._link = deadline_s, link
         self._id = new_epoch()
         controller.press(self._id)
-        self._roster = StopRoster(network_of(link), named)
+        self._scope = scope
+        self._roster = StopRoster(network_of(link), named, scope)
         self._begun = threading.Event()
         self._looking = threading.Lock()
         self._missed = "" if named else "no list of them in time"
@@ -73,6 +82,7 @@ class RunningStop:
                 more=True,
                 on_progress=self._progress,
                 on_report=self._take_report,
+                scope=self._scope,
             )
         except BaseException as exc:  # noqa: BLE001 - raised again by the future
             self.report.set_exception(exc)
@@ -83,8 +93,13 @@ class RunningStop:
             self._begun.set()
 
     def _progress(self, progress: Progress) -> None:
+        widened = progress.widened and not (self.latest is not None and self.latest.widened)
         self.latest = progress
         self._begun.set()
+        if widened:
+            self._roster.widen()
+        if widened or self._roster.divided:
+            self._expect()
 
     def _read_roster(self) -> None:
         self._begun.wait()
@@ -100,8 +115,9 @@ class RunningStop:
         # The report of a stop that this completes is read after what this says.
         with self._looking:
             self._searching.discard(searched)
-            awaited = self._roster.awaited(self.latest.answered if self.latest else {})
-            more = bool(self._searching) or self._roster.incomplete
+            answered = self.latest.answered if self.latest else {}
+            awaited = self._roster.awaited(answered)
+            more = bool(self._searching) or self._roster.incomplete(answered)
             if self._controller.expect(self._id, awaited, more=more) and searched == "the network":
                 self._missed = missed
 
@@ -130,6 +146,9 @@ class RunningStop:
             if self.report.done():
                 return
             within = min(2.0, self._deadline_s * LOOKUP_SHARE)
-            self._roster.find({peer.id: peer.stop_verb is not None for peer in fleet.peers(within, thorough=True)})
+            peers = fleet.peers(within, thorough=True)
+            self._roster.find(
+                {peer.id: peer.stop_verb is not None for peer in peers}, {peer.id: peer.cell for peer in peers}
+            )
             stale = fleet.stale
         self._expect("the network", stale.rstrip("."))

@@ -26,11 +26,15 @@ from strands_robots.cli.mesh_controller import MeshController
 from strands_robots.cli.network import Network, mesh_peer
 from strands_robots.cli.output import CliError, Exit, Screen, captured_log, label, table
 from strands_robots.cli.resume import ask_robots, lockable_robots
-from strands_robots.cli.stop_report import LATE_MS, SLOW_MS, style_of, summary
+from strands_robots.cli.stop_report import LATE_MS, SLOW_MS, outcome_lines, style_of, summary
 from strands_robots.safety.answers import Answer
 from strands_robots.safety.controller import Progress, SafetyController, StopReport
 from strands_robots.safety.lockout import utc
 from strands_robots.safety.orders import new_epoch
+from strands_robots.safety.roster_search import RosterSearch
+from strands_robots.safety.scope import EVERY_ROBOT, Scope
+from strands_robots.safety.stop_roster import StopOutcome, StopRoster
+from strands_robots.tools.mesh_roster import stand_on_mesh
 from strands_robots.utils import device_id, number
 
 if TYPE_CHECKING:
@@ -88,20 +92,26 @@ def safety_controller(
         signer = None if key is None else signing_key(key, passphrase_file)
         with mesh_peer(None, source, "controller") as mesh:
             controls = MeshController(mesh, signer)
-            if every is not None:
-                controls.check_in_every(every)
-            _run(screen, controls, FleetScreen(controls, controls.reports, every), reason)
+            fleet = FleetScreen(controls, controls.reports, every)
+            with contextlib.closing(stand_on_mesh(mesh, signer, fleet.known)):
+                if every is not None:
+                    controls.check_in_every(every)
+                _run(screen, controls, fleet, reason)
         screen.say(f"{source} is off. The robots it stopped stay locked.")
         return
     link = network.link()
     signer = None if key is None else signing_key(key, passphrase_file)
     from strands_robots.device_connect import safety_controller as network_side  # noqa: PLC0415 - loaded when it is used
 
-    controller = network_side.safety_controller(source, link, signing_key=signer, require_signed=signer is not None)
+    controller = network_side.safety_controller(
+        source, link, signing_key=signer, require_signed=signer is not None, stands=True
+    )
     with contextlib.closing(controller):
-        if every is not None:
-            controller.check_in_every(every)
-        _run(screen, controller, FleetScreen(controller, link, every), reason)
+        fleet = FleetScreen(controller, link, every)
+        with contextlib.closing(network_side.stand(controller, link, fleet.known)):
+            if every is not None:
+                controller.check_in_every(every)
+            _run(screen, controller, fleet, reason)
     screen.say(f"{source} is off. The robots it stopped stay locked.")
 
 
@@ -109,11 +119,15 @@ def _run(screen: Screen, controller: SafetyController | MeshController, fleet: F
     from rich.live import Live  # noqa: PLC0415 - loaded when a screen is redrawn
 
     done = threading.Event()
-    button = StopButton(controller, fleet.expected, reason)
+    buttons = StopButtons(lambda scope: StopButton(controller, lambda: fleet.expected(scope), reason, scope))
 
     def pressed(key: str) -> None:
         if key == " ":
-            button.press()
+            buttons.press()
+        elif key in "jk":
+            fleet.choose(1 if key == "j" else -1)
+        elif key in "oc":
+            buttons.press(fleet.chosen_scope(cell=key == "c"))
         elif key in "qQ":
             done.set()
         elif key in "fF":
@@ -121,12 +135,12 @@ def _run(screen: Screen, controller: SafetyController | MeshController, fleet: F
 
     with captured_log() as lines, fleet.polling(), _keys(pressed, done.set):
         try:
-            with Live(fleet.draw(button, lines), console=screen.out, screen=True, auto_refresh=False) as live:
+            with Live(fleet.draw(buttons.latest, lines), console=screen.out, screen=True, auto_refresh=False) as live:
                 while not done.wait(DRAW_S):
-                    button.review()
-                    live.update(fleet.draw(button, lines), refresh=True)
+                    buttons.review()
+                    live.update(fleet.draw(buttons.latest, lines), refresh=True)
         finally:
-            button.close()
+            buttons.close()
 
 
 @contextmanager
@@ -166,14 +180,23 @@ class StopButton:
         controller: sends.
         expected: returns the robots that must answer; called at each press.
         reason: sent to the robots.
+        scope: the robots that it is for.
     """
 
     def __init__(
-        self, controller: SafetyController | MeshController, expected: Callable[[], Collection[str]], reason: str
+        self,
+        controller: SafetyController | MeshController,
+        expected: Callable[[], Collection[str]],
+        reason: str,
+        scope: Scope = EVERY_ROBOT,
     ) -> None:
         self.progress: Progress | None = None
         self.report: StopReport | None = None
+        self.outcome: StopOutcome | None = None
+        """The report measured by the roster; None before the first, or where the network has no roster."""
+        self._roster: StopRoster | None = None
         self._controller, self._expected, self._reason = controller, expected, reason
+        self._scope = scope
         self._guard = threading.Lock()
         self._id, self._running, self._last = "", False, float("-inf")
         self._closing = threading.Event()
@@ -203,9 +226,12 @@ class StopButton:
             if report is None or self._running:
                 return
         later = self._controller.review(report)
+        if later is report:
+            return
+        outcome = self._measured(self._roster, later)
         with self._guard:
-            if later is not report and report is self.report and not self._running:
-                self.report = later
+            if report is self.report and not self._running:
+                self.report, self.outcome = later, outcome
                 if progress is not None:
                     self.progress = replace(progress, answered=later.answered)
 
@@ -214,21 +240,81 @@ class StopButton:
         self._closing.set()
 
     def _stop(self, estop_id: str) -> None:
+        network = self._controller.network
+        search = None if network is None else RosterSearch(self._controller, estop_id, network, scope=self._scope)
+
         def note(progress: Progress) -> None:
             if estop_id == self._id:
                 self.progress = progress
+            if search is not None:
+                search.begin(progress)
 
+        recorded, scope = False, self._scope
         while True:
-            report = self._controller.stop(self._expected(), self._reason, estop_id=estop_id, on_progress=note)
-            unfinished = not report.link or bool(report.unanswered)
+            expected = self._expected()
+            options: dict[str, Any] = {} if search is None else {"more": not search.begun, "on_report": search.take}
+            options |= {} if scope.everything else {"scope": scope}
+            report = self._controller.stop(expected, self._reason, estop_id=estop_id, on_progress=note, **options)
+            scope = EVERY_ROBOT if report.widened else scope
+            roster = None if search is None else search.roster
+            outcome = self._measured(roster, report)
+            if outcome is not None and not recorded:
+                recorded = True
+                outcome.record(self._controller.controller_id)
+            # The roster's rows that no screen shows have had their time: a robot that is back asks by itself.
+            unfinished = not report.link or not {*expected}.isdisjoint(report.unanswered)
             with self._guard:
                 if estop_id != self._id:
                     return
+                self.outcome, self._roster = outcome, roster
                 self.report, self._running = report, unfinished and not self._closing.is_set()
                 if not self._running:
                     # A robot that was resumed meanwhile acts only on a stop with a new id.
                     self._id = "" if report.refused else self._id
                     return
+
+    def _measured(self, roster: StopRoster | None, report: StopReport) -> StopOutcome | None:
+        if roster is None:
+            return None
+        return roster.outcome(report, replace(self._controller.sending, left=report.link))
+
+
+class StopButtons:
+    """Stop button of all robots, and one for each robot or cell that was pressed.
+
+    Each press of another one is a stop of its own, so that none waits for another or narrows it.
+
+    Args:
+        make: makes the button of a scope.
+    """
+
+    def __init__(self, make: Callable[[Scope], StopButton]) -> None:
+        self._make = make
+        self.latest = make(EVERY_ROBOT)
+        """The button that was pressed last."""
+        self._buttons = {EVERY_ROBOT: self.latest}
+
+    def press(self, scope: Scope = EVERY_ROBOT) -> None:
+        """Stop the robots of a scope; returns at once."""
+        if scope not in self._buttons:
+            self._buttons = {**self._buttons, scope: self._make(scope)}
+        self.latest = self._buttons[scope]
+        self.latest.press()
+
+    @property
+    def running(self) -> bool:
+        """True while a stop waits for answers."""
+        return any(each.running for each in self._buttons.values())
+
+    def review(self) -> None:
+        """Take what robots have said since the stops ended."""
+        for each in self._buttons.values():
+            each.review()
+
+    def close(self) -> None:
+        """Give up stops that wait for the link."""
+        for each in self._buttons.values():
+            each.close()
 
 
 class FleetScreen:
@@ -245,6 +331,7 @@ class FleetScreen:
     ) -> None:
         self._controller, self._link, self._check_in_s = controller, link, check_in_s
         self._robots: dict[str, LockoutReport] = {}
+        self._chosen = ""
         self._beats: dict[str, float] = {}
         self._asked: dict[str, float] = {}
         self._unanswered: set[str] = set()
@@ -252,10 +339,34 @@ class FleetScreen:
         self._problem = "Looking for robots..."
         self._closed = threading.Event()
 
-    def expected(self) -> Collection[str]:
-        """Return the robots that must answer a stop: seen and not forgotten."""
+    def expected(self, scope: Scope = EVERY_ROBOT) -> Collection[str]:
+        """Return the robots that must answer a stop: seen, in its scope, not forgotten.
+
+        A robot that states no cell reads no scope, and stops whatever it is.
+        """
         # A stop asks for them: what each reports of itself is read anew.
         self._all_since = time.monotonic()
+        cells = {name: last.facts.get("cell") for name, last in self._robots.items()}
+        return tuple(
+            name for name, cell in cells.items() if not isinstance(cell, str) or scope.covers(name, {cell} - {""})
+        )
+
+    def choose(self, step: int) -> None:
+        """Choose the next robot of the table, or the one before."""
+        names = sorted(self._robots)
+        if names:
+            at = names.index(self._chosen) + step if self._chosen in names else min(step, 0)
+            self._chosen = names[at % len(names)]
+
+    def chosen_scope(self, *, cell: bool) -> Scope:
+        """Return the scope of the chosen robot, or of its cell; every robot without one."""
+        last = self._robots.get(self._chosen)
+        if last is None:
+            return EVERY_ROBOT
+        return Scope.read({"cell": last.facts.get("cell")}) if cell else Scope.named([last.name])
+
+    def known(self) -> Collection[str]:
+        """Return the robots that were seen and not forgotten."""
         return tuple(self._robots)
 
     def forget(self) -> None:
@@ -350,10 +461,14 @@ class FleetScreen:
         columns = ("robot", "lockout", "since, by whom", "last stop", "status", "last seen", "check-in")
         robots = sorted(self._robots.items())
         silent = self._unanswered
-        rows = (_row(name, last, self._seen_at(last), name in silent, answers.get(name)) for name, last in robots)
+        rows = (
+            _row(name, last, self._seen_at(last), name in silent, answers.get(name), chosen=name == self._chosen)
+            for name, last in robots
+        )
         return Group(
             label(head, "bold green" if up else "bold white on red"),
             label("SPACE stops everything    f forgets robots that are gone    q quits", "bold"),
+            label("j k choose a robot    o stops that one alone    c stops its cell, and robots without one"),
             table("", columns, rows),
             *([label(self._problem, "yellow")] if self._problem else []),
             _outcome(button),
@@ -365,7 +480,9 @@ def _epochs(report: LockoutReport) -> set[str]:
     return {each.epoch for each in report.lockouts}
 
 
-def _row(name: str, last: LockoutReport, seen_at: float, unanswered: bool, answer: Answer | None) -> tuple[Any, ...]:
+def _row(
+    name: str, last: LockoutReport, seen_at: float, unanswered: bool, answer: Answer | None, *, chosen: bool = False
+) -> tuple[Any, ...]:
     now, lockouts, trip_ms = time.monotonic(), last.lockouts, last.round_trip_ms
     age, report_age = now - seen_at, now - last.at
     locked = f"LOCKED x{len(lockouts)}" if len(lockouts) > 1 else "LOCKED"
@@ -373,10 +490,13 @@ def _row(name: str, last: LockoutReport, seen_at: float, unanswered: bool, answe
     seen = f"GONE, {age:.0f} s"
     if age < GONE_S:
         seen = f"beats, NO ANSWER for {report_age:.0f} s" if unanswered and old else f"{age:.0f} s ago"
+    cell = last.facts.get("cell")
+    place = f", {cell}" if isinstance(cell, str) and cell else "" if isinstance(cell, str) else ", stops always"
+    scope = f" for {lockouts[0].scope}" if lockouts and not lockouts[0].scope.everything else ""
     return (
-        name,
+        label(f"{'> ' if chosen else ''}{name}{place}", "reverse" if chosen else ""),
         label(locked + old, "bold red") if lockouts else label("free" + old),
-        f"{utc(lockouts[0].at)} {lockouts[0].source} {lockouts[0].reason}" if lockouts else "",
+        f"{utc(lockouts[0].at)} {lockouts[0].source}{scope} {lockouts[0].reason}" if lockouts else "",
         _stop_cell(answer),
         label(f"{trip_ms:.1f} ms", "red" if trip_ms > SLOW_MS else ""),
         label(seen, "" if seen.endswith("ago") else "bold red"),
@@ -415,7 +535,12 @@ def _outcome(button: StopButton) -> Text:
         return label(f"STOPPING{age}: {len(button.progress.answered)} answered{waiting}{link}", "bold red")
     if button.report is None:
         return label("")
-    report = button.report
-    silent_names = f" No answer: {', '.join(report.silent)}." if report.silent else ""
+    outcome = button.outcome
+    report = button.report if outcome is None else outcome.report
+    reasons = {} if outcome is None else outcome.reasons
+    missing = [f"{name}{f' ({reasons[name]})' if name in reasons else ''}" for name in report.silent]
+    silent_names = f" No answer: {', '.join(missing)}." if missing else ""
     alarms = " ".join(f" ALARM: {name}: {why}." for name, why in report.alarms.items())
-    return label(f"{summary(report)}{silent_names}{alarms}", "bold red" if alarms else style_of(report))
+    told = "" if outcome is None else f"\n{' '.join([outcome.sentence, *outcome_lines(outcome)])}"
+    doubtful = alarms or (outcome is not None and outcome.problems)
+    return label(f"{summary(report)}{silent_names}{alarms}{told}", "bold red" if doubtful else style_of(report))

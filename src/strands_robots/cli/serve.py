@@ -7,7 +7,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import replace
 from importlib import import_module
@@ -36,6 +36,13 @@ if TYPE_CHECKING:
 
     from strands_robots.device_connect.backends import LinkConfig
     from strands_robots.device_connect.shutdown import StopSignal
+
+PAGE_CALLER = "dashboard"
+PAGE_VERBS = ("acquireControl", "moveJoints", "moveBy", "setGripper")
+"""Verbs with which the operator's page drives a robot by hand."""
+
+EMULATED = ("so100", "so101")
+"""Arms whose servos can be emulated."""
 
 EVERY_PROGRAM_HERE = "Every program of this machine can drive and read the robot, no other machine can."
 
@@ -81,6 +88,17 @@ def serve(
     command_allow: Annotated[
         str | None, _allow("--command-allow", "Verbs approved on real hardware: verb, verb@peer or verb@peer:caller.")
     ] = None,
+    drive_by_page: Annotated[
+        bool,
+        typer.Option(
+            "--drive-by-page",
+            help=f"Let the page drive it: adds {PAGE_CALLER} to --rpc-allow and {','.join(PAGE_VERBS)} to the verbs.",
+            rich_help_panel="Authorization",
+        ),
+    ] = False,
+    emulated: Annotated[
+        bool, typer.Option("--emulated", help="A real arm's driver on emulated servos, in the place of --port.")
+    ] = False,
     policies: Annotated[
         Path | None, typer.Option("--policies", help="File of policy profiles, which callers choose by name.")
     ] = None,
@@ -116,6 +134,10 @@ def serve(
     until_stdin_closes: Annotated[bool, typer.Option("--until-stdin-closes", hidden=True)] = False,
 ) -> None:
     """Put a robot on the network. Ctrl-C or SIGTERM stops the robot first, then departs."""
+    if drive_by_page:
+        rpc_allow = _added(rpc_allow, "DEVICE_CONNECT_RPC_ALLOW", (PAGE_CALLER,))
+        command_allow = _added(command_allow, "STRANDS_ROBOT_COMMAND_ALLOW", PAGE_VERBS)
+        screen.say(f"The page may drive it: --rpc-allow {rpc_allow} --command-allow {command_allow}.")
     flags = {
         "DEVICE_CONNECT_RPC_ALLOW": rpc_allow,
         "DEVICE_CONNECT_ESTOP_ALLOW": estop_allow,
@@ -123,12 +145,11 @@ def serve(
         "STRANDS_ROBOT_COMMAND_ALLOW": command_allow,
         "STRANDS_ALLOW_MOCK": "true" if allow_mock else None,
         "STRANDS_DC_STATE_HZ": None if state_hz is None else str(number("--state-hz", state_hz, low=0.01, high=100)),
+        "STRANDS_CELL": None if cell is None else identifier("--cell", cell),
     }
     for name, value in flags.items():
         if value is not None:
             settings.put(name, value)
-    if cell is not None:
-        settings.put("STRANDS_CELL", identifier("--cell", cell))
     if policies is not None:
         load_profiles(policies.expanduser())
         settings.put("STRANDS_POLICIES", str(policies))
@@ -143,25 +164,37 @@ def serve(
     limit = None if speed_limit is None else number("--speed-limit", speed_limit, above=0, high=SPEED_MAX)
     given = {"host": host, "port": serial_port, "speed_limit": limit}
     chosen = assignments(options or []) | {name: value for name, value in given.items() if value is not None}
-    mode = mode or ("real" if serial_port is not None or robot == "reachy_mini" else "sim")
+    if emulated and (robot not in EMULATED or serial_port is not None or mode == "sim"):
+        raise ValidationError(f"--emulated is for a real {' or '.join(EMULATED)} without a serial port.")
+    mode = mode or ("real" if emulated or serial_port is not None or robot == "reachy_mini" else "sim")
     if serial_port is not None and mode == "sim":
         raise ValidationError(f"--mode must be real with the serial port {serial_port}, not sim.")
     chosen |= _arm_options(mode, model, detector)
     loading = [] if policies is None else warm_profiles()
     if loading:
         screen.say(f"Loading the policies {', '.join(loading)}.")
-    body = Robot(robot, mode="real" if robot == "reachy_mini" else mode, **chosen)
-    try:
-        with record_robot(screen, body, peer_id or str(body.tool_name_str), record, record_cameras):
-            if link is None:
-                served = _on_mesh(screen, body, peer_id, mode)
-            else:
-                served = _on_device_connect(screen, network, link, body, peer_id)
-            _serve(screen, body, served, piped=until_stdin_closes)
-    finally:
+    with ExitStack() as stack:
+        if emulated:
+            from strands_robots.hardware.emulated.process import emulated_arm  # noqa: PLC0415 - as above
+
+            chosen = stack.enter_context(emulated_arm()) | chosen
+        body = Robot(robot, mode="real" if robot == "reachy_mini" else mode, **chosen)
         cleanup = getattr(body, "cleanup", None)
         if callable(cleanup):
-            cleanup()
+            stack.callback(cleanup)
+        stack.enter_context(record_robot(screen, body, peer_id or str(body.tool_name_str), record, record_cameras))
+        if link is None:
+            served = _on_mesh(screen, body, peer_id, mode)
+        else:
+            served = _on_device_connect(screen, network, link, body, peer_id)
+        _serve(screen, body, served, piped=until_stdin_closes)
+
+
+def _added(given: str | None, setting: str, entries: Sequence[str]) -> str:
+    """Return the allowed entries of a flag, or else of the environment, and more."""
+    before = settings.raw(setting) if given is None else given
+    named = [each.strip() for each in (before or "").split(",")]
+    return ",".join(dict.fromkeys([*filter(None, named), *entries]))
 
 
 def _arm_options(mode: str, model: Path | None, detector: str | None) -> dict[str, Any]:
@@ -265,6 +298,7 @@ def _announce(screen: Screen, peer_id: str, link: LinkConfig, driver: DeviceDriv
         label(describe(link)),
         *([label(EVERY_PROGRAM_HERE)] if link.loopback_only and not link.authenticated else []),
         *([label(f"Tenant {link.tenant}.")] if link.tenant != "default" else []),
+        *([label(f"Cell {cell}.")] if (cell := settings.raw("STRANDS_CELL")) else []),
         table("", ("function", "what it does"), ((name, first_line(text)) for name, text in functions.items())),
         label("From another terminal:", "bold"),
         label(f"  strands-robots peers{flags}"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 from rich.table import Table
@@ -11,7 +11,8 @@ from strands_robots.cli.output import Exit, Screen, label, plain, table
 from strands_robots.safety.answers import Answer
 from strands_robots.safety.controller import Progress, StopReport
 from strands_robots.safety.roster import RosterRow
-from strands_robots.safety.silence import UNTOLD, seconds
+from strands_robots.safety.silence import seconds
+from strands_robots.safety.stop_notes import stop_notes
 from strands_robots.safety.stop_roster import StopOutcome
 
 SLOW_MS = 100.0
@@ -19,9 +20,6 @@ SLOW_MS = 100.0
 
 LATE_MS = 1000.0
 """A stop that left later than this after the press says so."""
-
-FEW = 5
-"""Names of a group that are printed."""
 
 
 def exit_code(outcome: StopReport | StopOutcome) -> Exit:
@@ -94,43 +92,8 @@ def say_outcome(screen: Screen, outcome: StopOutcome) -> None:
 
 
 def outcome_lines(outcome: StopOutcome) -> list[str]:
-    """Return the sentences on groups, on missing robots, and on other networks."""
-    lines = [plain(f"{each[:1].upper()}{each[1:].rstrip('.')}.", 500) for each in outcome.problems]
-    lines += [outcome.worth] if outcome.worth else []
-    lines += [group_line(outcome)] if group_line(outcome) else []
-    if outcome.unproven:
-        names = sorted(outcome.unproven)
-        by = sorted({outcome.unproven[name] for name in names})
-        lines.append(
-            f"{_named(by)} say{'s' if len(by) == 1 else ''}, without a signature known here, that "
-            f"{_number(len(names), 'robot')} did not answer: {_named(names)}. This does not alter the exit code."
-        )
-    if outcome.roster.elsewhere:
-        lines.append(f"{_number(outcome.roster.elsewhere, 'robot')} of other networks: this stop is not for them.")
-    if outcome.report.silent and not outcome.sending.tells:
-        lines.append(UNTOLD)
-    return lines
-
-
-def group_line(outcome: StopOutcome) -> str:
-    """Return the sentence on names that do not alter the exit code, or ""."""
-    others = outcome.others
-    moving = sorted({**others.not_stopped, **others.refused})
-    names = [*moving, *others.silent, *sorted(others.claimed), *sorted(others.stopped)]
-    if not names:
-        return ""
-    told = [
-        f"{len(each)} {word}{f' ({_named(sorted(each))})' if shown else ''}"
-        for each, word, shown in (
-            (moving, "say that they DID NOT STOP", True),
-            (others.silent, "gave no answer", True),
-            (others.claimed, "claim to have stopped", False),
-            (others.stopped, "stopped", False),
-        )
-        if each
-    ]
-    many = _number(len(names), "name")
-    return f"{many} only heard, and not enrolled here: {'; '.join(told)}. This does not alter the exit code."
+    """Return the notes of an outcome, printable."""
+    return [plain(each, 600) for each in stop_notes(outcome)]
 
 
 def _state(row: RosterRow) -> str:
@@ -142,15 +105,6 @@ def _marked(row: RosterRow) -> str:
     said = f"by {mark.by}: {mark.reason or 'no reason'}" if mark is not None else ""
     heard = f"; heard under its name {seconds(max(0.0, row.age_s))} ago" if row.age_s is not None else ""
     return plain(f"{said}{heard}", 300)
-
-
-def _number(count: int, thing: str) -> str:
-    return f"{count} {thing}{'' if count == 1 else 's'}"
-
-
-def _named(names: Sequence[str]) -> str:
-    more = f" and {len(names) - FEW} more" if len(names) > FEW else ""
-    return plain(f"{', '.join(names[:FEW])}{more}", 600)
 
 
 def _row(name: str, answer: Answer, left_ms: float) -> tuple[Any, ...]:

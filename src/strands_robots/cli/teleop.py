@@ -125,11 +125,17 @@ def calibrate(
     try:
         steps.begin()
         screen.say("The torque is off. Move every joint to the middle of its motion, then press Enter.")
-        if not sys.stdin.readline():
-            raise ValidationError("calibrate needs a person at the keyboard; standard input has ended.")
+        _EnterKey().wait()
         steps.centre()
         screen.say("Now move every joint from one end to the other, then press Enter.")
-        steps.watch(_enter_pressed().is_set, lambda reaches: _draw_reaches(screen, reaches))
+        while True:
+            enter = _EnterKey()
+            steps.watch(enter.pressed, lambda reaches: _draw_reaches(screen, reaches))
+            enter.wait()
+            still = steps.unmoved()
+            if not still:
+                break
+            screen.say(f"Not moved yet: {', '.join(still)}. Move each from one end to the other, then press Enter.")
         path = steps.finish()
     finally:
         steps.close()
@@ -307,16 +313,26 @@ def _arm_options(port: str, device: str | None, calibration: Path | None) -> dic
     return {key: value for key, value in options.items() if value is not None}
 
 
-def _enter_pressed() -> threading.Event:
-    """Return an event that is set when Enter is pressed."""
-    pressed = threading.Event()
+class _EnterKey:
+    """The next press of Enter, read on a thread."""
 
-    def read() -> None:
-        sys.stdin.readline()
-        pressed.set()
+    def __init__(self) -> None:
+        self._line = ""
+        self._reader = threading.Thread(target=self._read, name="enter", daemon=True)
+        self._reader.start()
 
-    threading.Thread(target=read, name="enter", daemon=True).start()
-    return pressed
+    def pressed(self) -> bool:
+        """Return True once it was pressed, or the input has ended."""
+        return not self._reader.is_alive()
+
+    def wait(self) -> None:
+        """Wait for it. Raises :class:`ValidationError` where the input has ended."""
+        self._reader.join()
+        if not self._line:
+            raise ValidationError("calibrate needs a person at the keyboard; standard input has ended.")
+
+    def _read(self) -> None:
+        self._line = sys.stdin.readline()
 
 
 def _draw_reaches(screen: Screen, reaches: dict[str, JointReach]) -> None:

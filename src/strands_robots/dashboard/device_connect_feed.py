@@ -21,7 +21,7 @@ from strands_robots.device_connect import FleetClient
 from strands_robots.device_connect.client import DeviceEvent
 from strands_robots.device_connect.discovery import Peer
 from strands_robots.device_connect.enrollment import enrolled_robots
-from strands_robots.device_connect.safety_controller import safety_controller
+from strands_robots.device_connect.safety_controller import safety_controller, stand
 from strands_robots.envelope import Envelope, error, is_error
 from strands_robots.safety.identity import KeyFileError
 from strands_robots.safety.orders import new_epoch
@@ -53,8 +53,9 @@ class DeviceConnectFeed:
     def __init__(self, model: FleetModel, fleet: FleetClient, signing_key: Any = None) -> None:
         self._model, self._fleet = model, fleet
         self.controller = safety_controller(
-            fleet.source, fleet.link, signing_key=signing_key, require_signed=signing_key is not None
+            fleet.source, fleet.link, signing_key=signing_key, require_signed=signing_key is not None, stands=True
         )
+        self._standing = stand(self.controller, fleet.link, lambda: model.expected(self.network))
         self._keys: dict[str, bytes] = {}
         self._keys_usable, self._keys_at = True, float("-inf")
         self._names: set[str] = set()
@@ -104,6 +105,7 @@ class DeviceConnectFeed:
             self._subscription.close()
         self._running.cancel()
         self._thread.close()
+        self._standing.close()
         self.controller.close()
 
     # On the client's thread: returns at once and may not raise.

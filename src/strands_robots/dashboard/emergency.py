@@ -6,14 +6,19 @@ import time
 from collections.abc import Callable, Iterable
 from typing import Any
 
+from strands_robots.cli.output import plain
 from strands_robots.cli.safety_controller import StopButton
 from strands_robots.dashboard.feed import FleetFeed
 from strands_robots.dashboard.fleet_model import FleetModel
 from strands_robots.safety.answers import Answer
 from strands_robots.safety.controller import UNCONFIRMED_S, Progress, StopReport
+from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.safety.statements import Proof
+from strands_robots.safety.stop_notes import stop_notes
+from strands_robots.safety.stop_roster import StopOutcome
 
 REASON = "STOP on the operator's page"
+NOTES_MAX = 16
 SILENT_S = 0.9
 """A network whose robots were all silent for longer may be gone."""
 
@@ -31,7 +36,8 @@ class FleetStop:
         self._buttons = {
             feed.network: StopButton(feed.controller, _expected(model, feed.network), REASON) for feed in self._feeds
         }
-        self._seen: dict[str, tuple[object, bool, frozenset[str]]] = {}
+        self._some: dict[tuple[str, Scope], StopButton] = {}
+        self._seen: dict[tuple[str, Scope], tuple[object, bool, frozenset[str]]] = {}
         self._pressed_at: float | None = None
         self._by = ""
 
@@ -45,28 +51,46 @@ class FleetStop:
             button.press()
         self._pressed_at, self._by = time.time(), who
 
+    def press_one(self, network: str, robot: str) -> None:
+        """Stop and lock one robot; returns at once. Every robot where it is none."""
+        feed = next((each for each in self._feeds if each.network == network), None)
+        scope = Scope.named([robot])
+        if feed is None or scope.everything:
+            self.press(robot)
+            return
+        button = self._some.get((network, scope))
+        if button is None:
+            button = StopButton(feed.controller, lambda: scope.only, REASON, scope)
+            self._some = {**self._some, (network, scope): button}
+        button.press()
+        self._pressed_at, self._by = time.time(), robot
+
     def close(self) -> None:
         """Give up a stop that waits for the link."""
-        for button in self._buttons.values():
+        for button in (*self._buttons.values(), *self._some.values()):
             button.close()
 
     @property
     def running(self) -> bool:
         """True while a stop waits for answers."""
-        return any(button.running for button in self._buttons.values())
+        return any(button.running for button in (*self._buttons.values(), *self._some.values()))
 
     def refresh(self) -> None:
         """Put the answers that came since into the model; called repeatedly."""
-        for network, button in self._buttons.items():
+        everything = {(network, EVERY_ROBOT): button for network, button in self._buttons.items()}
+        for (network, scope), button in {**everything, **self._some}.items():
             button.review()
             running, progress, report = button.running, button.progress, button.report
-            expected = frozenset(self._model.expected(network))
+            outcome = button.outcome
             latest = report if report is not None and not running else progress
+            some = scope.only if latest is None or not latest.widened else ()
+            expected = frozenset(some or self._model.expected(network))
             seen = (latest, running, expected)
-            if latest is None or self._seen.get(network) == seen:
+            if latest is None or self._seen.get((network, scope)) == seen:
                 continue
-            self._seen[network] = seen
-            for name, verdict in self._verdicts(latest, expected).items():
+            self._seen[network, scope] = seen
+            measured = outcome if latest is report else None
+            for name, verdict in self._verdicts(latest, expected, measured).items():
                 self._model.verdict(network, name, verdict)
 
     def state(self) -> dict[str, Any]:
@@ -81,17 +105,25 @@ class FleetStop:
             "silent_s": silent_s,
             "can_stop": all(links.values()) and (silent_s is None or silent_s <= SILENT_S),
             "running": self.running,
+            "roster": {name: _roster(each.outcome) for name, each in self._buttons.items() if each.outcome is not None},
             "pressed_at": self._pressed_at,
             "pressed_by": self._by,
         }
 
-    def _verdicts(self, latest: Progress | StopReport, expected: frozenset[str]) -> dict[str, dict[str, Any]]:
+    def _verdicts(
+        self, latest: Progress | StopReport, expected: frozenset[str], outcome: StopOutcome | None
+    ) -> dict[str, dict[str, Any]]:
         about = {"id": latest.estop_id, "at": self._pressed_at}
         answered = latest.answered
         late = latest.elapsed_ms >= UNCONFIRMED_S * 1000
         found = {name: verdict_of(answer, latest.left_ms) for name, answer in answered.items()}
-        for name in expected - answered.keys():
-            found[name] = {"state": "silent" if late else "waiting", "why": "", "ms": None, "signed": False}
+        reasons = {} if outcome is None else outcome.reasons
+        told = set() if outcome is None else {*outcome.others.silent}
+        missing = {*expected, *(latest.unconfirmed if isinstance(latest, Progress) else ())}
+        missing |= {*outcome.report.silent} if outcome is not None else set()
+        for name in missing - answered.keys():
+            state = "heard_only" if name in told else "silent" if late else "waiting"
+            found[name] = {"state": state, "why": reasons.get(name, "")[:300], "ms": None, "signed": False}
         for name, why in latest.alarms.items():
             own = found.get(name)
             if own is None or own["state"] in ("silent", "waiting", "claimed"):
@@ -123,6 +155,15 @@ def verdict_of(answer: Answer, left_ms: float) -> dict[str, Any]:
         "left_ms": round(left_ms, 1),
         "signed": answer.proof is Proof.SIGNED,
         **({"settling": True} if settling else {}),
+    }
+
+
+def _roster(outcome: StopOutcome) -> dict[str, Any]:
+    """Return what the page says of a stop besides each robot's answer."""
+    return {
+        "ok": outcome.ok,
+        "sentence": outcome.sentence,
+        "notes": [plain(each, 300) for each in stop_notes(outcome)[:NOTES_MAX]],
     }
 
 

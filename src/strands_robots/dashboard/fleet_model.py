@@ -192,7 +192,10 @@ class FleetModel:
                     network, answer.name, locked=None, doubt=_cut(answer.problem), alarm="ALARM" in answer.problem
                 )
             return
-        rows = [each.fields() for each in answer.lockouts[:LOCKOUTS_MAX]]
+        rows = [
+            {**each.fields(), **({} if each.scope.everything else {"scope": str(each.scope)})}
+            for each in answer.lockouts[:LOCKOUTS_MAX]
+        ]
         self._note_freed(network, answer.name, {each.epoch for each in answer.lockouts}, answer.at)
         self.update(
             network,

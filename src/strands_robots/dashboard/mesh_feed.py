@@ -19,6 +19,7 @@ from strands_robots.device_connect.telemetry import numbers
 from strands_robots.envelope import Envelope, error, is_error
 from strands_robots.mesh import Mesh
 from strands_robots.safety.stopping import explain, grade
+from strands_robots.tools.mesh_roster import stand_on_mesh
 
 LOOK_S = 0.25
 STOP_S = 2.0
@@ -38,6 +39,7 @@ class MeshFeed:
     def __init__(self, model: FleetModel, mesh: Mesh, signing_key: Any = None) -> None:
         self._model, self._mesh = model, mesh
         self.controller = MeshController(mesh, signing_key)
+        self._standing = stand_on_mesh(mesh, signing_key, lambda: model.expected(self.network))
         self._forms = peer_forms()
         self._names: set[str] = set()
         self._closing = threading.Event()
@@ -87,6 +89,7 @@ class MeshFeed:
     def close(self) -> None:
         """Leave the network."""
         self._closing.set()
+        self._standing.close()
         self._thread.join(2 * ASK_S + 1.0)
         for pool in (self._calls, self._stops):
             pool.shutdown(wait=False, cancel_futures=True)

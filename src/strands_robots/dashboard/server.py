@@ -173,8 +173,15 @@ class Dashboard:
                     # Before anything else is done with it.
                     named = pressed.get("robot")
                     who = named[:128] if isinstance(named, str) else ""
-                    self.stop.press(who)
-                    self.model.note("", "", "STOP pressed", {"button": who or "all robots"})
+                    key = pressed.get("only")
+                    # A robot that is not known here is no reason to stop none.
+                    row = self.model.row(key) if isinstance(key, str) else None
+                    if row is None:
+                        self.stop.press(who)
+                    else:
+                        self.stop.press_one(row.network, row.id)
+                    button = f"{row.id} alone" if row is not None else who or "all robots"
+                    self.model.note("", "", "STOP pressed", {"button": button})
                     await socket.send_text(json.dumps({"type": "pressed", "id": pressed.get("id")}, default=str))
         except (ValueError, RecursionError, KeyError, RuntimeError, WebSocketDisconnect) as gone:
             logger.debug("A page is gone, or sent no message of this page: %s", type(gone).__name__)

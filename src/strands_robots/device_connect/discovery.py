@@ -110,6 +110,12 @@ class Peer:
         names = {str(each.get("name", "")) for each in self.functions}
         return next((verb for verb in ("stop", "stopMotion") if verb in names), None)
 
+    @property
+    def cell(self) -> str | None:
+        """Its cell, "" for none; None where it states neither, and reads no scope."""
+        cell = self.status.get("cell")
+        return cell if isinstance(cell, str) else None
+
     @classmethod
     def of(cls, description: Mapping[str, Any]) -> Peer:
         """Read a presence message or a registration; a field that it lacks is empty."""
@@ -136,7 +142,7 @@ class Discovery:
         """Empty, or one sentence on why the last collection may lack devices or name some that are gone."""
         self._messaging = messaging
         self._root = f"device-connect.{messaging.link.tenant}"
-        self._network = network_of(messaging.link)
+        self._network, self._remembered = network_of(messaging.link), sightings()
         self._present: dict[str, Peer] = {}
         self._listed: dict[str, Peer] = {}
         self._listed_at: float | None = None
@@ -347,7 +353,7 @@ class Discovery:
     def _remember(self, peer: Peer, *, departing: bool = False) -> None:
         """Have this machine remember a device that was heard."""
         cell, stops = peer.status.get("cell"), peer.stop_verb is not None
-        sightings().note(
+        self._remembered.note(
             self._network,
             peer.id,
             # A device that states no cell is in none, so that a forged presence cannot put it into one.
@@ -389,7 +395,7 @@ class Discovery:
             # Access rules guard the topic of one device, so a beat proves the life of that one only.
             named = [each for each in named if each == own]
         for name in (own, *named):
-            sightings().note(self._network, name)
+            self._remembered.note(self._network, name)
             # Taken out and put in again, so that the longest silent ones are dropped first.
             self._beats.pop(name, None)
             self._beats[name] = now

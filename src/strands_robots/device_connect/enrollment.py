@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from strands_robots.device_connect.backends import LinkConfig
+from strands_robots.device_connect.backends.config import DEFAULT_URL
 from strands_robots.safety.identity import EnrolledKeys, of_tenant
 from strands_robots.safety.network_key import DEVICE_CONNECT, NetworkKey
 
@@ -20,4 +21,7 @@ def network_of(link: LinkConfig) -> NetworkKey:
     """Return the key of the network that a link reaches."""
     met = (link.meeting_point,) if link.meeting_point else ()
     listened = [each for each in link.listen if not each.endswith(":0")]
-    return NetworkKey.of(DEVICE_CONNECT, [*link.connect, *listened, *met] or ["multicast"], link.tenant)
+    scouted = ("multicast",) if link.uses_multicast else ()
+    default = DEFAULT_URL if link.transport == "nats" else "nowhere"
+    stated = [*link.connect, *listened, *met, *scouted] or [default]
+    return NetworkKey.of(DEVICE_CONNECT, stated, link.tenant)

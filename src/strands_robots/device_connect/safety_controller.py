@@ -2,25 +2,57 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import functools
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 from strands_robots.device_connect.backends import LinkConfig
-from strands_robots.device_connect.enrollment import enrolled_robots
+from strands_robots.device_connect.enrollment import enrolled_robots, network_of
 from strands_robots.device_connect.links import usual_link
 from strands_robots.device_connect.stop_link import stop_link
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.safety.controller import SafetyController, StopReport
+from strands_robots.safety.estop_listener import notification
+from strands_robots.safety.roster import Roster
+from strands_robots.safety.roster_report import STOP_ROSTER
+from strands_robots.safety.standing_roster import StandingRoster, controllers_identity
+from strands_robots.safety.stop_roster import robots_known_at
 
 
 def safety_controller(controller_id: str, link: LinkConfig | None = None, **options: Any) -> SafetyController:
     """Return a :class:`SafetyController` on ``link``, else on the environment's.
 
-    Further arguments are those of :class:`SafetyController`. The robots enrolled at this machine have to sign.
+    Further arguments are those of :class:`SafetyController`. The robots enrolled at this machine have to sign, and its
+    roster says whether a stop of some robots means one that is known.
     """
     link = link or usual_link()
     options.setdefault("enrolled", lambda: enrolled_robots(link))
+    options.setdefault("remembers", robots_known_at(lambda: network_of(link)))
+    options.setdefault("network", network_of(link))
     return SafetyController(controller_id, lambda: stop_link(link), **options)
+
+
+def stand(
+    controller: SafetyController, link: LinkConfig, also: Callable[[], Collection[str]] = tuple
+) -> StandingRoster:
+    """Have a controller report whom it misses after the stop of another one.
+
+    Args:
+        controller: made with ``stands``.
+        link: its network.
+        also: returns names that it shows besides its roster.
+    """
+    network = network_of(link)
+    standing = StandingRoster(
+        controller.controller_id,
+        lambda fields: controller.publish(STOP_ROSTER, notification(STOP_ROSTER, fields)),
+        roster=lambda: Roster.of(network),
+        keys=lambda: enrolled_robots(link),
+        identity=functools.cache(lambda: controllers_identity(controller.controller_id, controller.signing_key)),
+        also=also,
+    )
+    controller.hear_others(standing.hear)
+    return standing
 
 
 def envelope(report: StopReport, reasons: Mapping[str, str] | None = None) -> Envelope:
@@ -53,6 +85,5 @@ def envelope(report: StopReport, reasons: Mapping[str, str] | None = None) -> En
     failures += [f"{name} gave no answer{f' ({why[name]})' if name in why else ''}" for name in report.silent]
     if not report.link:
         failures.append("the stop was not sent: the link is down")
-    if report.widened:
-        failures.append(f"no robot was there for {report.scope}, so every robot was stopped")
+    failures += [report.widening] if report.widening else []
     return error(f"{'; '.join(failures) or 'No robot answered the emergency stop'}.", **fields)

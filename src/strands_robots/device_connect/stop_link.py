@@ -20,6 +20,7 @@ from strands_robots.device_connect.backends import LinkConfig
 from strands_robots.safety.estop_listener import CHECK_IN_ANSWER, ESTOP, VERDICT, OnEvent, OnState, StopLink
 from strands_robots.safety.missed_stops import ANSWER, QUESTION
 from strands_robots.safety.orders import PARSED_MAX_BYTES
+from strands_robots.safety.roster_report import STOP_ROSTER
 from strands_robots.safety.stop_log import stop_logger
 
 if TYPE_CHECKING:
@@ -37,7 +38,7 @@ LEASE_MS = 4000
 OVERLAP_S = 2.0
 """Time in which a replaced session still carries stops: peers learn of the new one and of one another meanwhile."""
 
-ANSWERS = frozenset((VERDICT, CHECK_IN_ANSWER, QUESTION, ANSWER))
+ANSWERS = frozenset((VERDICT, CHECK_IN_ANSWER, QUESTION, ANSWER, STOP_ROSTER))
 """Events of which many may be sent at once; any other one is a stop or a check-in, and goes first."""
 
 LOST_MAX = 1024

@@ -54,6 +54,9 @@ class DeviceBody:
         ValidationError: the device lacks a part of the interface, a range is none, or it cannot release torque.
     """
 
+    stall_lag = 0.05
+    """Least lag of a joint in contact, in radians: a gear sticks and has play before it moves."""
+
     def __init__(
         self,
         name: str,

@@ -130,6 +130,9 @@ FULL_TURN = ("wrist_roll",)
 
 _POSITION_MODE = 0
 
+MOVED_COUNTS = 200
+"""Least reach of a joint that was moved, in encoder counts: 18 degrees. One at rest trembles by a few."""
+
 
 @dataclass(frozen=True, slots=True)
 class JointReach:
@@ -195,6 +198,11 @@ class Calibrator:
         while not done():
             report(self.look())
 
+    def unmoved(self) -> list[str]:
+        """Return the joints that were not moved since :meth:`centre`."""
+        moved = {motor for motor, reach in self._reaches.items() if reach.high - reach.low >= MOVED_COUNTS}
+        return [motor for motor in self._bus.motors if motor not in moved and motor not in FULL_TURN]
+
     def finish(self) -> Path:
         """Write the calibration into servos and LeRobot's file, and disconnect.
 
@@ -204,9 +212,9 @@ class Calibrator:
         Raises:
             ValidationError: joints that were not moved, by name.
         """
-        still = [motor for motor, reach in self._reaches.items() if reach.low >= reach.high]
-        if still or not self._reaches:
-            raise ValidationError(f"these joints were not moved: {', '.join(still) or 'none was'}.")
+        still = self.unmoved()
+        if still:
+            raise ValidationError(f"these joints were not moved: {', '.join(still)}.")
         content = {motor: self._entry(motor, each.id) for motor, each in self._bus.motors.items()}
         calibrate_from(self._device, content, name=str(self._device), role="")
         self._bus.write_calibration(self._device.calibration)

@@ -20,7 +20,7 @@ from strands_robots.hardware.body import READ_TRIES, DeviceBody
 from strands_robots.hardware.device_facts import has_temperatures, joint_units, kind, stable_id, temperatures
 from strands_robots.policies import create_policy, resolve_provider
 from strands_robots.policies.base import checked_action, is_velocity, numbers
-from strands_robots.policies.check import RobotFacts
+from strands_robots.policies.check_rows import RobotFacts
 from strands_robots.policies.profiled import ProfiledPolicy
 from strands_robots.policies.profiles import profiles
 from strands_robots.policies.rollout import Rollout, RolloutObservers, RolloutsEnd, rollout_options, unfollowed
@@ -244,6 +244,8 @@ class HardwareRobot(ArmMixin, TeleopMixin):
             joint_units(self.device),
             {key: (size[0], size[1], size[2]) for key, size in pictures.items()},
             self.control_hz,
+            self._body.bounds,
+            kind(self.device),
         )
 
     def body(self, robot_name: str | None = None) -> DeviceBody:
@@ -542,12 +544,12 @@ class HardwareRobot(ArmMixin, TeleopMixin):
 
         return made
 
-    def start_motion(self, robot_name: str, verb: str, plan: Callable[[float], Motion]) -> Rollout:
+    def start_motion(self, robot_name: str, verb: str, plan: Callable[[float, Permit], Motion]) -> Rollout:
         """Plan and start a motion of the arm."""
         self.body(robot_name)
 
         def made(permit: Permit) -> Rollout:
-            motion = plan(self.control_hz)
+            motion = plan(self.control_hz, permit)
             permit.check()
             return motion_rollout(self._body, motion, permit, self.control_hz, self.observers)
 

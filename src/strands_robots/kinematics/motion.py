@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from strands_robots.kinematics.arm import Action, Arm, ArmState
-from strands_robots.kinematics.chain import Floats
-from strands_robots.policies.base import Ranges, numbers
+from strands_robots.kinematics.chain import Floats, TipPose
+from strands_robots.kinematics.stall import StallWatch
+from strands_robots.policies.base import PolicyError, Ranges, numbers
 from strands_robots.utils import shown
 
 _QUOTES = "'\""
@@ -32,6 +33,9 @@ NEAR_RAD = 0.1
 
 FRESH = 0.9
 """Share of a control step by which the body's own time must have advanced between two looks."""
+
+STALL_LAG = 0.01
+"""Least lag of a joint in contact, of a body that observes and moves exactly (rad or m)."""
 
 MARGIN_S = 5.0
 """Seconds beyond its plan that a motion may take."""
@@ -54,9 +58,12 @@ class Motion:
         verb: what was asked for.
         asked: the caller's goal, as it is answered.
         goal: where the tip shall be in the end (m), None for a motion of the gripper alone.
+        end_joints: where the joints shall be in the end (rad); empty for a motion of the gripper alone.
         wanted: where joints shall be in the end, by name (rad or m).
         told: the last opening that the gripper is told, None for none.
         grasps: something shall be between the jaws in the end.
+        stall_lag: least lag of a joint that counts as contact with something (rad or m).
+        contact: what ended the motion, if a joint met something.
         clock: the body's own time in seconds; a simulation's stands still with it.
         state: what was observed last.
         segment: name of the segment that is played.
@@ -68,11 +75,14 @@ class Motion:
     segments: Sequence[Segment]
     hz: float
     goal: Floats | None = None
+    end_joints: Floats = field(default_factory=lambda: np.zeros(0))
     wanted: Mapping[str, float] = field(default_factory=dict)
     told: float | None = None
     grasps: bool = False
     clock: Callable[[], float] = time.monotonic
+    stall_lag: float = STALL_LAG
     state: ArmState | None = field(default=None, init=False)
+    contact: str = field(default="", init=False)
     segment: str = field(default="", init=False)
     uses_cameras: bool = field(default=False, init=False)
 
@@ -82,6 +92,8 @@ class Motion:
         self._settles_until: float | None = None
         self._still = 0
         self._seen: tuple[float, ArmState] | None = None
+        self._told: Floats | None = None
+        self._watch: StallWatch | None = None
 
     @property
     def instruction(self) -> str:
@@ -97,6 +109,11 @@ class Motion:
         """Longest time that the motion may take, in seconds."""
         frames = sum(len(segment.frames) for segment in self.segments)
         return frames / self.hz + SETTLE_S * sum(segment.settles for segment in self.segments) + MARGIN_S
+
+    @property
+    def end(self) -> TipPose:
+        """Return the pose of the tip in the end."""
+        return self.arm.chain.forward(self.end_joints)
 
     @property
     def finished(self) -> bool:
@@ -131,6 +148,7 @@ class Motion:
     def act(self, observation: Mapping[str, Any]) -> Action | Sequence[Action] | None:
         """Return the next setpoints, nothing while the arm settles, None at the end."""
         self.state = self.arm.state(numbers(observation))
+        self._require_progress(self.state)
         while not self._frames:
             if self._settles_until is not None:
                 if not self._settled(self.state, self.clock()):
@@ -143,7 +161,26 @@ class Motion:
             self._frames.extend(segment.frames)
             self._settles_until = np.inf if segment.settles else None
             self._still, self._seen = 0, None
-        return self._frames.popleft()
+            self._watch = StallWatch(self.stall_lag)
+        frame = self._frames.popleft()
+        self._told = self.arm.told(frame)
+        return frame
+
+    def _require_progress(self, state: ArmState) -> None:
+        """End the motion where a joint stands still against what it is told.
+
+        Raises:
+            PolicyError: a joint met something; :attr:`contact` has the sentence.
+        """
+        if self._told is None or self._watch is None or not self._frames:
+            return
+        told = np.where(np.isnan(self._told), state.joints, self._told)
+        index = self._watch.stalled(self.clock(), told, state.joints)
+        if index is not None:
+            joint = self.arm.chain.joints[index]
+            at = f"{np.degrees(state.joints[index]):.0f} degrees" if joint.turns else f"{state.joints[index]:.3f} m"
+            self.contact = f"{joint.name} was blocked at {at}: it met something, or its servo is too weak"
+            raise PolicyError(self.contact)
 
     def interrupt(self) -> None:
         """Do nothing: this policy never waits."""

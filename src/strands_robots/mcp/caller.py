@@ -19,9 +19,10 @@ from strands_robots.device_connect import FleetClient
 from strands_robots.device_connect.client import CallRefusedError, DeviceTimeoutError, NoSuchDeviceError
 from strands_robots.device_connect.discovery import Peer
 from strands_robots.envelope import Envelope, error, is_error, success, text_of
+from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.safety.stopping import Outcome, grade
 from strands_robots.serving.verbs import LEASE_ID, LEASE_TTL_S, TTL_MAX_S, TTL_MIN_S
-from strands_robots.tools.networks import combined_verdict, stop_and_lock
+from strands_robots.tools.networks import stop_and_lock, stop_everything
 from strands_robots.utils import ValidationError, number
 
 ANSWER_S = 10.0
@@ -177,17 +178,16 @@ class Caller:
         """Stop a robot, one of a world, or all robots, without a lease or a wait."""
         if not robot:
             loop = asyncio.get_running_loop()
-            answers = await loop.run_in_executor(self._urgent, self.fleet.stop_all)
-            return combined_verdict(answers, self.fleet.stale)
+            return await loop.run_in_executor(self._urgent, stop_everything, self.fleet)
         try:
             return await self.fleet.stop_async(robot, robot_name=robot_name)
         except ValidationError as refused:
             return error(str(refused), stopped=None)
 
-    async def emergency_stop(self, reason: str) -> Envelope:
-        """Stop and lock every robot."""
+    async def emergency_stop(self, reason: str, scope: Scope = EVERY_ROBOT) -> Envelope:
+        """Stop and lock every robot, or those of ``scope``."""
         loop = asyncio.get_running_loop()
-        return await loop.run_in_executor(self._urgent, stop_and_lock, self.fleet, reason)
+        return await loop.run_in_executor(self._urgent, stop_and_lock, self.fleet, reason, scope)
 
     async def leave(self) -> None:
         """Halt what this client moves and holds, and release it."""

@@ -27,6 +27,7 @@ from strands_robots.mcp.caller import Caller
 from strands_robots.mcp.resources import RobotResources
 from strands_robots.mcp.results import refused_arguments, result, unknown_arguments, with_note
 from strands_robots.mcp.tools import add_control, add_motions, add_reads, add_stops
+from strands_robots.safety.sightings import flush_sightings
 from strands_robots.serving.stop_arguments import network_emergency_stop, network_stop
 
 logger = logging.getLogger(__name__)
@@ -153,6 +154,7 @@ async def serve_stdio(caller: Caller, *, read_only: bool = False) -> None:
             await caller.leave()
         finally:
             pictures.close()
+            flush_sightings()
             os._exit(128 + signal.SIGTERM)
 
     asyncio.get_running_loop().add_signal_handler(

@@ -24,6 +24,7 @@ from strands_robots.mcp.access import AccessOf
 from strands_robots.mcp.approval import Approvals, Wish
 from strands_robots.mcp.caller import acquire_arguments, move_arguments
 from strands_robots.mcp.results import Result, facts, picture, quoted, result, row
+from strands_robots.serving.stop_arguments import stop_scope
 
 PAGE_BYTES = 2600
 """Size of a page of robots; it is in an answer twice, as text and as structured content."""
@@ -150,10 +151,19 @@ def add_stops(server: MCPServer[Any], access: AccessOf) -> None:
 
     @server.tool(annotations=STOP)
     async def emergency_stop(
-        context: Context[Any, Any], reason: Annotated[str, Field(description="Why, in up to 200 characters")] = ""
+        context: Context[Any, Any],
+        reason: Annotated[str, Field(description="Why, in up to 200 characters")] = "",
+        only: Annotated[list[str] | None, Field(description="Ids of the robots to stop; empty for all robots")] = None,
+        cell: Annotated[
+            str, Field(description="Stop this cell and robots without one; empty for all robots", max_length=128)
+        ] = "",
     ) -> Result:
-        """Stop and lock every robot; only a human operator can resume them."""
-        return result(await access(context).caller.emergency_stop(reason))
+        """Stop and lock every robot; only a human operator can resume them.
+
+        With only or cell, those robots alone; where none of them is there, every robot.
+        """
+        scope, _ = stop_scope(only, cell)
+        return result(await access(context).caller.emergency_stop(reason, scope))
 
 
 def add_motions(server: MCPServer[Any], access: AccessOf, approvals: Approvals) -> None:

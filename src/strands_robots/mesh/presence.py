@@ -123,7 +123,7 @@ class PresenceListener:
         self._transport = transport
         self._registry = registry
         self._members: dict[str, Context] = {}
-        self._network = mesh_session.network()
+        self._network, self._remembered = mesh_session.network(), sightings()
         self._skewed: set[str] = set()
         self._leaving: dict[tuple[str, str], float] = {}
         self._tokens: dict[tuple[str, str], None] = {}
@@ -239,7 +239,7 @@ class PresenceListener:
         if not robot or any(each.has_robot for each in members) or self._registry.of_world(peer, sample.session):
             return
         cell = facts.get("cell")
-        sightings().note(
+        self._remembered.note(
             self._network,
             peer,
             cell=cell if isinstance(cell, str) else "",

@@ -48,6 +48,7 @@ TABLE: tuple[Topic, ...] = (
     Topic("checkin_answer", "strands/*/checkin/answer", 0, None, 4 * KIB, True, False, 1, False, True),
     Topic("missed_ask", "strands/*/missed/ask", 0, None, 8 * KIB, True, False, 1, False, True),
     Topic("missed_answer", "strands/*/missed/answer", 0, None, 64 * KIB, True, False, 1, False, True),
+    Topic("missed_roster", "strands/*/missed/roster", 0, None, 16 * KIB, True, False, 1, False, True),
     Topic("broadcast", "strands/broadcast", 0, None, 16 * KIB, True, True, 1, False, True),
     Topic("cmd", "strands/*/cmd", 0, None, 16 * KIB, True, True, 1, False, True),
     Topic("response", "strands/*/response/**", 0, None, 1024 * KIB, True, True, 1, False, True),
@@ -103,6 +104,10 @@ def missed_ask(peer: str) -> str:
 
 def missed_answer(peer: str) -> str:
     return f"{ROOT}/{peer}/missed/answer"
+
+
+def missed_roster(controller: str) -> str:
+    return f"{ROOT}/{controller}/missed/roster"
 
 
 def response(requester: str, responder: str, turn: str) -> str:

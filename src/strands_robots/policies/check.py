@@ -1,59 +1,41 @@
 """Check of a policy against a robot, before anything moves.
 
-Every question is a row with both sides. What two sources contradict is *refused*; what none of them states is
-*unverified*, and refused too until the profile lists it under ``confirmed``. Nothing is taken from the order of a
-dictionary.
+Every question is a row with both sides and their owners. What two sources contradict is *refused*; what none of them
+states is *unverified*. Units, rate and image size keep the robot from moving until the profile states them or lists
+them under ``confirmed``; other unanswered questions are told. Nothing is taken from the order of a dictionary.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
-from strands_robots.policies.checkpoint import ACTION, STATE, Size, Statement, checkpoint_statements, dataset_statement
+from strands_robots.policies.agreement import agreement
+from strands_robots.policies.check_rows import (
+    PROFILE,
+    ROBOT,
+    CheckRow,
+    Outcome,
+    RobotFacts,
+    compared,
+    converted,
+    of,
+    unanswered,
+)
+from strands_robots.policies.checkpoint import Statement, checkpoint_statements
+from strands_robots.policies.dataset_facts import dataset_statements
 from strands_robots.policies.profiles import CameraMap, Profile
 from strands_robots.utils import ValidationError, joint_name
-
-Outcome = Literal["ok", "confirmed", "unverified", "refused"]
 
 CONVERTIBLE = frozenset({"degrees", "radians"})
 """Units between which a profile converts."""
 
 RGB = 3
 
-
-@dataclass(frozen=True)
-class RobotFacts:
-    """Facts of a robot, for the check.
-
-    Attributes:
-        state: present values of what it observes, by key.
-        action: its action keys.
-        units: unit by key, where it is known.
-        cameras: size by name; None for one that draws any size.
-        rate: its control rate in Hz.
-    """
-
-    name: str
-    state: Mapping[str, float]
-    action: Sequence[str]
-    units: Mapping[str, str] = field(default_factory=dict)
-    cameras: Mapping[str, Size | None] = field(default_factory=dict)
-    rate: float = 50.0
-
-
-@dataclass(frozen=True)
-class CheckRow:
-    """One question: both sides, the outcome, and the line of the profile to change."""
-
-    question: str
-    policy: str
-    robot: str
-    outcome: Outcome
-    change: str = ""
+PLAY_SHARE = 0.02
+"""Part of a joint's range by which it may always be outside of the data."""
 
 
 @dataclass(frozen=True)
@@ -65,13 +47,20 @@ class PolicyCheck:
 
     @property
     def passed(self) -> bool:
-        """True when nothing is refused or unverified."""
-        return all(row.outcome in ("ok", "confirmed") for row in self.rows)
+        """True when the robot may move."""
+        return not self.failures
 
     @property
     def failures(self) -> tuple[CheckRow, ...]:
         """The rows for which the robot may not move."""
-        return tuple(row for row in self.rows if row.outcome in ("refused", "unverified"))
+        return tuple(
+            row for row in self.rows if row.outcome == "refused" or (row.outcome == "unverified" and row.blocks)
+        )
+
+    @property
+    def unanswered(self) -> tuple[CheckRow, ...]:
+        """Questions that no source answers, and that keep nothing from moving."""
+        return tuple(row for row in self.rows if row.outcome == "unverified" and not row.blocks)
 
     def refusal(self) -> str:
         """Return the failed rows as a sentence each; empty when it passed."""
@@ -96,7 +85,7 @@ def statements_of(profile: Profile) -> list[Statement]:
     # What a server loads may be on its own disk alone.
     absent = not profile.checkpoint or (profile.url and not checkpoint.is_dir())
     found = [] if absent else checkpoint_statements(checkpoint)
-    return found + ([dataset_statement(Path(profile.dataset).expanduser())] if profile.dataset else [])
+    return found + (dataset_statements(Path(profile.dataset).expanduser()) if profile.dataset else [])
 
 
 def check_policy(profile: Profile, statements: Sequence[Statement], robot: RobotFacts) -> PolicyCheck:
@@ -114,6 +103,7 @@ def check_policy(profile: Profile, statements: Sequence[Statement], robot: Robot
         *_rate(profile, statements, robot),
         *_chunk(profile, statements),
         *_task(profile, statements),
+        *agreement(profile, statements, robot),
     ]
     return PolicyCheck(profile.name, tuple(rows))
 
@@ -131,11 +121,7 @@ def _kind(profile: Profile, statements: Sequence[Statement]) -> Iterator[CheckRo
         if each.kind and profile.policy_type:
             change = f'set policy_type = "{each.kind}"'
             fits = each.kind == profile.policy_type
-            yield _row("policy type", f"{each.kind} ({each.source})", profile.policy_type, fits, change)
-
-
-def _row(question: str, policy: str, robot: str, fits: bool, change: str) -> CheckRow:
-    return CheckRow(question, policy, robot, "ok" if fits else "refused", "" if fits else change)
+            yield compared("policy type", of(each.kind, each.source), of(profile.policy_type, PROFILE), fits, change)
 
 
 def _vector(
@@ -145,20 +131,22 @@ def _vector(
     present: Sequence[str],
 ) -> Iterator[CheckRow]:
     """Names, order and dimension of state or action."""
-    mine = ", ".join(chosen)
+    mine = of(", ".join(chosen), PROFILE)
     unknown = [key for key in chosen if key not in present]
     missing = [key for key in present if key not in chosen] if name == "action" else []
     change = f"{name} has {', '.join(unknown)}, which the robot has not" if unknown else ""
     change = change or f"{name} lacks {', '.join(missing)}: they would keep still"
-    yield _row(f"{name} names", mine, ", ".join(present), not (unknown or missing), change)
+    yield compared(f"{name} names", mine, of(", ".join(present), ROBOT), not (unknown or missing), change)
     for source, names, size in stated:
         if names is not None:
             same = [joint_name(key) for key in names] == [joint_name(key) for key in chosen]
             change = f"put {name} into the order of {source}"
-            yield _row(f"{name} order", f"{', '.join(names)} ({source})", mine, same, change)
+            yield compared(f"{name} order", f"{', '.join(names)} ({source})", mine, same, change)
         if size is not None:
             same = size == len(chosen)
-            yield _row(f"{name} size", f"{size} ({source})", str(len(chosen)), same, f"name {size} keys in {name}")
+            yield compared(
+                f"{name} size", f"{size} ({source})", of(len(chosen), PROFILE), same, f"name {size} keys in {name}"
+            )
 
 
 def _environment(profile: Profile, statements: Sequence[Statement], robot: RobotFacts) -> Iterator[CheckRow]:
@@ -183,19 +171,18 @@ def _values(profile: Profile, statements: Sequence[Statement], robot: RobotFacts
             continue
         far = []
         for key, low, high in zip(profile.state, *each.state_range, strict=True):
-            value = _converted(robot.state[key], robot.units.get(key), profile.unit(key))
-            margin = profile.state_margin * (high - low)
+            value = converted(robot.state[key], robot.units.get(key), profile.unit(key))
+            # A joint that never moved in the data is never exactly there again.
+            bottom, top = (
+                converted(end, robot.units.get(key), profile.unit(key)) for end in robot.ranges.get(key, (0.0, 0.0))
+            )
+            play = PLAY_SHARE * (top - bottom) if math.isfinite(top - bottom) else 0.0
+            margin = max(profile.state_margin * (high - low), play)
             if not low - margin <= value <= high + margin:
                 far.append(f"{key} {value:g} outside {low:g} to {high:g}")
         change = "move the robot to where the data begins, or check units and zero"
         outside = "; ".join(far) or "inside"
-        yield _row("state in the data", f"its range ({each.source})", outside, not far, change)
-
-
-def _converted(value: float, of: str | None, to: str | None) -> float:
-    if of == "radians" and to == "degrees":
-        return math.degrees(value)
-    return math.radians(value) if of == "degrees" and to == "radians" else value
+        yield compared("state in the data", f"its range ({each.source})", of(outside, ROBOT), not far, change)
 
 
 def _cameras(profile: Profile, statements: Sequence[Statement], robot: RobotFacts) -> Iterator[CheckRow]:
@@ -215,7 +202,9 @@ def _cameras(profile: Profile, statements: Sequence[Statement], robot: RobotFact
             size = _size(camera, robot)
             given = f"{camera.camera}, {'any size' if size is None else f'{size[0]}x{size[1]}'}"
             fits = channels == RGB and (size is None or size == (height, width))
-            yield _row(f"picture {key}", wanted, given, fits, f"set cameras.{camera.camera}.size = [{height}, {width}]")
+            yield compared(
+                f"picture {key}", wanted, given, fits, f"set cameras.{camera.camera}.size = [{height}, {width}]"
+            )
         for key in mapped.keys() - statement.cameras.keys():
             known = ", ".join(statement.cameras) or "no pictures"
             change = f"no picture of the policy has the key {key}"
@@ -259,11 +248,11 @@ def _statistics(profile: Profile, statements: Sequence[Statement]) -> Iterator[C
     for each in statements:
         if each.statistics is None:
             continue
-        for feature in (STATE, ACTION):
+        for feature in sorted(each.needed):
             there = feature in each.statistics
             change = "save the checkpoint with its processors: raw numbers would go to the motors"
-            has = f"{'present' if there else 'none'} ({each.source})"
-            yield _row(f"statistics of {feature}", has, "-", there, change)
+            has = of("present" if there else "none", each.source)
+            yield compared(f"statistics of {feature}", has, "-", there, change)
 
 
 def _units(profile: Profile, robot: RobotFacts) -> Iterator[CheckRow]:
@@ -272,7 +261,7 @@ def _units(profile: Profile, robot: RobotFacts) -> Iterator[CheckRow]:
         if mine is not None and its is not None:
             fits = mine == its or {mine, its} <= CONVERTIBLE
             change = f'units."{key}" must be {its}, or the robot configured for {mine}'
-            yield _row(f"unit of {key}", mine, its, fits, change)
+            yield compared(f"unit of {key}", of(mine, PROFILE), of(its, ROBOT), fits, change)
         elif key in profile.action:
             outcome: Outcome = "confirmed" if "units" in profile.confirmed else "unverified"
             change = 'set units, or list "units" under confirmed'
@@ -281,17 +270,27 @@ def _units(profile: Profile, robot: RobotFacts) -> Iterator[CheckRow]:
 
 def _rate(profile: Profile, statements: Sequence[Statement], robot: RobotFacts) -> Iterator[CheckRow]:
     stated = [(each.source, each.rate) for each in statements if each.rate is not None]
+    if profile.rate is not None and not stated:
+        yield unanswered("rate of the data", robot=of(f"{profile.rate:g} Hz", PROFILE))
     if profile.rate is None:
         outcome: Outcome = "confirmed" if "rate" in profile.confirmed else "unverified"
         hint = f", {stated[0][1]:g} in {stated[0][0]}" if stated else ""
         change = f'set rate to that of the data{hint}, or list "rate" under confirmed'
-        yield CheckRow("rate", "not stated", f"{robot.rate:g} Hz", outcome, change)
+        yield CheckRow("rate", "not stated", of(f"{robot.rate:g} Hz", ROBOT), outcome, change)
         return
     for source, rate in stated:
         same = math.isclose(rate, profile.rate, rel_tol=1e-3)
-        yield _row("rate of the data", f"{rate:g} Hz ({source})", f"{profile.rate:g} Hz", same, f"set rate = {rate:g}")
+        yield compared(
+            "rate of the data",
+            f"{rate:g} Hz ({source})",
+            of(f"{profile.rate:g} Hz", PROFILE),
+            same,
+            f"set rate = {rate:g}",
+        )
     change = f"serve the robot with control_hz={profile.rate:g}"
-    yield _row("rate", f"{profile.rate:g} Hz", f"{robot.rate:g} Hz", profile.rate <= robot.rate, change)
+    yield compared(
+        "rate", of(f"{profile.rate:g} Hz", PROFILE), of(f"{robot.rate:g} Hz", ROBOT), profile.rate <= robot.rate, change
+    )
 
 
 def _chunk(profile: Profile, statements: Sequence[Statement]) -> Iterator[CheckRow]:
@@ -302,7 +301,7 @@ def _chunk(profile: Profile, statements: Sequence[Statement]) -> Iterator[CheckR
             if value is not None:
                 fits = value == each.chunk if name == "chunk" else value <= each.chunk
                 change = f"set {name} {'to' if name == 'chunk' else 'to at most'} {each.chunk}"
-                yield _row(name, f"{each.chunk} ({each.source})", str(value), fits, change)
+                yield compared(name, f"{each.chunk} ({each.source})", of(value, PROFILE), fits, change)
 
 
 def _task(profile: Profile, statements: Sequence[Statement]) -> Iterator[CheckRow]:

@@ -1,8 +1,9 @@
-"""Facts that a LeRobot checkpoint and its dataset state, read without LeRobot.
+"""Facts that a LeRobot checkpoint states, read without LeRobot.
 
-``config.json`` has the features, ``policy_preprocessor.json`` and ``policy_postprocessor.json`` name the files of their
-statistics, and the headers of the safetensors files name and place what they hold. Motor names, rate and robot are in
-the dataset's ``meta/info.json`` alone. Format: LeRobot 0.4 to 0.6.
+``config.json`` has the features. ``policy_preprocessor.json`` and ``policy_postprocessor.json`` have the way in which
+numbers are normalised, and name the files of their statistics; the headers of the safetensors files name and place what
+they hold. Motor names, rate and robot are in the dataset alone: :mod:`strands_robots.policies.dataset_facts`. Format:
+LeRobot 0.4 to 0.6.
 """
 
 from __future__ import annotations
@@ -24,6 +25,21 @@ HEADER_MAX, HEADER_ELEMENTS_MAX = 4 * 2**20, 200_000
 Size = tuple[int, int, int]
 """Height, width and channels of a picture."""
 
+Bounds = tuple[tuple[float, ...], tuple[float, ...]]
+"""Lowest and highest value by place."""
+
+VECTOR_MAX = 1024
+"""Longest vector of statistics that is read."""
+
+NEEDED_STATISTICS: Mapping[str, tuple[str, ...]] = {
+    "IDENTITY": (),
+    "MEAN_STD": ("mean", "std"),
+    "MIN_MAX": ("min", "max"),
+    "QUANTILES": ("q01", "q99"),
+    "QUANTILE10": ("q10", "q90"),
+}
+"""Statistics that each way to normalise uses; of any other way they are not known."""
+
 
 @dataclass(frozen=True)
 class Statement:
@@ -34,8 +50,13 @@ class Statement:
         problem: why it cannot be used.
         cameras: size of each picture by the policy's key.
         state, environment, action: names in the policy's order; only their count where ``*_size`` alone is known.
-        statistics: features whose statistics it has.
-        state_range: lowest and highest value of each state in the data.
+        statistics: features whose statistics it has, as its way to normalise needs them.
+        needed: features whose statistics it must have.
+        state_range, action_range: lowest and highest value of each in the data.
+        normalization: way to normalise by kind of feature, such as ``MEAN_STD`` of ``STATE``.
+        recorded: size of each picture of the data by its key, renamed as the policy's.
+        renamed: the policy's key of each picture that is renamed.
+        robot: type of the robot that the data is of.
         language: it has to be told a task.
         kind: its type, such as ``act``.
     """
@@ -52,7 +73,13 @@ class Statement:
     rate: float | None = None
     chunk: int | None = None
     statistics: frozenset[str] | None = None
-    state_range: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+    needed: frozenset[str] = frozenset()
+    state_range: Bounds | None = None
+    action_range: Bounds | None = None
+    normalization: Mapping[str, str] | None = None
+    recorded: Mapping[str, Size] | None = None
+    renamed: Mapping[str, str] | None = None
+    robot: str = ""
     language: bool | None = None
     kind: str = ""
 
@@ -66,31 +93,16 @@ def checkpoint_statements(directory: Path) -> list[Statement]:
     if not directory.is_dir():
         return [Statement(str(directory), "there is no such directory")]
     try:
-        config = _object(directory / "config.json")
+        config = json_object(directory / "config.json")
     except ValueError as exc:
         return [Statement("config.json", str(exc))]
     weights = directory / "model.safetensors"
-    return [_config(config), Statement(weights.name, _damage(weights)), _statistics(directory)]
-
-
-def dataset_statement(directory: Path) -> Statement:
-    """Return what the ``meta/info.json`` of a dataset states."""
-    try:
-        info = _object(directory / "meta" / "info.json")
-    except ValueError as exc:
-        return Statement("info.json", str(exc))
-    features = info.get("features")
-    features = features if isinstance(features, Mapping) else {}
-    fps = info.get("fps")
-    lows, highs = (_stats(directory).get(bound) for bound in ("min", "max"))
-    return Statement(
-        "info.json",
-        state=_names(features.get(STATE)),
-        environment=_names(features.get(ENVIRONMENT)),
-        action=_names(features.get(ACTION)),
-        rate=float(fps) if isinstance(fps, int | float) and not isinstance(fps, bool) and fps > 0 else None,
-        state_range=(lows, highs) if lows and highs and len(lows) == len(highs) else None,
-    )
+    return [
+        _config(config),
+        Statement(weights.name, _damage(weights)),
+        _processor(directory, "policy_preprocessor.json", STATE),
+        _processor(directory, "policy_postprocessor.json", ACTION),
+    ]
 
 
 def _config(config: Mapping[str, Any]) -> Statement:
@@ -99,7 +111,7 @@ def _config(config: Mapping[str, Any]) -> Statement:
         return Statement("config.json", "it has no input_features and output_features")
     cameras: dict[str, Size] = {}
     for key, feature in inputs.items():
-        shape = _shape(feature)
+        shape = shape_of(feature)
         if str(key).startswith("observation.image") and len(shape) == 3:
             # Images are channel-first there.
             cameras[str(key)] = (shape[1], shape[2], shape[0])
@@ -110,30 +122,112 @@ def _config(config: Mapping[str, Any]) -> Statement:
         "config.json",
         problem="" if kind else "it names no type",
         cameras=cameras,
-        state_size=next(iter(_shape(inputs.get(STATE))), None),
-        environment_size=next(iter(_shape(inputs.get(ENVIRONMENT))), None),
-        action_size=next(iter(_shape(outputs.get(ACTION))), None),
+        state_size=next(iter(shape_of(inputs.get(STATE))), None),
+        environment_size=next(iter(shape_of(inputs.get(ENVIRONMENT))), None),
+        action_size=next(iter(shape_of(outputs.get(ACTION))), None),
         action=tuple(map(str, names)) if isinstance(names, list) and names else None,
         chunk=chunk if isinstance(chunk, int) and not isinstance(chunk, bool) else None,
         language=kind in LANGUAGE_TYPES,
         kind=kind,
+        normalization=_texts(config.get("normalization_mapping")) or None,
     )
 
 
-def _statistics(directory: Path) -> Statement:
-    """Return the features with statistics, in both processors."""
-    found: set[str] = set()
-    for name in ("policy_preprocessor.json", "policy_postprocessor.json"):
-        try:
-            steps = _object(directory / name).get("steps", [])
-            files = [step["state_file"] for step in steps if isinstance(step, Mapping) and "state_file" in step]
-            for each in files:
-                for tensor in _header(directory / Path(str(each)).name):
-                    feature, _, kind = tensor.rpartition(".")
-                    found |= {feature} if kind in ("mean", "std", "min", "max", "q01", "q99") else set()
-        except ValueError as exc:
-            return Statement(name, str(exc), statistics=frozenset())
-    return Statement("the processors", statistics=frozenset(found))
+def _processor(directory: Path, name: str, feature: str) -> Statement:
+    """Return what a processor states of the statistics that it is for."""
+    values: dict[str, tuple[float, ...]] = {}
+    modes: dict[str, str] = {}
+    renamed: dict[str, str] = {}
+    try:
+        for step in _steps(directory / name):
+            settings = step.get("config")
+            settings = settings if isinstance(settings, Mapping) else {}
+            modes |= _texts(settings.get("norm_map"))
+            renamed |= _texts(settings.get("rename_map"))
+            if "state_file" in step:
+                values |= _vectors(directory / Path(str(step["state_file"])).name)
+    except ValueError as exc:
+        return Statement(name, str(exc), statistics=frozenset(), needed=frozenset((STATE, ACTION)))
+    has = {key: _of(values, key) for key in (STATE, ACTION)}
+    present = frozenset(key for key, kinds in has.items() if _suffices(kinds, modes.get(KINDS[key], "")))
+    own = next(iter(has[feature].values()), None)
+    used = modes.get(KINDS[feature]) != "IDENTITY"
+    return Statement(
+        name,
+        statistics=present,
+        needed=frozenset((feature,)) if used else frozenset(),
+        state_size=len(own) if own is not None and feature == STATE else None,
+        action_size=len(own) if own is not None and feature == ACTION else None,
+        state_range=bounds_of(has[STATE]) if feature == STATE else None,
+        action_range=bounds_of(has[ACTION]),
+        normalization=modes or None,
+        renamed=renamed or None,
+    )
+
+
+KINDS = {STATE: "STATE", ACTION: "ACTION"}
+"""Kind of each feature, as the way to normalise is listed by it."""
+
+
+def bounds_of(kinds: Mapping[str, tuple[float, ...]]) -> Bounds | None:
+    """Return the range that statistics state, by bounds or by quantiles."""
+    for low, high in (("min", "max"), ("q01", "q99")):
+        if low in kinds and len(kinds[low]) == len(kinds.get(high, ())):
+            return kinds[low], kinds[high]
+    return None
+
+
+def _of(values: Mapping[str, tuple[float, ...]], feature: str) -> dict[str, tuple[float, ...]]:
+    """Return the finite statistics of a feature, by kind."""
+    found = {kind: values[f"{feature}.{kind}"] for kind in _STATISTICS if f"{feature}.{kind}" in values}
+    return {kind: each for kind, each in found.items() if all(map(math.isfinite, each))}
+
+
+_STATISTICS = tuple(dict.fromkeys(kind for kinds in NEEDED_STATISTICS.values() for kind in kinds))
+
+
+def _suffices(kinds: Mapping[str, tuple[float, ...]], mode: str) -> bool:
+    """Return True for the statistics that a way to normalise needs."""
+    used = NEEDED_STATISTICS.get(mode)
+    return bool(kinds) if used is None else all(kind in kinds for kind in used)
+
+
+def _steps(path: Path) -> list[Mapping[str, Any]]:
+    steps = json_object(path).get("steps", [])
+    return [step for step in steps if isinstance(step, Mapping)] if isinstance(steps, list) else []
+
+
+def _texts(given: object) -> dict[str, str]:
+    return {str(key): str(each) for key, each in given.items()} if isinstance(given, Mapping) else {}
+
+
+def _vectors(path: Path) -> dict[str, tuple[float, ...]]:
+    """Return the vectors of a safetensors file, by name; others are left out.
+
+    Raises:
+        ValidationError: it is not whole.
+    """
+    problem = _damage(path)
+    if problem and problem != NO_WEIGHTS:
+        raise ValidationError(f"{path.name}: {problem}")
+    found: dict[str, tuple[float, ...]] = {}
+    with path.open("rb") as file:
+        start = 8 + struct.unpack("<Q", file.read(8))[0]
+        for name, tensor in _header(path).items():
+            begin, end = (int(each) for each in tensor["data_offsets"])
+            code, count = _CODES.get(str(tensor.get("dtype"))), end - begin
+            if code is None or len(tensor.get("shape", ())) > 1 or not 0 < count <= VECTOR_MAX * 8:
+                continue
+            file.seek(start + begin)
+            found[name] = struct.unpack(f"<{count // struct.calcsize(code)}{code}", file.read(count))
+    return found
+
+
+_CODES = {"F16": "e", "F32": "f", "F64": "d"}
+"""Code in a ``struct`` of each type of number that is read."""
+
+
+NO_WEIGHTS = "it holds no weights"
 
 
 def _damage(path: Path) -> str:
@@ -147,7 +241,7 @@ def _damage(path: Path) -> str:
         start = 8 + struct.unpack("<Q", file.read(8))[0]
     missing = start + max(ends, default=0) - path.stat().st_size
     if not ends:
-        return "it holds no weights"
+        return NO_WEIGHTS
     return f"it lacks its last {missing} bytes" if missing > 0 else ""
 
 
@@ -166,7 +260,8 @@ def _header(path: Path) -> dict[str, Any]:
     return {name: each for name, each in header.items() if name != "__metadata__"}
 
 
-def _object(path: Path) -> dict[str, Any]:
+def json_object(path: Path) -> dict[str, Any]:
+    """Return the object of a JSON file. Raises :class:`ValidationError` without one."""
     try:
         content = read_json(path)
     except (OSError, ValueError) as exc:
@@ -176,32 +271,11 @@ def _object(path: Path) -> dict[str, Any]:
     return content
 
 
-def _shape(feature: object) -> tuple[int, ...]:
+def shape_of(feature: object) -> tuple[int, ...]:
+    """Return the shape of a feature; empty where it states none."""
     shape = feature.get("shape") if isinstance(feature, Mapping) else None
     return tuple(int(each) for each in shape) if isinstance(shape, list) and all(map(_is_count, shape)) else ()
 
 
 def _is_count(value: object) -> bool:
     return isinstance(value, int) and not isinstance(value, bool)
-
-
-def _names(feature: object) -> tuple[str, ...] | None:
-    names = feature.get("names") if isinstance(feature, Mapping) else None
-    if isinstance(names, Mapping) and len(names) == 1:
-        # Older data sets: {"motors": [...]}.
-        names = next(iter(names.values()))
-    return tuple(map(str, names)) if isinstance(names, list) and names else None
-
-
-def _stats(directory: Path) -> dict[str, tuple[float, ...]]:
-    """Return the statistics of the state, by kind; none where the file has none."""
-    try:
-        state = _object(directory / "meta" / "stats.json").get(STATE)
-    except ValueError:
-        return {}
-    kinds = state if isinstance(state, Mapping) else {}
-    return {
-        str(kind): tuple(map(float, values))
-        for kind, values in kinds.items()
-        if isinstance(values, list) and all(isinstance(v, int | float) and math.isfinite(v) for v in values)
-    }

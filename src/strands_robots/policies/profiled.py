@@ -11,7 +11,8 @@ from importlib import import_module
 from typing import Any, Protocol, runtime_checkable
 
 from strands_robots.policies.base import Action, Policy, PolicyError, Ranges, SpeedLimit, is_velocity, numbers
-from strands_robots.policies.check import CONVERTIBLE, PolicyCheckError, RobotFacts, check_policy, statements_of
+from strands_robots.policies.check import CONVERTIBLE, PolicyCheckError, check_policy, statements_of
+from strands_robots.policies.check_rows import RobotFacts
 from strands_robots.policies.inference import Inference, InferenceWorker, InlineInference
 from strands_robots.policies.loop_counts import LoopCounts
 from strands_robots.policies.playback import Playback
@@ -73,6 +74,7 @@ class ProfiledPolicy:
         self._inner = inner
         self._now: Callable[[], float] = time.monotonic
         self._scale: dict[str, float] = {}
+        self._told = False
         self._limit: SpeedLimit | None = None
         self._last: Action = {}
         self._hz = profile.rate or 0.0
@@ -111,6 +113,10 @@ class ProfiledPolicy:
         found = check_policy(self.profile, statements_of(self.profile), robot)
         if not found.passed:
             raise PolicyCheckError(found)
+        if found.unanswered and not self._told:
+            self._told = True
+            questions = ", ".join(dict.fromkeys(row.question for row in found.unanswered))
+            logger.warning("%s moves %s, and no source states: %s.", self.profile.name, robot.name, questions)
         keys = {*self.profile.state, *self.profile.environment, *self.profile.action}
         self._scale = {key: _scale(robot.units.get(key), self.profile.unit(key)) for key in keys}
         self._hz = robot.rate

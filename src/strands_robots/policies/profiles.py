@@ -22,7 +22,7 @@ LAYOUTS = ("libero", "droid", "aloha", "n1.5", "n1.6", "n1.6-flat")
 FLIPS = ("none", "180", "horizontal", "vertical")
 ASYNC = "lerobot_async"
 """Provider whose server loads what the profile tells it."""
-CONFIRMABLE = ("units", "rate", "image size")
+CONFIRMABLE = ("units", "rate", "image size", "robot type")
 """Facts that a profile may declare to be right although nothing states them."""
 
 KEYS_MAX = 64

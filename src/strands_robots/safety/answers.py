@@ -16,6 +16,11 @@ from strands_robots.safety.statements import Proof, Purpose, proof_of
 ANSWERS_MAX = 4096
 """Robots that answer one stop; further names that are not expected are not taken, so that they use no memory."""
 
+RUNS_MAX = 8
+"""Processes of one robot's name that answer one stop."""
+
+RUN_MAX = 64
+
 REFUSED = "resumed before"
 
 
@@ -31,6 +36,7 @@ class Answer:
         required: a signature of the robot was needed.
         enrolled: the robot's key is known here.
         delay_s: from the press to the stop's receipt by the robot, or None where clocks were not compared.
+        runs: the answer of each process of this name by its run id, which robots of earlier releases leave empty.
     """
 
     device_id: str
@@ -42,6 +48,7 @@ class Answer:
     required: bool = False
     enrolled: bool = False
     delay_s: float | None = None
+    runs: Mapping[str, Answer] = field(default_factory=dict)
 
     @property
     def claimed(self) -> bool:
@@ -77,6 +84,7 @@ class Answers:
         self._required = required
         self._pressed_at = pressed_at
         self._ahead_s: dict[str, tuple[float, float]] = {}
+        self._runs: dict[str, dict[str, Answer]] = {}
         self.by_robot: dict[str, Answer] = {}
         self.alarms: dict[str, str] = {}
 
@@ -99,10 +107,15 @@ class Answers:
             required=self._required or key is not None,
             enrolled=key is not None,
         )
-        known = self.by_robot.get(source)
+        runs, run = self._runs.setdefault(source, {}), "" if answer.claimed else _run(params)
+        # Made-up processes leave room for the robot's answer.
+        run = run if run in runs or len(runs) < RUNS_MAX else ""
+        known = runs.get(run)
         if known is not None and not _outranks(answer, known):
             return False
-        self.by_robot[source] = replace(answer, delay_s=self._delay_s(source, received))
+        runs[run] = replace(answer, delay_s=self._delay_s(source, received))
+        # One process that moves on outweighs the others.
+        self.by_robot[source] = replace(min(runs.values(), key=_rank), runs=dict(runs))
         return True
 
     def settled(self) -> frozenset[str]:
@@ -147,6 +160,15 @@ def _outranks(new: Answer, known: Answer) -> bool:
         # The robot's latest statement counts, in whatever order they arrive.
         return (seconds_of(new.facts.get("t")) or 0.0) > (seconds_of(known.facts.get("t")) or 0.0)
     return new.stopped is False and known.stopped is not False
+
+
+def _rank(answer: Answer) -> tuple[bool, int]:
+    return answer.claimed, 2 if answer.stopped else 1 if answer.stopped is None else 0
+
+
+def _run(params: Mapping[str, Any]) -> str:
+    run = params.get("run")
+    return run if isinstance(run, str) and len(run) <= RUN_MAX else ""
 
 
 def _why(params: Mapping[str, Any]) -> str:

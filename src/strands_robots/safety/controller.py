@@ -31,6 +31,7 @@ from strands_robots.safety.estop_listener import (
 from strands_robots.safety.head_witness import HeadWitness
 from strands_robots.safety.identity import KeyFileError
 from strands_robots.safety.missed_stops import ANSWER, QUESTION, MissedStops
+from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.orders import REASON_MAX, answered_field, new_epoch, params_of, signed_stop
 from strands_robots.safety.question_ports import ControllerPort
 from strands_robots.safety.roster_inbox import OnReport, RosterInbox
@@ -115,6 +116,11 @@ class StopReport:
     widened: bool = False
 
     @property
+    def widening(self) -> str:
+        """Reason why a stop of some robots became one of all, or ""."""
+        return f"no robot was there for {self.scope}: every robot was stopped" if self.widened else ""
+
+    @property
     def answered(self) -> Mapping[str, Answer]:
         """The answer of each robot that gave one."""
         return {**self.stopped, **self.not_stopped, **self.refused, **self.claimed}
@@ -168,6 +174,7 @@ class SafetyController:
         enrolled: gives the public keys of robots, read when this is made and once each stop has left.
         require_signed: count a robot that is not enrolled as *claimed* only.
         stands: receive the stops of other controllers, too, for :meth:`hear_others`.
+        network: of its stops, whose roster must answer them; None where that is not known.
         remembers: says whether this machine knows a robot in a scope; asked on a thread once such a stop has left.
     """
 
@@ -181,9 +188,10 @@ class SafetyController:
         enrolled: Callable[[], Mapping[str, bytes]] = dict,
         require_signed: bool = False,
         stands: bool = False,
+        network: NetworkKey | None = None,
         remembers: Remembers = none_known,
     ) -> None:
-        self.controller_id = device_id("controller_id", controller_id)
+        self.controller_id, self.network = device_id("controller_id", controller_id), network
         self._key = signing_key
         self._enrolled, self._require_signed = enrolled, require_signed
         self._remembers = remembers

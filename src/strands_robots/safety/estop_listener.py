@@ -35,6 +35,7 @@ from strands_robots.safety.orders import (
 )
 from strands_robots.safety.plane import SafetyPlane, plane
 from strands_robots.safety.question_ports import Member, RobotsPort
+from strands_robots.safety.sighting_file import own_run
 from strands_robots.safety.statements import Purpose, signed
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.turns import shorten_turns
@@ -440,7 +441,7 @@ class EstopListener:
                 self._open[registration.key].started()
             elif registration in self._registrations:
                 missed = self._open[registration.key] = self._missed_stops(registration)
-                receive = functools.partial(self._receive, missed, _text(registration.network))
+                receive = functools.partial(self.receive, network=_text(registration.network), missed=missed)
                 registration.link.open(EVENTS, receive, lambda up: missed.link_up() if up else None)
 
     def unregister(self, registration: ListenerRegistration) -> None:
@@ -510,8 +511,13 @@ class EstopListener:
         """Act on a stop that a device of this process raises; return at once."""
         self._plane.begin(order, self._answer)
 
-    def receive(self, event: str, source: str, payload: bytes | int, network: str = "") -> None:
+    def receive(
+        self, event: str, source: str, payload: bytes | int, network: str = "", missed: MissedStops | None = None
+    ) -> None:
         """Take an event from a link's thread; returns at once."""
+        if missed is not None and event in (QUESTION, ANSWER):
+            missed.receive(event, source, payload)
+            return
         events = self._queue
         if events is None:
             return
@@ -529,12 +535,6 @@ class EstopListener:
             events.put(event, source, payload, urgent=event == ESTOP, network=network)
         elif self._refusals.due(source):
             events.put(event, source, payload, urgent=False)
-
-    def _receive(self, missed: MissedStops, network: str, event: str, source: str, payload: bytes | int) -> None:
-        if event in (QUESTION, ANSWER):
-            missed.receive(event, source, payload)
-        else:
-            self.receive(event, source, payload, network)
 
     def _missed_stops(self, registration: ListenerRegistration) -> MissedStops:
         key, link = registration.key, registration.link
@@ -560,7 +560,7 @@ class EstopListener:
         self._rules = self._make_rules()
         self._rules.require_keys()
         self._check_ins = CheckInRules(self._rules)
-        audit_head(), own_log_id()  # read from the disk now, so that no stop waits for it
+        audit_head(), own_log_id(), own_run()  # read from the disk now, so that no stop waits for it
         self._end_short_turns = shorten_turns()
         self._end_watch = AWAKE.watch(self.awake)
         self._queue = FairQueue()
@@ -652,7 +652,8 @@ class EstopListener:
         halted_now = report.received_at is not None and not report.repeated
         payload = None if halted_now else self._repeated.get(same)
         if payload is None:
-            fields = {**report.fields(), "device_id": device_id, "audit": audit_head(), **self._cell(report)}
+            fields = {**report.fields(), "device_id": device_id, "run": own_run(), "audit": audit_head()}
+            fields |= self._cell(report)
             payload = notification(VERDICT, signed(identity, Purpose.STOP_VERDICT, device_id, fields))
             if not halted_now:
                 self._repeated[same] = payload

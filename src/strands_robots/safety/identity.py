@@ -43,6 +43,8 @@ SEED_BYTES = 32
 RETIRED, OFF = "retired", "off"
 EXEMPT_STATES = (RETIRED, OFF)
 
+NETWORKS_MAX = 8
+
 LOCK_S = 2.0
 """Seconds that a change of the enrolled robots waits for another process."""
 
@@ -167,6 +169,15 @@ def robot_identity(name: str) -> SigningIdentity | None:
         return None
 
 
+def key_here(name: str) -> bytes | None:
+    """Return the public key of a robot of this machine, None without a usable one."""
+    try:
+        identity = KeyFile(ROBOTS, name).load()
+    except (StrandsRobotsError, OSError):
+        return None
+    return None if identity is None else identity.public
+
+
 def robots_here(directory: Path | None = None) -> dict[str, SigningIdentity | str]:
     """Return the identities of this machine's robots by name, or why one is unusable."""
     found: dict[str, SigningIdentity | str] = {}
@@ -203,8 +214,8 @@ class EnrolledRobot:
 
     Attributes:
         key: its public key.
-        networks: where it was enrolled or last answered signed, one of each kind; empty in a record of an earlier
-            release, which counts on every network.
+        networks: where it was enrolled, the latest last; empty in a record of an earlier release, which counts on
+            every network until the robot has answered signed.
         exemption: None while it must answer.
     """
 
@@ -213,9 +224,9 @@ class EnrolledRobot:
     exemption: Exemption | None = None
 
     def at(self, network: NetworkKey) -> EnrolledRobot:
-        """Return the record with this network in place of the one of its kind."""
-        others = (each for each in self.networks if each.kind != network.kind)
-        return replace(self, networks=(*others, network))
+        """Return the record with this network besides those it has."""
+        others = (each for each in self.networks if not each.meets(network))
+        return replace(self, networks=(*others, network)[-NETWORKS_MAX:])
 
 
 class EnrolledKeys:
@@ -265,7 +276,7 @@ class EnrolledKeys:
 
         Args:
             found: keys of robots that were heard with them.
-            replace: a robot's changed key is taken.
+            replace: a robot's changed key is taken, and it is expected on this network alone of its kind.
             network: where they were heard.
 
         Raises:
@@ -284,7 +295,10 @@ class EnrolledKeys:
                     )
                 if robot is not None and robot.exemption is not None:
                     undone[name] = robot.exemption
-                record = EnrolledRobot(public, robot.networks if robot is not None else ())
+                networks = robot.networks if robot is not None else ()
+                if replace and network is not None:
+                    networks = tuple(each for each in networks if each.kind != network.kind)
+                record = EnrolledRobot(public, networks)
                 known[name] = record if network is None else record.at(network)
         return undone
 

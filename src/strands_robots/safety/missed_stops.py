@@ -21,6 +21,7 @@ from typing import Any, Protocol
 
 from strands_robots.audit import queue_safety_event
 from strands_robots.safety import ed25519
+from strands_robots.safety.answer_slots import AnswerSlots
 from strands_robots.safety.clocks import seconds_of
 from strands_robots.safety.identity import SigningIdentity
 from strands_robots.safety.orders import params_of
@@ -41,10 +42,16 @@ STARTED, BACK = "the process started", "its link is back"
 UNITE_S = 0.3
 """Seconds from the question for which motions hold, while the answers come in."""
 
-LISTEN_S = 1.0
+LISTEN_S = 1.9
 """Seconds from the question in which an answer counts; a busy machine answers late."""
 
 ASK_EVERY_S = 1.0
+LOCKED_EVERY_S = 5.0
+"""The same, while every robot of the process is locked: a fleet that stands still does not crowd a busy machine."""
+
+LOCKED_WAIT_S = 2.0
+"""Longest wait of such a process before it asks; drawn anew each time."""
+
 ASK_AGAIN_S = 2.0
 ASKS_MAX = 5
 """Questions after one reason: two, and more only while answers had to be dropped."""
@@ -61,7 +68,7 @@ ANSWER_EVERY_S = 0.1
 
 DEVICES_MAX = 64
 QUESTION_MAX_BYTES = 8 * 2**10
-QUESTIONS_MAX = 64
+QUESTIONS_MAX = 16
 """Questions that wait for one answer."""
 
 ANSWER_MAX_BYTES = 60 * 2**10
@@ -88,6 +95,9 @@ class MissedStopsPort(Protocol):
 
     def was_here(self) -> bool:
         """Return True where a robot was served from here before its start."""
+
+    def locked(self) -> bool:
+        """Return True while every robot of the process is locked."""
 
     def devices(self) -> Sequence[str]:
         """Return the names of the robots that ask; none, and nothing is asked."""
@@ -161,9 +171,17 @@ class Asker:
         """The moment of the next question; infinite where none is wanted."""
         return self._due if self._asks else float("inf")
 
-    def want(self, now: float) -> None:
-        """Ask, at once or as soon as a second has passed since the last question."""
-        self._due, self._asks = max(now, self._asked + ASK_EVERY_S), ASKS_MAX
+    def want(self, now: float, later_s: float = 0.0) -> None:
+        """Ask, at once or as soon as a second has passed since the last question.
+
+        Args:
+            later_s: seconds that a process whose robots are all locked waits; it does so at most every five seconds.
+        """
+        if not later_s:
+            self._due = max(now, self._asked + ASK_EVERY_S)
+        elif not self._asks:
+            self._due = max(now + later_s, self._asked + LOCKED_EVERY_S)
+        self._asks = ASKS_MAX
 
     def asked(self, now: float) -> None:
         """Note that a question leaves, and plan the next one."""
@@ -207,6 +225,11 @@ class Answerer:
         return bool(self._questions)
 
     @property
+    def nonces(self) -> tuple[str, ...]:
+        """The questions that wait."""
+        return tuple(self._questions)
+
+    @property
     def full(self) -> bool:
         """True while no further question is taken; the next answer serves its asker too."""
         return len(self._questions) >= QUESTIONS_MAX
@@ -227,8 +250,8 @@ class Answerer:
                 for epoch in named:
                     given.setdefault(epoch, set()).add(answerer)
 
-    def take(self, originals: Iterable[Original], now: float) -> tuple[str, list[Original]]:
-        """Return one question and the stops that it is still to be told; end all."""
+    def take(self, originals: Iterable[Original], now: float) -> list[Original]:
+        """Return the stops that one of the questions is still to be told; end all."""
         questions, self._questions, self._due = self._questions, {}, float("inf")
         rest = [
             each
@@ -237,7 +260,7 @@ class Answerer:
         ]
         if rest:
             self._answered = now
-        return next(iter(questions), ""), rest
+        return rest
 
 
 def waiting_s(chance: float) -> float:
@@ -302,6 +325,7 @@ class MissedStops:
         chance: Callable[[], float] = random.random,
     ) -> None:
         self._port, self._parse, self._clock = port, parse, clock
+        self._chance, self._slots = chance, AnswerSlots()
         self._asker, self._answerer = Asker(), Answerer(chance)
         self._reasons: deque[str] = deque(maxlen=8)
         self._questions: deque[tuple[str, bytes]] = deque(maxlen=QUESTIONS_MAX)
@@ -386,9 +410,10 @@ class MissedStops:
                     continue
                 self._port.hold(UNITE_S)
             logger.info("Asking for the stops missed: %s.", reason)
-            self._asker.want(self._clock())
+            self._asker.want(self._clock(), self._chance() * LOCKED_WAIT_S if self._port.locked() else 0.0)
         self._take_questions()
-        self._take_answers()
+        if self._asker.listens(self._clock()):
+            self._take_answers()
         now = self._clock()
         if now >= self._asker.due:
             self._ask()
@@ -454,12 +479,21 @@ class MissedStops:
                     return
 
     def _answer(self) -> None:
+        originals = self._port.originals()
+        questions = self._slots.take(self._answerer.nonces, [each.epoch for each in originals]) if originals else []
+        if questions:
+            # What others answered is checked now: most processes get no slot and need not.
+            self._take_answers()
+        else:
+            originals = ()
         now = self._clock()
-        nonce, rest = self._answerer.take(self._port.originals(), now)
+        rest = self._answerer.take(originals, now)
+        if not self._asker.listens(now):
+            self._answers.clear()
         if not rest:
             return
         name, identity = self._port.signer()
-        fields = answer_fields(nonce, rest)
+        fields = answer_fields(questions[0], rest)
         self._port.publish(ANSWER, name, signed(identity, Purpose.MISSED_STOPS, name, fields))
         if now - self._audited >= AUDIT_EVERY_S:
             self._audited = now

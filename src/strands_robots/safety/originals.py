@@ -105,6 +105,12 @@ class Originals:
         """
         self._new.append(original)
 
+    def has(self, epoch: str, network: str) -> bool:
+        """Return True where this stop is kept, or is about to be."""
+        return (network, epoch) in self._stored or any(
+            (each.network, each.epoch) == (network, epoch) for each in self._new
+        )
+
     def of(self, epochs: Collection[str], network: str | None = None) -> list[Original]:
         """Return those of these epochs, oldest first."""
         with self._lock:

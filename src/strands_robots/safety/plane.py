@@ -86,7 +86,7 @@ class Registered:
         self.on_disk = kept.state
         self.registered_before = kept.resumed is not None
         self.resumed_on_disk = self.latch.resumed if self.registered_before else None
-        self._since = resumed.since
+        self._recorded_since, self._here_since = resumed.since, uptime()
         self.keep_again = False
         self.verdict = StopVerdict(unknown={robot_id: "its halt has not answered yet"})
         self._halted_at = float("-inf")
@@ -110,7 +110,7 @@ class Registered:
     @property
     def resumed(self) -> ResumedEpochs:
         """The record of the epochs that it was resumed from."""
-        return ResumedEpochs(self.latch.resumed, self._since)
+        return ResumedEpochs(self.latch.resumed, self._recorded_since)
 
     @property
     def unsaved(self) -> bool:
@@ -142,7 +142,7 @@ class Registered:
         """Store this robot under ``key``, and take over what is stored there."""
         self.key = key
         if kept.resumed is not None:
-            self.registered_before, self._since = True, min(self._since, kept.resumed.since)
+            self.registered_before, self._recorded_since = True, kept.resumed.since
             self.latch.forgo(kept.resumed.epochs)
         self.inherit(kept.state)
 
@@ -150,6 +150,12 @@ class Registered:
         """Take over the lockouts of another entry, except what was resumed here since."""
         for each in state.all:
             self.latch.engage(each.epoch, each.source, each.reason, each.scope)
+
+    def returned(self) -> bool:
+        """Count as a robot that was here before its process; False without a record."""
+        if self.registered_before:
+            self._here_since = min(self._here_since, self._recorded_since)
+        return self.registered_before
 
     def come_up_locked(self) -> None:
         """Halt motion that began before the lock was known; return at once."""
@@ -171,9 +177,9 @@ class Registered:
         """Lock under the order; True when it has to be carried out.
 
         A stop is known, or one of a flood that locks nothing more: the latest halt answers for it. A missed one may be
-        older than the robot.
+        from before its time.
         """
-        if order.age_s > uptime() - self._since:
+        if order.age_s > uptime() - self._here_since:
             return False
         lock = functools.partial(self.latch.engage, order.epoch, order.source, order.reason, order.scope)
         if not self.crowded:
@@ -417,9 +423,7 @@ class SafetyPlane:
                     since=order.received,
                     answered=functools.partial(reporter.answer, run, entry.robot_id),
                 )
-            if order.original is not None:
-                received = uptime() - (time.monotonic() - order.received) - order.age_s
-                self._originals.add(Original(order.epoch, order.source, order.original, order.network, received))
+            self._note_original(order)
             reporter.begin(run)
             followed = True
             if self._reporter is not reporter:
@@ -554,6 +558,15 @@ class SafetyPlane:
             on_report(report)
         if any(entry.crowded and order.epoch not in entry.epochs for entry in robots):
             self._counted.add(order.source)
+        late = order.original is not None and not self._originals.has(order.epoch, order.network)
+        if late and any(entry.latch.state.can_resume(order.epoch) for entry in robots):
+            # It came without its bytes first, from the framework or from a device here.
+            self._note_original(order)
+
+    def _note_original(self, order: StopOrder) -> None:
+        if order.original is not None:
+            received = uptime() - (time.monotonic() - order.received) - order.age_s
+            self._originals.add(Original(order.epoch, order.source, order.original, order.network, received))
 
     def _keep(self, entries: Iterable[Registered]) -> None:
         # One at a time, so that no older state is written over a newer one.

@@ -6,8 +6,8 @@ SERVED or SIGNED count; names that were only HEARD are told and do not alter the
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety.identity import EnrolledKeys, EnrolledRobot, Exemption, of_tenant
@@ -34,6 +34,7 @@ class RosterRow:
         departed: it said, unsigned, that it left.
         alive: its process on this machine lives; None where it is not served from here.
         pid: of that process.
+        processes: run id and pid of every living process of this machine that serves it; each must answer.
         exemption: of rows of :attr:`Roster.exempt`.
         reported_by: the controller that reported it, "" where this machine heard it.
     """
@@ -48,8 +49,37 @@ class RosterRow:
     departed: bool = False
     alive: bool | None = None
     pid: int | None = None
+    processes: tuple[tuple[str, int], ...] = ()
     exemption: Exemption | None = None
     reported_by: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class _Memory:
+    """Memory of all networks, and the names of the one asked for."""
+
+    networks: tuple[NetworkKey, ...]
+    found: tuple[Sighting, ...]
+    enrolled: Mapping[str, EnrolledRobot]
+    problems: tuple[str, ...]
+
+    def at(self, networks: Iterable[NetworkKey]) -> bool:
+        return any(own.meets(each) for each in networks for own in self.networks)
+
+    def here(self, sighting: Sighting) -> bool:
+        return self.at((sighting.network,))
+
+    def further(self, proven: Mapping[str, Collection[str]]) -> tuple[NetworkKey, ...]:
+        """Return networks that are the one asked for, as robots prove."""
+        recorded = {key for name in proven if name in self.enrolled for key in self.enrolled[name].networks}
+        recorded |= {
+            each.network
+            for each in self.found
+            if each.name in proven and not {run for run, _ in each.processes}.isdisjoint(proven[each.name])
+        }
+        kind, tenant = self.networks[0].kind, self.networks[0].tenant
+        alike = (each for each in recorded if (each.kind, each.tenant) == (kind, tenant) and not self.at((each,)))
+        return tuple(sorted(alike, key=lambda each: each.text))
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +101,7 @@ class Roster:
     elsewhere: int = 0
     enrolled: int = 0
     problems: tuple[str, ...] = ()
+    _memory: _Memory | None = field(default=None, repr=False, compare=False)
 
     @classmethod
     def of(
@@ -98,10 +129,18 @@ class Roster:
         except (StrandsRobotsError, OSError) as exc:
             enrolled = {}
             problems.append(f"the enrolled robots cannot be read: {exc}")
+        return cls._at(_Memory((network,), tuple(found), enrolled, tuple(problems)))
+
+    @classmethod
+    def _at(cls, memory: _Memory) -> Roster:
         rows: dict[str, RosterRow] = {}
-        for each in sorted((each for each in found if each.network.meets(network)), key=_surest_first):
+        processes: dict[str, dict[str, int]] = {}
+        for each in sorted(filter(memory.here, memory.found), key=_surest_first):
             rows.setdefault(each.name, _row_of(each))
-        here = {name: robot for name, robot in enrolled.items() if _is_at(robot, network)}
+            processes.setdefault(each.name, {}).update(each.processes)
+        rows = {name: replace(row, processes=tuple(processes[name].items())) for name, row in rows.items()}
+        enrolled = memory.enrolled
+        here = {name: robot for name, robot in enrolled.items() if not robot.networks or memory.at(robot.networks)}
         exempt: list[RosterRow] = []
         for name, robot in here.items():
             known = replace(rows.get(name, RosterRow(name, Known.ENROLLED)), exemption=robot.exemption)
@@ -110,17 +149,61 @@ class Roster:
                 rows.pop(name, None)
             else:
                 # A robot that this machine serves now is there, whatever was decided about it.
-                rows[name] = replace(known, known=Known.ENROLLED, exemption=None)
+                rows[name] = replace(known, known=Known.ENROLLED, stoppable=True, exemption=None)
         others = {name for name, robot in enrolled.items() if name not in here and robot.exemption is None}
-        served = {each.name for each in found if each.alive and not each.network.meets(network)}
+        served = {each.name for each in memory.found if each.alive and not memory.here(each)}
         return cls(
-            network,
+            memory.networks[0],
             in_order(rows.values()),
             in_order(exempt),
             len(others | served),
             sum(robot.exemption is None for robot in here.values()),
-            tuple(problems),
+            memory.problems,
+            memory,
         )
+
+    @property
+    def joined(self) -> tuple[NetworkKey, ...]:
+        """Further names of this network, as :meth:`with_answers` found."""
+        return () if self._memory is None else self._memory.networks[1:]
+
+    @property
+    def served_elsewhere(self) -> frozenset[str]:
+        """Robots that living processes of this machine serve on other networks."""
+        memory = self._memory
+        if memory is None:
+            return frozenset()
+        return frozenset(each.name for each in memory.found if each.alive and not memory.here(each))
+
+    def with_answers(self, proven: Mapping[str, Collection[str]]) -> Roster:
+        """Return the roster with the robots of networks that are this one.
+
+        A network may be reached under several addresses. A robot that answers here and is enrolled under another one,
+        or whose very process is served under it, shows that both are the same. It adds rows and takes none away.
+
+        Args:
+            proven: robots that answered, signed by a key that is known here, and the run ids in their answers.
+        """
+        memory = self._memory
+        while memory is not None and (further := memory.further(proven)):
+            memory = replace(memory, networks=(*memory.networks, *further))
+        if memory is None or memory is self._memory:
+            return self
+        joined = Roster._at(memory)
+        rows = {row.name: row for row in joined.rows}
+        for row in self.rows:
+            also = rows.get(row.name, row)
+            surer = also.known < row.known
+            rows[row.name] = replace(
+                row,
+                known=also.known if surer else row.known,
+                stoppable=True if surer else row.stoppable,
+                processes=also.processes,
+            )
+        exempt = tuple(row for row in joined.exempt if row.name not in rows)
+        # Names that were only heard count on as they did.
+        enrolled = joined.enrolled if self.enrolled else 0
+        return replace(joined, rows=in_order(rows.values()), exempt=exempt, enrolled=enrolled)
 
     def counts(self, row: RosterRow) -> bool:
         """True when the exit code depends on this row."""
@@ -137,15 +220,20 @@ class Roster:
         return tuple(row for row in self.rows if not self.counts(row))
 
     def with_reported(self, rows: Iterable[RosterRow], by: str) -> Roster:
-        """Return the roster with rows that ``by`` reported; one known here stays."""
-        here = {row.name for row in (*self.rows, *self.exempt)}
-        added = tuple(replace(row, reported_by=by) for row in rows if row.name not in here)
-        return replace(self, rows=in_order((*self.rows, *added)))
+        """Return the roster with rows that the controller ``by`` reported.
 
-
-def _is_at(robot: EnrolledRobot, network: NetworkKey) -> bool:
-    """Return True where a robot is enrolled here; an old record is for all."""
-    return not robot.networks or any(map(network.meets, robot.networks))
+        A row of this machine stays, and takes the surer of the two grades. Where the controller's signature is not
+        verified the caller passes every row as HEARD.
+        """
+        united = {row.name: row for row in self.rows}
+        exempt = {row.name for row in self.exempt}
+        for row in rows:
+            known = united.get(row.name)
+            if known is None and row.name not in exempt:
+                united[row.name] = replace(row, reported_by=by)
+            elif known is not None and row.known < known.known:
+                united[row.name] = replace(known, known=row.known, stoppable=True, reported_by=by)
+        return replace(self, rows=in_order(united.values()))
 
 
 def _surest_first(sighting: Sighting) -> tuple[int, float]:

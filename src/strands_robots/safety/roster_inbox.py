@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Any
 
 from strands_robots.safety.estop_listener import FairQueue
 from strands_robots.safety.orders import params_of
@@ -22,7 +23,7 @@ logger = stop_logger(__name__)
 UNPROVEN_PAUSE_S = 0.005
 """Pause after a report of a source that no known key has signed, so that a flood of them costs little."""
 
-OnReport = Callable[[RosterReport], None]
+OnReport = Callable[[RosterReport], object]
 
 
 class RosterInbox:
@@ -30,9 +31,13 @@ class RosterInbox:
 
     A source whose report was signed with a known key has every second turn, so that a flood under made-up names keeps
     no such report away for long.
+
+    Args:
+        read: returns the fields of a message; empty for what is none.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, read: Callable[[bytes], Mapping[str, Any]] = params_of) -> None:
+        self._read = read
         self._lock = threading.Lock()
         self._stops: dict[str, OnReport] = {}
         self._queue = FairQueue()
@@ -70,7 +75,8 @@ class RosterInbox:
                 trusted = frozenset()
                 continue
             trusted = trusted or trusted_controllers()
-            report = read_report(event.source, params_of(event.payload), trusted)
+            fields = {} if isinstance(event.payload, int) else self._read(event.payload)
+            report = read_report(event.source, fields, trusted)
             with self._lock:
                 on_report = None if report is None else self._stops.get(report.estop_id)
             if report is None or not report.trusted:

@@ -7,11 +7,13 @@ file is put aside and begun again; for ten minutes from then every reader is tol
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -153,6 +155,7 @@ class Sighting:
         departed: it said, unsigned, that it left.
         alive: of a robot served from this machine: its process lives.
         pid: of that process, else None.
+        processes: run id and pid of every living process that serves it.
     """
 
     network: NetworkKey
@@ -166,6 +169,7 @@ class Sighting:
     departed: bool = False
     alive: bool | None = None
     pid: int | None = None
+    processes: tuple[tuple[str, int], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,9 +213,13 @@ class Served:
     ended: bool = False
 
     @property
-    def alive(self) -> bool:
+    def run(self) -> str:
+        """The run id of its process, as its signed answers state it."""
+        return _run(self.at.boot, self.pid, self.started)
+
+    def lives(self, now: Moment) -> bool:
         """True while its process lives and serves it."""
-        return not self.ended and self.at.boot == boot() and process_start(self.pid) == self.started != ""
+        return not self.ended and self.at.boot == now.boot and process_start(self.pid) == self.started != ""
 
 
 def process_start(pid: int) -> str:
@@ -233,6 +241,20 @@ def process_start(pid: int) -> str:
     except PermissionError:
         return "unknown"
     return "unknown"
+
+
+def own_run() -> str:
+    """Return the run id of this process: 16 hex digits, another one in each process."""
+    return _run_of(os.getpid())
+
+
+@lru_cache(maxsize=4)
+def _run_of(pid: int) -> str:
+    return _run(boot(), pid, process_start(pid))
+
+
+def _run(since_boot: str, pid: int, started: str) -> str:
+    return hashlib.sha256(f"{since_boot} {pid} {started}".encode()).hexdigest()[:16]
 
 
 class SightingFile:
@@ -311,7 +333,7 @@ class SightingFile:
         gone = [
             (each.network.text, each.name, each.pid, each.started)
             for each in self._served(connection)
-            if each.at.age_s(now) >= RECENT_S and not each.alive
+            if each.at.age_s(now) >= RECENT_S and not each.lives(now)
         ]
         connection.executemany("DELETE FROM served WHERE network = ? AND name = ? AND pid = ? AND started = ?", gone)
         connection.execute(
@@ -431,9 +453,12 @@ def _moment_row(at: Moment) -> tuple[str, float, float]:
 def _united(heard: Sequence[tuple[object, ...]], served: Sequence[Served], now: Moment) -> list[Sighting]:
     """Return the sightings of the ten minutes before ``now``, one a robot and key."""
     latest: dict[tuple[NetworkKey, str], Served] = {}
+    living: dict[tuple[NetworkKey, str], dict[str, int]] = {}
     for row in served:
+        if row.lives(now):
+            living.setdefault((row.network, row.name), {})[row.run] = row.pid
         known = latest.get((row.network, row.name))
-        if known is None or (row.alive, -row.at.age_s(now)) > (known.alive, -known.at.age_s(now)):
+        if known is None or (row.lives(now), -row.at.age_s(now)) > (known.lives(now), -known.at.age_s(now)):
             latest[row.network, row.name] = row
     by_name: dict[str, list[Served]] = {}
     for row in latest.values():
@@ -447,7 +472,7 @@ def _united(heard: Sequence[tuple[object, ...]], served: Sequence[Served], now: 
         if not any(seen.age_s >= row.at.age_s(now) - LEAVING_S for row in ended):
             found[seen.network, seen.name] = seen
     for key, own in latest.items():
-        alive, age = own.alive, own.at.age_s(now)
+        alive, age = own.lives(now), own.at.age_s(now)
         if own.ended or not (alive or age < RECENT_S):
             continue
         seen = found.get(key) or Sighting(own.network, own.name, Known.SERVED, age)
@@ -460,6 +485,7 @@ def _united(heard: Sequence[tuple[object, ...]], served: Sequence[Served], now: 
             stoppable=True,
             alive=alive,
             pid=own.pid,
+            processes=tuple(living.get(key, {}).items()),
         )
     return list(found.values())
 

@@ -17,8 +17,9 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
+from weakref import WeakSet
 
-from strands_robots.audit import queue_safety_event
+from strands_robots.audit import log_safety_event
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety.approval import state_dir
 from strands_robots.safety.identity import EnrolledKeys, local_name
@@ -39,7 +40,7 @@ from strands_robots.safety.sighting_file import (
 from strands_robots.safety.statements import STATED_WITHIN_S, Purpose, own_key
 from strands_robots.safety.stop_log import stop_logger
 
-__all__ = ["RECENT_S", "Known", "Moment", "Sighting", "Sightings", "sightings", "this_moment"]
+__all__ = ["RECENT_S", "Known", "Moment", "Sighting", "Sightings", "flush_sightings", "sightings", "this_moment"]
 
 logger = stop_logger(__name__)
 
@@ -290,7 +291,7 @@ class Sightings:
         """Start the writing thread unless it runs; the lock is held. False without one."""
         if self._thread is not None and self._thread.is_alive():
             return True
-        _end_in_order(self)
+        _STARTED.add(self)
         thread = threading.Thread(target=self._work, name="sightings", daemon=True)
         try:
             thread.start()
@@ -381,7 +382,7 @@ class Sightings:
                 undone = enrolled.heard(local_name(network.tenant, name), key, network)
                 if undone is not None:
                     facts = {"was": undone.state, "by": undone.by, "network": network.text}
-                    queue_safety_event("exemption_undone", name, facts)
+                    log_safety_event("exemption_undone", name, facts)
                     logger.warning("%s was %s and was heard with its enrolled key: it must answer.", name, undone.state)
         except (StrandsRobotsError, OSError) as exc:
             logger.warning("The enrolled robots could not be updated: %s", exc)
@@ -423,10 +424,16 @@ def _storable(name: str) -> bool:
     return 0 < len(name) <= NAME_MAX and name.isprintable()
 
 
-@lru_cache(maxsize=64)
-def _end_in_order(store: Sightings) -> None:
-    """Have the end of the process write what is queued."""
-    atexit.register(store.flush, ENDING_S)
+_STARTED: WeakSet[Sightings] = WeakSet()
+
+
+def flush_sightings(within: float = ENDING_S) -> None:
+    """Write what is queued, at the end of the process."""
+    for store in tuple(_STARTED):
+        store.flush(within)
+
+
+atexit.register(flush_sightings)
 
 
 @lru_cache(maxsize=16)

@@ -18,6 +18,7 @@ from strands_robots.safety.identity import SigningIdentity
 from strands_robots.safety.orders import StopRules, params_of, stated_epoch
 from strands_robots.safety.roster import Roster, RosterRow
 from strands_robots.safety.roster_report import report_fields
+from strands_robots.safety.scope import EVERY_ROBOT, SCOPE, Scope
 from strands_robots.safety.sightings import Known
 from strands_robots.safety.statements import Purpose, signed
 from strands_robots.safety.stop_log import stop_logger
@@ -45,6 +46,11 @@ VERDICTS_MAX_BYTES = 4 * 2**20
 
 EACH_MAX = 4
 
+Unanswered = Callable[[str, Mapping[str, RosterRow]], Collection[str]]
+"""Returns those of the rows that are not known to have received the stop of this id."""
+
+ReadStop = Callable[[str, bytes], tuple[str, Mapping[str, Any]]]
+
 Publish = Callable[[Mapping[str, Any]], object]
 """Sends the fields of a report under the controller's name."""
 
@@ -55,6 +61,7 @@ class _Followed:
 
     estop_id: str
     due: list[float]
+    scope: Scope = EVERY_ROBOT
     last: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -71,6 +78,8 @@ class StandingRoster:
         keys: reads the enrolled public keys by robot.
         identity: signs the reports; None where there is no key.
         also: names that the controller shows besides.
+        read: returns the source and the fields of a stop, from what the topic names and the message.
+        unanswered: where the answers of robots are not for all to hear; by default they are.
     """
 
     def __init__(
@@ -82,14 +91,17 @@ class StandingRoster:
         keys: Callable[[], Mapping[str, bytes]],
         identity: Callable[[], SigningIdentity | None],
         also: Callable[[], Collection[str]] = tuple,
+        read: ReadStop = lambda source, payload: (source, params_of(payload)),
+        unanswered: Unanswered | None = None,
     ) -> None:
         self._source, self._publish = source, publish
         self._roster, self._keys, self._identity, self._also = roster, keys, identity, also
+        self._read, self._unanswered = read, unanswered
         self._pending: dict[str, bytes] = {}
         self._answers: dict[str, tuple[bytes, ...]] = {}
         self._bytes = 0
         self._followed: dict[str, _Followed] = {}
-        self._done: dict[str, None] = {}
+        self._done: dict[tuple[str, Scope], None] = {}
         self._wake, self._closed = threading.Event(), False
         self._rules = StopRules(allow=())
         self._thread = threading.Thread(target=self._run, name="standing roster", daemon=True)
@@ -138,21 +150,26 @@ class StandingRoster:
     def _take_stops(self) -> None:
         pending, self._pending = self._pending, {}
         now = time.monotonic()
-        for source, payload in list(pending.items()):
-            params = params_of(payload)
+        for sender, payload in list(pending.items()):
+            source, params = self._read(sender, payload)
+            if source == self._source:
+                continue
             estop_id = stated_epoch(source, params)
             last = self._followed.get(source)
-            if not estop_id or estop_id in self._done or (last is not None and last.estop_id == estop_id):
+            # A stop of some robots may be widened to one of all, under its id.
+            scope = self._rules.scope(source, params) if SCOPE in params else EVERY_ROBOT
+            mark = (estop_id, scope)
+            if not estop_id or mark in self._done or (last is not None and (last.estop_id, last.scope) == mark):
                 continue
             if last is None and len(self._followed) >= SOURCES_MAX:
                 continue
             if self._rules.signature_refusal(source, params, Purpose.EMERGENCY_STOP) is None:
-                self._note_done(estop_id)
+                self._note_done(mark)
                 spread = random.random() * SPREAD_S
-                self._followed[source] = _Followed(estop_id, [now + at + spread for at in REPORT_AT_S])
+                self._followed[source] = _Followed(estop_id, [now + at + spread for at in REPORT_AT_S], scope)
 
-    def _note_done(self, estop_id: str) -> None:
-        self._done[estop_id] = None
+    def _note_done(self, mark: tuple[str, Scope]) -> None:
+        self._done[mark] = None
         while len(self._done) > 4 * SOURCES_MAX:
             del self._done[next(iter(self._done))]
 
@@ -166,7 +183,7 @@ class StandingRoster:
             followed = self._followed[source]
             while followed.due and followed.due[0] <= now:
                 followed.due.pop(0)
-            fields = report_fields(followed.estop_id, self._missing(followed.estop_id, roster, keys))
+            fields = report_fields(followed.estop_id, self._missing(followed, roster, keys))
             # A controller that missed robots says when it misses none any more.
             if fields != followed.last and (fields["missing"] or followed.last):
                 followed.last = fields
@@ -176,15 +193,19 @@ class StandingRoster:
         if not self._followed:
             self._answers, self._bytes = {}, 0
 
-    def _missing(self, estop_id: str, roster: Roster, keys: Mapping[str, bytes]) -> list[RosterRow]:
+    def _missing(self, followed: _Followed, roster: Roster, keys: Mapping[str, bytes]) -> list[RosterRow]:
         rows = {row.name: row for row in roster.rows if row.stoppable is not False or counts(roster, row)}
         marked = {row.name for row in roster.exempt}
         rows |= {name: RosterRow(name, Known.HEARD) for name in self._also() if name not in rows and name not in marked}
+        scope = followed.scope
+        rows = {name: row for name, row in rows.items() if scope.covers(name, {row.cell} - {""})}
+        if self._unanswered is not None:
+            return [rows[name] for name in self._unanswered(followed.estop_id, rows)]
         graded = Answers(keys, required=False, pressed_at=0.0)
         for name in rows:
             for payload in self._answers.get(name, ()):
                 params = params_of(payload)
-                if params.get("estop_id") == estop_id:
+                if params.get("estop_id") == followed.estop_id:
                     graded.take(name, Received(params, 0.0, 0.0))
         return [rows[name] for name in graded.unsettled(rows)]
 

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 from strands_robots.audit import queue_safety_event
 from strands_robots.safety.answers import Answer
 from strands_robots.safety.controller import StopReport
-from strands_robots.safety.network_key import NetworkKey
+from strands_robots.safety.identity import key_here, local_name
+from strands_robots.safety.network_key import DEVICE_CONNECT, NetworkKey
 from strands_robots.safety.roster import Roster, RosterRow
 from strands_robots.safety.roster_report import RosterReport
+from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope
 from strands_robots.safety.sightings import Known, sightings
 from strands_robots.safety.silence import Sending, reason_of
 from strands_robots.safety.state_files import uptime
-from strands_robots.safety.statements import Purpose
+from strands_robots.safety.statements import Proof, Purpose, proof_of
 
 OTHERS_AWAITED = 64
 """Names that do not alter the exit code, and for whose answer a stop goes on all the same."""
@@ -86,13 +88,13 @@ class StopOutcome:
         """The limit of that sentence where no robot is enrolled, else ""."""
         if self.roster.enrolled:
             return ""
-        return f"No robot is enrolled here: a robot that was not heard for ten minutes is not missed. {ENROLL}"
+        return f"No robot is enrolled here, so one that was not heard for ten minutes is not missed: {ENROLL}"
 
     def facts(self) -> dict[str, Any]:
         """Return what a script reads besides the report's own fields."""
         return {
             "roster": {"size": self.size, "still": len(self.report.stopped), "enrolled": self.roster.enrolled},
-            "reasons": dict(self.reasons),
+            "reasons": dict(list(self.reasons.items())[:NAMED_MAX]),
             "retired": [row.name for row in self.roster.exempt if row.exemption and row.exemption.state == "retired"],
             "off": [row.name for row in self.roster.exempt if row.exemption and row.exemption.state == "off"],
             "elsewhere": self.roster.elsewhere,
@@ -121,6 +123,8 @@ class StopOutcome:
                 "denied": self.sending.denied,
                 "problems": list(self.problems),
                 "ok": self.ok,
+                **report.scope.field(),
+                **({"widened": True} if report.widened else {}),
             },
         )
 
@@ -131,14 +135,18 @@ class StopRoster:
     Args:
         network: of the stop.
         named: robots that the caller says must answer, besides the roster.
+        scope: the robots that the stop is for. Those that stop all the same must answer as well.
     """
 
-    def __init__(self, network: NetworkKey, named: Collection[str] = ()) -> None:
+    def __init__(self, network: NetworkKey, named: Collection[str] = (), scope: Scope = EVERY_ROBOT) -> None:
         self._network, self._pressed = network, uptime()
         self._lock, self._is_read = threading.Lock(), threading.Event()
-        self._named = frozenset(named)
+        self._named, self._asked, self.scope = frozenset(named) | scope.only, scope, scope
         self._roster = Roster(network, problems=("the roster was not read in time",))
+        self._keys: dict[str, bytes | None] = {}
+        self._divided: dict[str, str] = {}
         self._found: dict[str, bool] = {}
+        self._cells: dict[str, str | None] = {}
         self._trusted: dict[str, RosterReport] = {}
         self._unproven: dict[str, RosterReport] = {}
 
@@ -152,10 +160,20 @@ class StopRoster:
             self._roster = roster
         self._is_read.set()
 
-    def find(self, devices: Mapping[str, bool]) -> None:
-        """Take devices that were found since the press, and whether each has a stop."""
+    def find(self, devices: Mapping[str, bool], cells: Mapping[str, str | None] | None = None) -> None:
+        """Take devices that were found since the press, and whether each has a stop.
+
+        Args:
+            cells: of each; None for one that states none, and reads no scope.
+        """
         with self._lock:
             self._found |= devices
+            self._cells |= cells or {}
+
+    def widen(self) -> None:
+        """Have every robot answer: the stop has become one of all."""
+        with self._lock:
+            self.scope = EVERY_ROBOT
 
     def take(self, report: RosterReport) -> bool:
         """Take a controller's report in place of its last; False where nothing changed."""
@@ -166,11 +184,22 @@ class StopRoster:
             kept[report.source] = report
         return True
 
-    @property
-    def incomplete(self) -> bool:
-        """True while a controller misses more robots than it has named."""
+    def incomplete(self, answered: Mapping[str, Answer] | None = None) -> bool:
+        """Return True while robots are missing that no name stands for.
+
+        A controller misses more than it has named, or one of several processes of a name gives no answer.
+        """
+        answers = answered or {}
         with self._lock:
-            return any(each.more for each in self._trusted.values())
+            twice = [row for row in self._roster.rows if len(row.processes) > 1 and row.name in answers]
+            more = any(each.more for each in self._trusted.values())
+        return more or any(self._unanswered(row, answers[row.name]) for row in twice)
+
+    @property
+    def divided(self) -> bool:
+        """True where several processes serve a robot, so that each answer counts."""
+        with self._lock:
+            return any(len(row.processes) > 1 for row in self._roster.rows)
 
     def awaited(self, answered: Mapping[str, Answer] | None = None) -> frozenset[str]:
         """Return the robots for whose answer the stop goes on.
@@ -194,18 +223,23 @@ class StopRoster:
             problem: why robots may be missing that were to be found.
         """
         sending = sending or Sending(report.link)
+        if report.widened:
+            self.widen()
+        report = replace(report, scope=self._asked, widened=self.scope != self._asked)
         # The stop is over; a disk that hangs is given this long.
         self._is_read.wait(READ_WITHIN_S)
         with self._lock:
             roster, found = self._whole(report.answered.items()), dict(self._found)
             unproven = _missed_by(self._unproven, roster)
             problems = [*roster.problems, *([problem] if problem else [])]
+            problems += [report.widening] if report.widening else []
             problems += [
                 f"{each.source} misses {each.more} more robots than it names"
                 for each in self._trusted.values()
                 if each.more
             ]
         rows = {row.name: row for row in roster.rows}
+        report, divided = self._proven(report, rows)
         must = {row.name for row in roster.rows if counts(roster, row)} | report.alarms.keys()
         no_stop = tuple(row.name for row in roster.rows if row.stoppable is False and row.name not in must)
         told = {*rows} - must - {*no_stop}
@@ -215,12 +249,54 @@ class StopRoster:
             name: reason_of(rows[name], sending, found=name in found, elsewhere=elsewhere)
             for name in counted.silent
             if name in rows
-        }
+        } | {name: why for name, why in divided.items() if name in counted.silent}
         return StopOutcome(counted, others, roster, no_stop, unproven, reasons, tuple(problems), sending)
+
+    def _proven(self, report: StopReport, rows: Mapping[str, RosterRow]) -> tuple[StopReport, dict[str, str]]:
+        """Return the report without what proves nothing of robots that are served here.
+
+        Their keys lie on this machine, whether or not they are enrolled, so an unsigned answer is a claim. Where a
+        process gave no answer the robot is silent, and the second part of the result says why.
+        """
+        stopped, claimed, why = dict(report.stopped), dict(report.claimed), dict[str, str]()
+        for name, answer in report.stopped.items():
+            row = rows.get(name)
+            if row is None or not row.processes:
+                continue
+            missing = self._unanswered(row, answer)
+            if not self._proven_runs(name, answer):
+                claimed[name] = replace(stopped.pop(name), required=True)
+            elif missing or (name in self._divided and not answer.facts):
+                del stopped[name]
+                # The answer to a plain stop, after the emergency stop, does not say which process gave it.
+                why[name] = self._divided.get(name) or _divided(missing, len(row.processes))
+        self._divided = why
+        return replace(report, stopped=stopped, claimed=claimed), why
+
+    def _unanswered(self, row: RosterRow, answer: Answer) -> list[int]:
+        """Return the processes of a robot that gave no answer of their own."""
+        runs = self._proven_runs(row.name, answer)
+        # An earlier release states no process: its answer is that of the only one.
+        if "" in runs and len(row.processes) == 1:
+            return []
+        return [pid for run, pid in row.processes if run not in runs]
+
+    def _proven_runs(self, name: str, answer: Answer) -> frozenset[str]:
+        """Return the run ids in answers that the robot's key has signed, "" for none stated."""
+        if self._network.kind != DEVICE_CONNECT or not answer.facts:
+            return frozenset(answer.runs or ("",))
+        if name not in self._keys:
+            self._keys[name] = key_here(local_name(self._network.tenant, name))
+        key, runs = self._keys[name], answer.runs or {"": answer}
+        return frozenset(
+            run
+            for run, each in runs.items()
+            if key is None or proof_of(Purpose.STOP_VERDICT, name, each.facts, key) is Proof.SIGNED
+        )
 
     def _whole(self, answered: Collection[tuple[str, Answer]]) -> Roster:
         """Return the roster with all that was named, found, reported and answered since."""
-        roster = self._roster
+        roster = self._roster = self._roster.with_answers(self._proofs(answered))
         for each in self._trusted.values():
             roster = roster.with_reported(each.rows, each.source)
         rows = {row.name: row for row in roster.rows}
@@ -241,7 +317,25 @@ class StopRoster:
             # As surely as if it were enrolled: the caller says so.
             rows[name] = replace(rows.get(name, RosterRow(name, Known.ENROLLED)), known=Known.ENROLLED, stoppable=True)
         kept = tuple(row for name, row in marked.items() if name not in rows)
-        return replace(roster, rows=tuple(rows.values()), exempt=kept)
+        inside = self._named | dict(answered).keys()
+        return replace(
+            roster, rows=tuple(row for row in rows.values() if row.name in inside or self._covers(row)), exempt=kept
+        )
+
+    def _proofs(self, answered: Collection[tuple[str, Answer]]) -> dict[str, Collection[str]]:
+        """Return the robots whose key, known here, signed an answer, and their run ids."""
+        served, on_mesh = self._roster.served_elsewhere, self._network.kind != DEVICE_CONNECT
+        proofs: dict[str, Collection[str]] = {}
+        for name, answer in answered:
+            runs = self._proven_runs(name, answer) if name in served and answer.facts else ()
+            # On the mesh what is not proven of an enrolled robot is claimed.
+            if not answer.claimed and (runs or answer.enrolled or on_mesh):
+                proofs[name] = runs
+        return proofs
+
+    def _covers(self, row: RosterRow) -> bool:
+        cell = self._cells.get(row.name, row.cell)
+        return self.scope.everything or cell is None or self.scope.covers(row.name, {cell} - {""})
 
     def _elsewhere(self, silent: Collection[str]) -> dict[str, tuple[NetworkKey, float]]:
         """Return where else robots of these names were heard last, and seconds since."""
@@ -264,6 +358,33 @@ class StopRoster:
             )
 
 
+def robots_known_at(network: Callable[[], NetworkKey]) -> Remembers:
+    """Return what says whether this machine's roster has a robot that a scope means.
+
+    A name that was only heard counts no more than for the exit code.
+    """
+
+    def remembers(scope: Scope) -> bool:
+        roster = Roster.of(network())
+        return any(scope.names(row.name, row.cell) for row in roster.rows if counts(roster, row))
+
+    return remembers
+
+
+def unheard(network: NetworkKey, answered: Collection[str]) -> str:
+    """Return the robots of the roster that are not among ``answered``, as text.
+
+    Names that were only heard are left out where robots are enrolled. It reads the disk.
+    """
+    try:
+        roster = Roster.of(network)
+    except Exception as exc:  # noqa: BLE001 - said in place of the names
+        return f"the roster cannot be read: {exc}"
+    names = [row.name for row in roster.rows if counts(roster, row) and row.name not in answered]
+    more = f" and {len(names) - NAMED_MAX} more" if len(names) > NAMED_MAX else ""
+    return f"{', '.join(names[:NAMED_MAX])}{more}"
+
+
 def counts(roster: Roster, row: RosterRow) -> bool:
     """Return True when the exit code depends on this row.
 
@@ -272,6 +393,15 @@ def counts(roster: Roster, row: RosterRow) -> bool:
     if row.known is not Known.HEARD:
         return True
     return row.stoppable is not False and not roster.enrolled
+
+
+def _divided(missing: Sequence[int], processes: int) -> str:
+    """Return why a robot counts as silent although one of its processes answered."""
+    pids = ", ".join(map(str, missing))
+    if len(missing) == processes > 1:
+        return f"the processes {pids} of this machine serve it, and its answer does not tell which of them stopped"
+    which = f"its process {pids} gives" if len(missing) == 1 else f"its processes {pids} give"
+    return f"{which} no answer; another process of that name did"
 
 
 def _part(report: StopReport, names: Collection[str]) -> StopReport:

@@ -71,6 +71,13 @@ SPEED = Parameter(
     lambda name, value: number(name, value, above=0, high=1),
     default=0.5,
 )
+AROUND = Parameter(
+    "around",
+    bool,
+    "Whether to go around the objects that getObjects knows; false goes as if there were none",
+    flag,
+    default=True,
+)
 WAIT = Parameter(
     "wait",
     bool,
@@ -86,7 +93,9 @@ PICTURE = Parameter(
     default="",
 )
 PLACE = Parameter("place", str, "Name of a saved place; home is always there", identifier)
-RESULT = "task_id, task_status, asked, reached, error_mm, holding, duration, why, picture"
+RESULT = (
+    "task_id, task_status, asked, reached, error_mm, holding, object_at, object_error_mm, moved, duration, why, picture"
+)
 
 _DIRECTION = Parameter(
     "direction",
@@ -146,7 +155,13 @@ _VERBS = (
         "moveJoints",
         Kind.MOTION,
         "Move joints to positions; the way is checked for limits and contacts before anything moves.",
-        (Parameter("joints", dict, "Degrees by joint name; joints left out stay", _positions), SPEED, WAIT, PICTURE),
+        (
+            Parameter("joints", dict, "Degrees by joint name; joints left out stay", _positions),
+            SPEED,
+            WAIT,
+            PICTURE,
+            AROUND,
+        ),
         returns=RESULT,
         run=_motion("move_joints"),
         lasts=True,
@@ -155,7 +170,7 @@ _VERBS = (
         "moveTo",
         Kind.MOTION,
         "Move the tip of the gripper to a point; the way is checked for limits and contacts before anything moves.",
-        (*(_coordinate(axis) for axis in "xyz"), APPROACH, SPEED, WAIT, PICTURE),
+        (*(_coordinate(axis) for axis in "xyz"), APPROACH, SPEED, WAIT, PICTURE, AROUND),
         returns=RESULT,
         run=_motion("move_to"),
         lasts=True,
@@ -171,6 +186,7 @@ _VERBS = (
             SPEED,
             WAIT,
             PICTURE,
+            AROUND,
         ),
         returns=RESULT,
         run=_motion("move_by"),
@@ -189,7 +205,7 @@ _VERBS = (
         "goTo",
         Kind.MOTION,
         "Move to a place that was saved, or to home.",
-        (PLACE, SPEED, WAIT, PICTURE),
+        (PLACE, SPEED, WAIT, PICTURE, AROUND),
         returns=RESULT,
         run=_motion("go_to"),
         lasts=True,
@@ -214,6 +230,7 @@ _VERBS = (
             SPEED,
             WAIT,
             PICTURE,
+            AROUND,
         ),
         returns=RESULT,
         run=_motion("pick"),
@@ -230,6 +247,7 @@ _VERBS = (
             SPEED,
             WAIT,
             PICTURE,
+            AROUND,
         ),
         returns=RESULT,
         run=_motion("place"),

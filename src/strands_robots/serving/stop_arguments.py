@@ -10,6 +10,7 @@ from typing import Any
 
 from strands_robots.envelope import Envelope
 from strands_robots.safety.orders import REASON_MAX
+from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.serving.robot_verbs import WORLD_VERBS
 from strands_robots.serving.verbs import unknown_arguments
 from strands_robots.utils import ValidationError, device_id
@@ -46,6 +47,31 @@ def stop_robot(name: str, value: object) -> tuple[str, str]:
         return "", f"{name} is no robot's id, so all robots are stopped"
 
 
+def stop_scope(only: object, cell: object) -> tuple[Scope, str]:
+    """Return the robots that an emergency stop is for, and a note.
+
+    What cannot be read, or both at once, is every robot. A robot of a world, ``world/robot``, is locked with its world.
+
+    Args:
+        only: names, or one name; None or empty for no choice.
+        cell: name of a cell; None or empty for no choice.
+    """
+    if only in (None, "", []) and cell in (None, ""):
+        return EVERY_ROBOT, ""
+    if only not in (None, "", []) and cell not in (None, ""):
+        return EVERY_ROBOT, "only and cell are given together, so all robots are stopped"
+    if cell:
+        scope = Scope.read({"cell": cell})
+        return scope, "cell is no cell's name, so all robots are stopped" if scope.everything else ""
+    named = [only] if isinstance(only, str) else only
+    names = list(named) if isinstance(named, list | tuple) else [None]
+    whole = [each.partition("/")[0] if isinstance(each, str) else each for each in names]
+    scope = Scope.read({"only": whole})
+    if scope.everything:
+        return scope, "only names what is no robot's id, or too many, so all robots are stopped"
+    return scope, "" if whole == names else "a robot of a world is locked with its whole world"
+
+
 def noted(answer: Envelope, *notes: str) -> Envelope:
     """Return the answer to a stop with the notes on what was dropped."""
     said = _joined(*notes)
@@ -59,10 +85,13 @@ def network_stop(given: Mapping[str, Any]) -> tuple[dict[str, str], str]:
     return {"robot": robot, "robot_name": of_world["robot_name"] if robot else ""}, _joined(unknown, unread)
 
 
-def network_emergency_stop(given: Mapping[str, Any]) -> tuple[dict[str, str], str]:
-    """Return the ``reason`` of an emergency stop by a client, and a note."""
+def network_emergency_stop(given: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
+    """Return the arguments of a client's emergency stop, and a note."""
     reason, cut = stop_reason(given.get("reason"))
-    return {"reason": reason}, _joined(cut, unknown_arguments(len(given) - ("reason" in given)))
+    scope, unread = stop_scope(given.get("only"), given.get("cell"))
+    unknown = unknown_arguments(len(given.keys() - {"reason", "only", "cell"}))
+    arguments = {"reason": reason, "only": sorted(scope.only), "cell": scope.cell}
+    return arguments, _joined(cut, unread, unknown)
 
 
 def _joined(*notes: str) -> str:

@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import importlib.util
 import math
+import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from strands_robots import settings
@@ -18,8 +20,15 @@ from strands_robots.envelope import Envelope, error, success, text_of
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety.orders import new_epoch
 from strands_robots.safety.peer_answers import enrolled_peers, stop_distrust
+from strands_robots.safety.roster_search import RosterSearch
+from strands_robots.safety.scope import EVERY_ROBOT, Scope
+from strands_robots.safety.silence import Sending
 from strands_robots.safety.statements import ALARM
+from strands_robots.safety.stop_notes import stop_notes
+from strands_robots.safety.stop_roster import StopRoster, robots_known_at
 from strands_robots.safety.stopping import explain, grade
+from strands_robots.tools.mesh_roster import MeshReports, mesh_network
+from strands_robots.tools.roster_verdict import combined_verdict, measured, roster_verdict
 from strands_robots.utils import MissingExtraError, ValidationError
 
 if TYPE_CHECKING:
@@ -47,38 +56,6 @@ def network() -> DeviceConnect | NativeMesh:
     if absent or settings.raw("STRANDS_ROBOT_MESH_DC").lower() in settings.FALSE_SPELLINGS:
         return NativeMesh()
     return DeviceConnect()
-
-
-def stop_outcome(answer: Envelope) -> tuple[bool | None, str]:
-    """Return whether a robot stopped, None when unknown, and the text of its answer."""
-    stopped = grade(answer).stopped
-    return stopped, text_of(answer) or ("" if stopped else explain(answer))
-
-
-def combined_verdict(answers: Mapping[str, Envelope], stale: str = "") -> Envelope:
-    """Return one answer for several stops: success when all were confirmed.
-
-    Args:
-        answers: by robot.
-        stale: why there may be more robots than these; then it is unknown whether all have stopped.
-    """
-    if not answers:
-        return error(f"No robot that can be stopped answered. {stale}".strip(), stopped=None, robots={})
-    outcomes = {name: stop_outcome(answer) for name, answer in answers.items()}
-    moving = [name for name, (stopped, _) in outcomes.items() if stopped is False]
-    silent = [name for name, (stopped, _) in outcomes.items() if stopped is None]
-    fields: dict[str, Any] = {
-        "stopped": False if moving else None if silent or stale else True,
-        "not_stopped": moving,
-        "silent": silent,
-        "robots": {name: said for name, (_, said) in outcomes.items()},
-    }
-    if fields["stopped"]:
-        return success(f"Stopped: {', '.join(answers)}.", **fields)
-    problems = [f"DID NOT STOP: {', '.join(moving)}"] if moving else []
-    problems += [f"no answer, state unknown: {', '.join(silent)}"] if silent else []
-    problems += [f"stopped: {', '.join(answers)}. {stale.rstrip('.')}"] if not problems else []
-    return error("; ".join(problems) + ".", **fields)
 
 
 @contextmanager
@@ -156,20 +133,47 @@ class NativeMesh:
                 return combined_verdict(
                     {target: _stop_answer(target, _reply(mesh, target, command, STOP_S), enrolled_peers())}
                 )
-            return _stop_all(mesh, lambda: mesh.broadcast(command, ESTOP_S))
+            roster = StopRoster(mesh_network())
+            answers = _stop_all(mesh, lambda: mesh.broadcast(command, ESTOP_S), roster)
+            return roster_verdict(answers, measured(answers, roster, Sending()))
 
         return _on_mesh(stopped, stopped=None)
 
-    def emergency_stop(self, reason: str, signing_key: Any = None) -> Envelope:
+    def emergency_stop(self, reason: str, signing_key: Any = None, scope: Scope = EVERY_ROBOT) -> Envelope:
         """Send the mesh's emergency stop, again while a peer has not confirmed it.
 
         A peer that was seen and did not answer is named. Every repetition is the same stop, ``estop_id``.
+
+        Args:
+            scope: the robots that it is for. Where none of them is there, every robot is stopped.
         """
         estop_id = new_epoch()
 
         def stopped(mesh: Mesh) -> Envelope:
-            answer = _stop_all(mesh, lambda: mesh.emergency_stop(signing_key, estop_id=estop_id))
-            return {**answer, "estop_id": estop_id}
+            reports = MeshReports(mesh)
+            roster = StopRoster(mesh_network(), scope=scope)
+            reports.inbox.open(estop_id, roster.take)
+            listening: list[threading.Thread] = []
+
+            def left(replies: list[dict[str, Any]]) -> None:
+                if not listening:
+                    listening.append(threading.Thread(target=reports.begin, name="missed rosters", daemon=True))
+                    listening[0].start()
+
+            def send() -> list[dict[str, Any]]:
+                some: dict[str, Any] = {}
+                if not roster.scope.everything:
+                    known = robots_known_at(mesh_network)
+                    some = {"scope": roster.scope, "remembers": known, "on_widened": roster.widen}
+                return mesh.emergency_stop(signing_key, estop_id=estop_id, on_answers=left, **some)
+
+            try:
+                answers = _stop_all(mesh, send, roster)
+            finally:
+                reports.close()
+            outcome = measured(answers, roster, Sending(signed=signing_key is not None), estop_id)
+            outcome.record(mesh.peer_id)
+            return {**roster_verdict(answers, outcome), "estop_id": estop_id, **scope.field()}
 
         return _on_mesh(stopped, stopped=None)
 
@@ -186,8 +190,12 @@ class NativeMesh:
         return _on_mesh(requested)
 
 
-def _stop_all(mesh: Mesh, stop: Callable[[], list[dict[str, Any]]]) -> Envelope:
-    """Send a stop, and again while a peer in reach has not confirmed it."""
+def _stop_all(mesh: Mesh, stop: Callable[[], list[dict[str, Any]]], roster: StopRoster) -> dict[str, Envelope]:
+    """Send a stop, and again while a peer in reach has not confirmed it.
+
+    Args:
+        roster: read once it has left, and given the peers in reach.
+    """
     seen: set[str] = set()
     answers: dict[str, Envelope] = {}
     sent = time.monotonic()
@@ -199,28 +207,41 @@ def _stop_all(mesh: Mesh, stop: Callable[[], list[dict[str, Any]]]) -> Envelope:
         for reply in replies:
             name = reply["responder_id"]
             if name != mesh.peer_id:
-                answers[name] = _stop_answer(name, reply, keys)
+                answers[name] = _stop_answer(name, reply, keys, locks=roster.scope.only)
 
     def unconfirmed() -> bool:
-        seen.update(_in_reach(mesh))
+        seen.update(name for name in _in_reach(mesh) if roster.scope.covers(name, _cells(mesh, name)))
         return any(not answers.get(name, {}).get("stopped") for name in seen)
 
     send()
+    roster.read()
     discover(mesh, lambda: send() if unconfirmed() and time.monotonic() - sent >= AGAIN_S else None)
     if unconfirmed():
         send()
+    roster.find(dict.fromkeys(seen, True), {name: next(iter(_cells(mesh, name)), "") for name in seen})
     silent: dict[str, Envelope] = {name: error(f"{name} did not answer.", stopped=None) for name in seen}
-    return combined_verdict(silent | answers)
+    return silent | answers
 
 
-def _stop_answer(target: str, reply: dict[str, Any], keys: Mapping[str, bytes] | None) -> Envelope:
+def _cells(mesh: Mesh, peer: str) -> frozenset[str]:
+    cell = next((row.get("cell") for row in mesh.peers if row["peer_id"] == peer), None)
+    return frozenset({cell} if isinstance(cell, str) and cell else ())
+
+
+def _stop_answer(
+    target: str, reply: dict[str, Any], keys: Mapping[str, bytes] | None, *, locks: Collection[str] = ()
+) -> Envelope:
+    """Return a reply as an envelope; one of ``locks`` has to say that it is locked."""
     if reply.get("status") in ("timeout", "error"):
         return error(f"{target} did not answer.", stopped=None)
     result = reply.get("result")
     if grade(result).stopped:
         why = stop_distrust(reply, keys)
         if not why:
-            return success("stopped", stopped=True)
+            free = target in locks and not (isinstance(result, Mapping) and result.get("locked") is True)
+            return success(
+                "stopped, and NOT LOCKED: its release knows no lock by command" if free else "stopped", stopped=True
+            )
         return error(why, stopped=False if why.startswith(ALARM) else None)
     return error(explain(result) if result is not None else str(reply.get("error", "")), stopped=False)
 
@@ -316,43 +337,78 @@ class DeviceConnect:
         def stopped(fleet: FleetClient) -> Envelope:
             if target:
                 return combined_verdict({target: fleet.stop(target, STOP_S, robot_name)})
-            answers = fleet.stop_all(STOP_S)
-            return combined_verdict(answers, fleet.stale)
+            return stop_everything(fleet)
 
         return _on_fleet(stopped, stopped=None)
 
-    def emergency_stop(self, reason: str) -> Envelope:
+    def emergency_stop(self, reason: str, scope: Scope = EVERY_ROBOT) -> Envelope:
         """Send an emergency stop on a connection of its own; answers by name.
 
         A device that is in reach and did not answer it gets a plain ``stop`` as well.
+
+        Args:
+            scope: the robots that it is for. Where none of them is there, every robot is stopped.
         """
-        return _on_fleet(lambda fleet: stop_and_lock(fleet, reason), stopped=None)
+        return _on_fleet(lambda fleet: stop_and_lock(fleet, reason, scope), stopped=None)
 
 
-def stop_and_lock(fleet: FleetClient, reason: str) -> Envelope:
+def stop_everything(fleet: FleetClient) -> Envelope:
+    """Stop each device that is found; answers by name, measured by the roster."""
+    from strands_robots.device_connect.enrollment import network_of  # noqa: PLC0415 - the network is loaded when it is used
+
+    roster = StopRoster(network_of(fleet.link))
+    answers = fleet.stop_all(STOP_S)
+    roster.read()
+    outcome = measured(answers, roster, Sending(tells=fleet.link.transport == "nats"))
+    return roster_verdict(answers, outcome, fleet.stale)
+
+
+def stop_and_lock(fleet: FleetClient, reason: str, scope: Scope = EVERY_ROBOT) -> Envelope:
     """Send an emergency stop under the client's name; answers by name.
 
-    A device that is in reach and did not answer it gets a plain ``stop`` as well.
+    A device of its scope that is in reach and did not answer it gets a plain ``stop`` as well. The roster must answer.
     """
-    from strands_robots.device_connect.safety_controller import envelope, safety_controller  # noqa: PLC0415
+    from strands_robots.device_connect.enrollment import network_of  # noqa: PLC0415 - the network is loaded when it is used
+    from strands_robots.device_connect.safety_controller import envelope, safety_controller  # noqa: PLC0415 - as above
 
+    estop_id = new_epoch()
+    controller = safety_controller(fleet.source, fleet.link)
     with ThreadPoolExecutor(1) as pool:
-        controller = safety_controller(fleet.source, fleet.link)
         try:
             seen = pool.submit(fleet.peers)
-            report = controller.stop((), reason, deadline_s=ESTOP_S)
+            found = lambda: {peer.id: (peer.stop_verb is not None, peer.cell) for peer in seen.result()}  # noqa: E731
+            search = RosterSearch(controller, estop_id, network_of(fleet.link), found, scope)
+            report = controller.stop(
+                (),
+                reason,
+                deadline_s=ESTOP_S,
+                estop_id=estop_id,
+                more=True,
+                on_progress=search.begin,
+                on_report=search.take,
+                scope=scope,
+            )
+            sending = replace(controller.sending, left=report.link)
         finally:
             controller.close()
     failed = {**report.not_stopped, **report.refused}
-    rest = [
-        peer.id for peer in seen.result() if peer.stop_verb and peer.id not in failed and peer.id not in report.stopped
-    ]
-    if not rest:
-        return envelope(report)
+    inside = EVERY_ROBOT if report.widened else scope
+    peers = [peer.id for peer in seen.result() if peer.stop_verb and inside.covers(peer.id, {peer.cell or ""} - {""})]
+    rest = [name for name in peers if name not in failed and name not in report.stopped]
     answers: dict[str, Envelope] = {name: success("locked and still", stopped=True) for name in report.stopped}
     answers |= {name: error(answer.why, stopped=False) for name, answer in failed.items()}
-    answers |= fleet.stop_each(rest, STOP_S)
-    return {**combined_verdict(answers), "not_locked": rest}
+    answers |= fleet.stop_each(rest, STOP_S) if rest else {}
+    roster = search.roster
+    outcome = roster.outcome(report, sending)
+    outcome = measured(answers, roster, sending, estop_id) if rest else outcome
+    outcome.record(fleet.source)
+    roster.remember(report)
+    if rest:
+        return {**roster_verdict(answers, outcome), "not_locked": rest, "estop_id": estop_id}
+    answer = envelope(outcome.report, outcome.reasons)
+    fields = {name: value for name, value in answer.items() if name not in ("status", "content", "reason")}
+    said = " ".join([text_of(answer), outcome.sentence, *stop_notes(outcome)])
+    return (success if outcome.ok else error)(said, **fields, **outcome.facts())
 
 
 def _peer_list(rows: list[dict[str, Any]], stale: str = "") -> Envelope:

@@ -17,7 +17,8 @@ from typing import Any
 from strands_robots.agent_tool import fitted, tool
 from strands_robots.envelope import error
 from strands_robots.serving.robot_verbs import ARM_VERBS, WORLD_VERBS
-from strands_robots.serving.stop_arguments import noted, stop_reason, stop_robot
+from strands_robots.serving.stop_arguments import noted, stop_reason, stop_robot, stop_scope
+from strands_robots.serving.verbs import unknown_arguments
 from strands_robots.tools import networks
 from strands_robots.utils import WAIT_S, ValidationError, choice, device_id, identifier, mapping, shown
 
@@ -64,7 +65,8 @@ def robot_mesh(
     Args:
         action: peers lists the robots; tell gives one an instruction and returns once the motion has started; status
             returns what one is doing; stop stops one, or all without a target, or with arguments {"robot_name": ...}
-            one robot of a world; emergency_stop stops and locks all;
+            one robot of a world; emergency_stop stops and locks all, or with arguments {"only": ["arm-1"]} some and
+            with {"cell": "cell-1"} those of a cell and every robot without one;
             release_torque stops one and switches its motors off, so that it falls, once its operator approved that;
             move moves an arm (moveTo, or another verb) and returns what it reached; picture returns a camera's
             picture (getPicture); wait waits for the end of a motion; call calls any verb that peers lists.
@@ -80,8 +82,7 @@ def robot_mesh(
         arguments: The verb's arguments by name, such as {"x": 0.25, "y": 0.0, "z": 0.1} or {"camera": "table"}.
     """
     if action == "emergency_stop":
-        why, cut = stop_reason(instruction)
-        return noted(networks.network().emergency_stop(why), cut)
+        return _emergency_stop(instruction, arguments)
     if action == "stop":
         return _stop(target, arguments)
     try:
@@ -111,6 +112,19 @@ def _stop(target: object, arguments: object) -> dict[str, Any]:
         unread = "arguments is no object"
     one = of_world.get("robot_name", "")
     return noted(networks.network().stop(robot, *([one] if one else [])), unknown, unread)
+
+
+def _emergency_stop(instruction: object, arguments: object) -> dict[str, Any]:
+    """Stop and lock all robots, or those that the arguments mean; none refuses it."""
+    why, cut = stop_reason(instruction)
+    given = arguments if isinstance(arguments, dict) else {}
+    scope, unread = stop_scope(given.get("only"), given.get("cell"))
+    unknown = unknown_arguments(len(given.keys() - {"only", "cell"}))
+    if arguments and not given:
+        unread = "arguments is no object"
+    network = networks.network()
+    answer = network.emergency_stop(why) if scope.everything else network.emergency_stop(why, scope=scope)
+    return noted(answer, cut, unread, unknown)
 
 
 def _with_image(answer: dict[str, Any]) -> dict[str, Any]:

@@ -59,6 +59,7 @@ PARSERS = {
     "mesh/transport/access.py": OWN_FILE,
     "mesh/wire.py": BOUNDED,
     "ros/rosbridge_session.py": BOUNDED,
+    "tools/mesh_roster.py": BOUNDED,
     "safety/approval.py": OWN_FILE,
     "safety/clearance.py": OWN_FILE,
     "safety/identity.py": OWN_FILE,
@@ -96,6 +97,7 @@ RECEIVERS = {
     "mesh/transport/zenoh.py": "the topic's own bound, by Zenoh and before it is copied",
     "ros/dds.py": "by ros/dds_types.py, before a sample is decoded",
     "ros/rclpy.py": "decoded by rclpy itself",
+    "tools/mesh_roster.py": "by the transport: the topic's own bound",
 }
 """Each module that receives foreign messages, and their bound."""
 

@@ -131,6 +131,19 @@ def test_expected_but_silent_robot_is_named_with_exit_3(site: Site, arms: tuple[
     assert site.signed()[0] == 0
 
 
+def test_robot_that_a_command_listed_is_missed_at_the_next_stop(
+    site: Site, arms: tuple[str, str], tmp_path: Path
+) -> None:
+    console = Machine(tmp_path / "console", STRANDS_DC_PORT=site.environment["STRANDS_DC_PORT"])
+    with site.serving("arm-8") as (served, _):
+        assert {each["id"] for each in console.json("peers")[1]["peers"]} >= {*arms, "arm-8"}
+        served.kill()
+        served.wait()
+        code, said = console.json("estop", "--deadline", "2")
+        assert (code, said["silent"]) == (3, ["arm-8"])
+        assert site.json("resume", "--local")[0] == 0
+
+
 def test_local_resume_clears_running_and_stopped_processes(site: Site, arms: tuple[str, str]) -> None:
     with site.serving("arm-3") as (served, _):
         assert site.json("estop", *arms, "arm-3", *PATIENT)[0] == 0

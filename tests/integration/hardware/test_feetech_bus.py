@@ -10,9 +10,10 @@ from pathlib import Path
 
 import pytest
 from fixtures.feetech_bus import REGISTERS, FeetechBus, Packet, Parser, arm_servos
-from fixtures.feetech_bus.packets import BROADCAST, OVERLOAD, PING, READ, SYNC_READ, SYNC_WRITE, WRITE
 from fixtures.feetech_bus.twin import ArmTwin
 from fixtures.waiting import eventually
+
+from strands_robots.hardware.emulated.packets import BROADCAST, OVERLOAD, PING, READ, SYNC_READ, SYNC_WRITE, WRITE
 
 
 class Line:

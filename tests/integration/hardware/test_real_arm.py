@@ -12,10 +12,10 @@ from typing import Any
 
 import pytest
 from fixtures.feetech_bus import MOTORS, FeetechBus, arm_calibration, arm_servos
-from fixtures.feetech_bus.arm import HIGH, LOW
 from fixtures.waiting import eventually
 
 from strands_robots.hardware import _compat, body
+from strands_robots.hardware.emulated.arm import HIGH, LOW
 from strands_robots.utils import ValidationError
 
 pytestmark = pytest.mark.system

@@ -9,6 +9,7 @@ import os
 import sys
 import threading
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -131,13 +132,39 @@ def test_the_command_asks_step_by_step(fresh: FeetechBus) -> None:
     eventually(lambda: not any(servo.torque for servo in fresh.servos.values()))
 
 
+def looked(bus: FeetechBus) -> None:
+    """Wait until the command has read every joint since now."""
+    before = bus.answers
+    eventually(lambda: bus.answers > before + 3 * len(MOTORS), what="two looks at the joints")
+
+
+def test_a_joint_that_was_not_moved_is_asked_for_again_by_name(fresh: FeetechBus) -> None:
+    def moved(numbers: Sequence[int]) -> None:
+        for move in (-900, 800):
+            for number in numbers:
+                fresh.servos[number].shaft += move
+            looked(fresh)
+            for number in numbers:
+                fresh.servos[number].shaft -= move
+
+    words = ["calibrate", "so101", "--port", fresh.port, "--id", "again"]
+    line = [sys.executable, "-m", "fixtures.feetech_bus.patient", "strands_robots.cli", *words]
+    with on_a_terminal(line, os.environ) as terminal:
+        eventually(lambda: "the middle of its motion" in terminal.drawn, within=60, what="the first question")
+        terminal.press("\r")
+        eventually(lambda: "Now move every joint" in terminal.drawn, what="the second question")
+        moved([1, 2, 6])
+        # A joint at rest trembles.
+        fresh.servos[3].shaft += 3
+        terminal.press("\r")
+        eventually(lambda: "Not moved yet: elbow_flex, wrist_flex." in terminal.drawn, what="the names")
+        moved([3, 4])
+        terminal.press("\r")
+        assert terminal.process.wait(60) == 0, terminal.drawn
+
+
 @pytest.mark.parametrize("machine", [False, True], ids=["shown", "json"])
 def test_an_arm_is_calibrated_at_a_terminal(fresh: FeetechBus, machine: bool) -> None:
-    def looked() -> None:
-        """The command has read every joint since now."""
-        before = fresh.answers
-        eventually(lambda: fresh.answers > before + 3 * len(MOTORS), what="two looks at the joints")
-
     name = f"by-hand-{machine}"
     words = ["calibrate", "so101", "--port", fresh.port, "--id", name, *(["--json"] if machine else [])]
     for servo in fresh.servos.values():
@@ -153,10 +180,10 @@ def test_an_arm_is_calibrated_at_a_terminal(fresh: FeetechBus, machine: bool) ->
         taken = 2 * len(MOTORS)
         eventually(lambda: len(fresh.written_after(0.0, "homing_offset")) == taken, what="the middle, taken")
         for move in (-900, 800):
-            looked()
+            looked(fresh)
             for servo in fresh.servos.values():
                 servo.shaft += move
-            looked()
+            looked(fresh)
             for servo in fresh.servos.values():
                 servo.shaft -= move
         terminal.press("\r")

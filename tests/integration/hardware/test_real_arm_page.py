@@ -5,20 +5,93 @@ from __future__ import annotations
 import asyncio
 import base64
 import io
+import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from fixtures.command_line import Machine
 from fixtures.feetech_bus import FeetechBus, arm_calibration
 from fixtures.page_feed import PageFeed
+from fixtures.waiting import until
 from PIL import Image
 
+from strands_robots.dashboard.driving import HandControl
 from strands_robots.dashboard.pose_process import PosePainter
 from strands_robots.dashboard.poses import Poses
+from strands_robots.device_connect import FleetClient, loopback_config
 
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
+
+
+class NetworkFeed(PageFeed):
+    """A network with one robot, as the page reaches it."""
+
+    def __init__(self, fleet: FleetClient) -> None:
+        super().__init__()
+        self._fleet = fleet
+
+    async def call(self, robot: str, verb: str, params: Mapping[str, Any], seconds: float) -> Any:
+        self.calls.append((robot, verb, dict(params)))
+        return await asyncio.to_thread(self._fleet.call, robot, verb, dict(params))
+
+    async def stop(self, robot: str) -> Any:
+        return await asyncio.to_thread(self._fleet.stop, robot)
+
+
+async def jogged(fleet: FleetClient, axis: str, moved: Callable[[], bool]) -> list[dict[str, Any]]:
+    """Take control, hold a jog until it has moved the arm, let go; return what the page was told."""
+    told: list[dict[str, Any]] = []
+    feed = NetworkFeed(fleet)
+    hand = HandControl(told.append)
+    try:
+        taken = await hand.take("dc:arm-1", feed, "arm-1")
+        assert taken["status"] == "success", taken
+
+        def ended() -> bool:
+            return any(each["type"] == "jogged" for each in told)
+
+        async with asyncio.timeout(60):
+            while not ended() and not await asyncio.to_thread(moved):
+                # On a busy machine a beat may be late, which ends the jog.
+                if not hand.begin("dc:arm-1", {"kind": "joint", "axis": axis, "direction": 1, "speed": 0.5}):
+                    await asyncio.sleep(0)
+                hand.beat("dc:arm-1")
+                await asyncio.sleep(0.02)
+            hand.release("dc:arm-1")
+            await until(ended, what="the end of the jog")
+    finally:
+        await hand.leave()
+    return told
+
+
+def test_joint_buttons_of_the_page_move_an_arm_that_is_served_for_them(tmp_path: Path) -> None:
+    machine = Machine(tmp_path)
+    ends = ["--emulated", "--drive-by-page", "--json", "--until-stdin-closes"]
+    process = machine.start("serve", "so101", "--peer-id", "arm-1", *ends)
+    try:
+        assert process.stdout is not None
+        ready = json.loads(process.stdout.readline())
+        assert ready["event"] == "serving", ready
+        with FleetClient(loopback_config(int(machine.environment["STRANDS_DC_PORT"])), "dashboard") as fleet:
+
+            def pan() -> float:
+                return float(fleet.call("arm-1", "getState")["joints"]["shoulder_pan.pos"])
+
+            start = pan()
+            told = asyncio.run(jogged(fleet, "shoulder_pan.pos", lambda: pan() > start + 5))
+            assert [each["refused"] for each in told if each["type"] == "jogged"][-1:] == [False], told
+            assert pan() > start + 4
+            refused = fleet.call("arm-1", "execute", {"instruction": "wave"})
+            assert refused["status"] == "error", "the flag approves what the page needs and no more"
+        process.communicate(timeout=60)
+        assert process.returncode == 0
+    finally:
+        process.kill()
+        process.communicate()
 
 
 class ArmFeed(PageFeed):

@@ -1,4 +1,4 @@
-"""Every model of four other projects does in a world of ours what docs/foreign-models.md says (`make models`)."""
+"""Every model of eight other projects does in a world of ours what docs/foreign-models.md says (`make models`)."""
 
 from __future__ import annotations
 

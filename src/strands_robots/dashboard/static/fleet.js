@@ -77,7 +77,7 @@ export function verdictTone(stop) {
   if (stop.alarm) return "bad";
   // It says nothing about the present any more, so it is not green.
   if (stop.freed && ["stopped", "claimed"].includes(stop.state)) return "quiet";
-  return { stopped: "good", claimed: "warn", waiting: "warn" }[stop.state] || "bad";
+  return { stopped: "good", claimed: "warn", waiting: "warn", heard_only: "quiet" }[stop.state] || "bad";
 }
 
 export function lockText(row) {
@@ -86,7 +86,7 @@ export function lockText(row) {
   const first = row.lockouts[0];
   if (!first) return S.locked;
   const at = typeof first.since === "number" ? S.when(new Date(first.since * 1000)) : "";
-  const why = first.reason ? `: ${first.reason}` : "";
+  const why = `${first.scope ? ` (${first.scope})` : ""}${first.reason ? `: ${first.reason}` : ""}`;
   return `${S.lockedBy(first.source, at)}${why}${row.lockouts.length > 1 ? ` (×${row.lockouts.length})` : ""}`;
 }
 

@@ -12,7 +12,7 @@ const channel = new Channel("/stop");
 const stop = new Stop(channel, fleet);
 const state = new State();
 const view = new FleetView(fleet, state, (id) => stop.press(id));
-const robot = new RobotView(fleet, state, (id) => stop.press(id));
+const robot = new RobotView(fleet, state, (id, only) => stop.press(id, only));
 const resume = new Resume(fleet, state);
 const main = document.getElementById("main");
 

@@ -24,6 +24,8 @@ export class RobotView {
     this.age = el("p", { class: "small age" });
     this.stop = el("button", { type: "button", class: "stop-one", text: S.stopOneShort });
     this.stop.addEventListener("click", () => onStop(this.row() ? this.row().id : ""));
+    this.stopAlone = el("button", { type: "button", class: "stop-one", text: S.stopAloneShort });
+    this.stopAlone.addEventListener("click", () => { const row = this.row(); if (row) onStop(row.id, row.key); });
     this.forget = el("button", { type: "button", class: "plain", text: S.forget, title: S.forgetHint });
     this.forget.addEventListener("click", () => this.state.ask({ type: "forget", key: this.key }));
     this.camera = el("img", { class: "camera", alt: "" });
@@ -58,7 +60,7 @@ export class RobotView {
     this.timeline = new Timeline(fleet);
     this.node = el("div", { id: "robot" },
       el("p", {}, el("a", { href: "#/", text: S.back })),
-      el("div", { class: "head" }, el("div", {}, this.title, this.kind, el("div", { class: "now" }, this.task, this.lock, this.verdict, this.age), this.forget), el("div", { class: "stop-own" }, this.stop, el("p", { class: "small", text: S.stopOneWhy }))),
+      el("div", { class: "head" }, el("div", {}, this.title, this.kind, el("div", { class: "now" }, this.task, this.lock, this.verdict, this.age), this.forget), el("div", { class: "stop-own" }, this.stop, this.stopAlone, el("p", { class: "small", text: S.stopOneWhy }))),
       el("div", { class: "columns" }, this.pictures, this.drive, this.posePanel, this.jointsPanel), this.verbs, this.timeline.node);
     state.addEventListener("pose", ({ detail }) => { if (detail.key === this.key) this.showPose(detail.why); });
     state.addEventListener("robot", ({ detail }) => { if (detail.key === this.key) this.details(detail); });
@@ -213,6 +215,8 @@ export class RobotView {
     setText(this.title, row.id);
     setAttr(this.stop, "aria-label", S.stopOne(row.id));
     setAttr(this.stop, "title", S.stopOne(row.id));
+    setAttr(this.stopAlone, "aria-label", S.stopAlone(row.id));
+    setAttr(this.stopAlone, "title", S.stopAlone(row.id));
     setText(this.kind, kindText(row));
     setText(this.task, taskText(row));
     setAttr(this.task, "data-on", this.fleet.moving(row) ? "yes" : "no");

@@ -1,9 +1,9 @@
-// STOP. It means one thing, always: stop every robot. Nothing on this page changes what it does.
+// STOP. The big button and the space bar mean one thing, always: stop every robot. Nothing on this page changes that.
 import { el, setText } from "./dom.js";
 import { byName, verdictText, verdictTone } from "./fleet.js";
 import { S } from "./strings.js";
 
-const ORDER = ["not_stopped", "alarm", "refused", "unknown", "silent", "claimed", "waiting", "stopped"];
+const ORDER = ["not_stopped", "alarm", "refused", "unknown", "silent", "claimed", "waiting", "stopped", "heard_only"];
 const NAMES_MAX = 60;
 const CONFIRM_MS = 500;
 
@@ -31,9 +31,10 @@ export class Stop {
     setInterval(() => this.look(), 100);
   }
 
-  press(robot) {
+  // only: the key of the one robot that stops; without it all do.
+  press(robot, only) {
     const id = ++this.id;
-    if (this.channel.send({ type: "stop", robot, id })) {
+    if (this.channel.send(only ? { type: "stop", robot, only, id } : { type: "stop", robot, id })) {
       this.notSent = "";
       this.unconfirmed.set(id, performance.now());
     } else {
@@ -72,13 +73,14 @@ export class Stop {
     const latest = this.link ? this.link.pressed_at : this.pressedAt;
     this.pressedAt = latest;
     const ready = answers.length === 0 && document.body.dataset.canStop === "yes" ? this.fleet.rows.size : 0;
-    const signature = JSON.stringify([ready, latest, this.link && this.link.running, answers.map((row) => [row.key, row.stop])]);
+    const rosters = latest && this.link && !this.link.running ? Object.values(this.link.roster || {}) : [];
+    const signature = JSON.stringify([ready, latest, rosters, this.link && this.link.running, answers.map((row) => [row.key, row.stop])]);
     if (signature === this.signature) return;
     this.signature = signature;
     if (!latest && answers.length === 0) { this.said.replaceChildren(...(ready ? [el("p", { "data-tone": "quiet", text: S.ready(ready) })] : [])); return; }
     const groups = new Map(ORDER.map((state) => [state, []]));
     for (const row of answers) (groups.get(row.stop.state) || groups.get("unknown")).push(row);
-    const bad = ORDER.slice(0, -1).some((state) => groups.get(state).length) || answers.some((row) => row.stop.alarm);
+    const bad = ORDER.slice(0, -2).some((state) => groups.get(state).length) || answers.some((row) => row.stop.alarm) || rosters.some((each) => !each.ok);
     const stopped = groups.get("stopped").length;
     const running = this.link && this.link.running;
     const someFreed = answers.some((row) => row.stop.freed), freed = answers.length > 0 && !bad && !running && answers.every((row) => row.stop.freed);
@@ -98,6 +100,7 @@ export class Stop {
         el("strong", { text: row.id }), ` ${verdictText(row.stop)}`));
     }
     if (worst.length > NAMES_MAX) list.append(el("li", { text: `+ ${worst.length - NAMES_MAX}` }));
-    this.said.replaceChildren(head, list);
+    const notes = rosters.flatMap((each) => [each.sentence, ...each.notes]).map((text) => el("p", { class: "small", text }));
+    this.said.replaceChildren(head, ...notes, list);
   }
 }

@@ -28,6 +28,9 @@ _URLS_OF = {"nats": ("NATS_URLS", "NATS_URL"), "zenoh": ("ZENOH_CONNECT",)}
 # Batches of 64 KiB per priority and link: the memory that a peer costs which is stopped in a debugger.
 QUEUED_BATCHES = 16
 
+DEFAULT_URL = "nats://127.0.0.1:4222"
+"""NATS server of a link that names none."""
+
 # Largest message in bytes that a receiver assembles from fragments; Zenoh's own default is 1 GiB.
 MAX_MESSAGE_BYTES = 64 * 2**20
 

@@ -1,0 +1,85 @@
+"""Contact of a moving arm, seen as a joint that stands still when told to move.
+
+A joint is compared with its setpoints now and :data:`DELAY_S` ago, so that neither the delay of a servo nor the sag of
+an arm under its payload counts: a joint that sags follows its setpoints, at a distance.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from strands_robots.kinematics.chain import Floats
+
+WINDOWS_S = (0.12, 0.22)
+"""Times over which a joint is compared with its setpoints; the longer one is for slow motions."""
+
+DELAY_S = 0.12
+"""Greatest delay of a servo behind its setpoints."""
+
+TOLD = 0.008
+"""Least way of the setpoints in such a time by which a joint is judged (rad or m)."""
+
+FOLLOWED = 0.2
+"""Share of its way that a joint goes at least; one in contact goes less."""
+
+STILL = 0.012
+"""A joint that goes further in such a time does not stand still (rad or m)."""
+
+CONFIRMED = 2
+"""Control steps in a row in which a joint stands still."""
+
+
+class StallWatch:
+    """Compares the joints of one motion with what they are told; for one thread.
+
+    Args:
+        lag: least distance of a joint from its setpoint, beyond that at the motion's start (rad or m).
+    """
+
+    def __init__(self, lag: float) -> None:
+        self._lag = lag
+        self._seen: deque[tuple[float, Floats, Floats]] = deque()
+        self._counts: Floats = np.zeros(0)
+
+    def stalled(self, now: float, told: Floats, joints: Floats) -> int | None:
+        """Return the joint that stands still against its setpoints, if there is one.
+
+        Args:
+            now: the body's own time in seconds.
+            told: setpoint of each joint (rad or m).
+            joints: where they are.
+        """
+        if self._seen and now <= self._seen[-1][0]:
+            return None
+        self._seen.append((now, told, joints))
+        # The first look stays, for the distance at the start.
+        while len(self._seen) > 2 and self._seen[1][0] < now - DELAY_S - WINDOWS_S[-1] - 0.1:
+            del self._seen[1]
+        if not len(self._counts):
+            self._counts = np.zeros(len(joints))
+        still = np.zeros(len(joints), dtype=bool)
+        for window in WINDOWS_S:
+            still |= self._still(now, window)
+        self._counts = np.where(still, self._counts + 1, 0)
+        worst = int(np.argmax(np.where(self._counts >= CONFIRMED, np.abs(told - joints), -1.0)))
+        return worst if self._counts[worst] >= CONFIRMED else None
+
+    def _still(self, now: float, window: float) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+        first, last = self._seen[0], self._seen[-1]
+        if now - window < self._seen[1 if len(self._seen) > 1 else 0][0]:
+            return np.zeros(len(last[2]), dtype=bool)
+        before, earlier, earliest = (self._at(now - back) for back in (window, DELAY_S, DELAY_S + window))
+        told, told_before = last[1] - before[1], earlier[1] - earliest[1]
+        way = np.where(told * told_before > 0, np.sign(told) * np.minimum(np.abs(told), np.abs(told_before)), 0.0)
+        gone = (last[2] - before[2]) * np.sign(way)
+        lag = ((last[1] - last[2]) - (first[1] - first[2])) * np.sign(way)
+        result: np.ndarray[tuple[int], np.dtype[np.bool_]] = (
+            (np.abs(way) >= TOLD) & (gone <= np.minimum(FOLLOWED * np.abs(way), STILL)) & (lag >= self._lag)
+        )
+        return result
+
+    def _at(self, when: float) -> tuple[float, Floats, Floats]:
+        """Return the last look at or before a time, else the first."""
+        return next((look for look in reversed(self._seen) if look[0] <= when), self._seen[0])

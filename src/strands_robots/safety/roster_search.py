@@ -1,0 +1,94 @@
+"""Search for the robots that must answer a stop, once it has left."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Collection, Mapping
+from typing import Protocol
+
+from strands_robots.safety.answers import Answer
+from strands_robots.safety.controller import Progress
+from strands_robots.safety.network_key import NetworkKey
+from strands_robots.safety.roster_report import RosterReport
+from strands_robots.safety.scope import EVERY_ROBOT, Scope
+from strands_robots.safety.stop_log import stop_logger
+from strands_robots.safety.stop_roster import StopRoster
+
+logger = stop_logger(__name__)
+
+
+LookUp = Callable[[], Mapping[str, tuple[bool, str | None]]]
+
+
+class Expecting(Protocol):
+    """A controller that is told who must answer."""
+
+    def expect(self, estop_id: str, names: Collection[str], *, more: bool = False) -> bool:
+        """Name further robots that must answer."""
+
+
+class RosterSearch:
+    """Names the robots of the roster as those that must answer.
+
+    Args:
+        controller: that sends the stop.
+        estop_id: of the stop.
+        network: whose roster it is.
+        look_up: finds devices, whether each has a stop, and its cell or None, on a thread of its own; the stop goes on
+            until then.
+        scope: the robots that the stop is for.
+    """
+
+    def __init__(
+        self,
+        controller: Expecting,
+        estop_id: str,
+        network: NetworkKey,
+        look_up: LookUp | None = None,
+        scope: Scope = EVERY_ROBOT,
+    ) -> None:
+        self.roster, self.begun = StopRoster(network, scope=scope), False
+        self._controller, self._id, self._look_up = controller, estop_id, look_up
+        self._answered: Mapping[str, Answer] = {}
+        self._lock = threading.Lock()
+        self._left = 1 if look_up is None else 2
+
+    def begin(self, progress: Progress) -> None:
+        """Take the answers so far; start the search at the first call."""
+        self._answered = progress.answered
+        widened = progress.widened and not self.roster.scope.everything
+        if widened:
+            self.roster.widen()
+        if widened or self.roster.divided:
+            self._expect(0)
+        if not self.begun:
+            self.begun = True
+            threading.Thread(target=self._read, name="stop roster", daemon=True).start()
+            if self._look_up is not None:
+                threading.Thread(target=self._find, args=(self._look_up,), name="stop lookup", daemon=True).start()
+
+    def take(self, report: RosterReport) -> None:
+        """Take the robots that another standing controller misses."""
+        if self.roster.take(report):
+            self._expect(0)
+
+    def _read(self) -> None:
+        self.roster.read()
+        self._expect(1)
+
+    def _find(self, look_up: LookUp) -> None:
+        try:
+            found = look_up()
+        except Exception as exc:  # noqa: BLE001 - the caller looks at it; the stop goes on to its deadline
+            logger.warning("The search for robots failed: %s", exc)
+            return
+        self.roster.find(
+            {name: stops for name, (stops, _) in found.items()}, {name: cell for name, (_, cell) in found.items()}
+        )
+        self._expect(1)
+
+    def _expect(self, done: int) -> None:
+        with self._lock:
+            self._left -= done
+            more = self._left > 0 or self.roster.incomplete(self._answered)
+            self._controller.expect(self._id, self.roster.awaited(self._answered), more=more)

@@ -1,0 +1,82 @@
+"""One answer for a stop of many robots, measured by the roster."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from strands_robots.envelope import Envelope, error, is_error, success, text_of
+from strands_robots.safety.answers import Answer
+from strands_robots.safety.controller import StopReport
+from strands_robots.safety.silence import Sending
+from strands_robots.safety.stop_notes import stop_notes
+from strands_robots.safety.stop_roster import StopOutcome, StopRoster
+from strands_robots.safety.stopping import explain, grade
+
+
+def stop_outcome(answer: Envelope) -> tuple[bool | None, str]:
+    """Return whether a robot stopped, None when unknown, and the text of its answer."""
+    stopped = grade(answer).stopped
+    return stopped, text_of(answer) or ("" if stopped else explain(answer))
+
+
+def combined_verdict(answers: Mapping[str, Envelope], stale: str = "") -> Envelope:
+    """Return one answer for several stops: success when all were confirmed.
+
+    Args:
+        answers: by robot.
+        stale: why there may be more robots than these; then it is unknown whether all have stopped.
+    """
+    if not answers:
+        return error(f"No robot that can be stopped answered. {stale}".strip(), stopped=None, robots={})
+    outcomes = {name: stop_outcome(answer) for name, answer in answers.items()}
+    moving = [name for name, (stopped, _) in outcomes.items() if stopped is False]
+    silent = [name for name, (stopped, _) in outcomes.items() if stopped is None]
+    fields: dict[str, Any] = {
+        "stopped": False if moving else None if silent or stale else True,
+        "not_stopped": moving,
+        "silent": silent,
+        "robots": {name: said for name, (_, said) in outcomes.items()},
+    }
+    if fields["stopped"]:
+        return success(f"Stopped: {', '.join(answers)}.", **fields)
+    problems = [f"DID NOT STOP: {', '.join(moving)}"] if moving else []
+    problems += [f"no answer, state unknown: {', '.join(silent)}"] if silent else []
+    problems += [f"stopped: {', '.join(answers)}. {stale.rstrip('.')}"] if not problems else []
+    return error("; ".join(problems) + ".", **fields)
+
+
+def measured(answers: Mapping[str, Envelope], roster: StopRoster, sending: Sending, estop_id: str = "") -> StopOutcome:
+    """Measure answers by the roster; one of unknown outcome is no answer."""
+    graded = {name: stop_outcome(answer) for name, answer in answers.items()}
+    rows = {name: Answer(name, stopped, 0.0, said) for name, (stopped, said) in graded.items() if stopped is not None}
+    report = StopReport(
+        estop_id,
+        {name: each for name, each in rows.items() if each.stopped},
+        {name: each for name, each in rows.items() if not each.stopped},
+        {},
+        (),
+        sending.left,
+        0.0,
+    )
+    return roster.outcome(report, sending)
+
+
+def roster_verdict(answers: Mapping[str, Envelope], outcome: StopOutcome, stale: str = "") -> Envelope:
+    """Return one answer: success when every robot of the roster was confirmed.
+
+    Args:
+        answers: by robot.
+        outcome: of these answers.
+        stale: as of :func:`combined_verdict`.
+    """
+    report = outcome.report
+    rows = {name: answers[name] for name in answers if name in report.answered}
+    for name in report.silent:
+        said = text_of(answers[name]) if name in answers else f"{name} did not answer."
+        why = outcome.reasons.get(name, "")
+        rows[name] = error(f"{said.rstrip('.')}{f': {why}' if why else ''}.", stopped=None)
+    verdict = combined_verdict(rows, stale or " ".join(outcome.problems))
+    fields = {name: value for name, value in verdict.items() if name not in ("status", "content", "reason")}
+    said = " ".join([text_of(verdict), outcome.sentence, *stop_notes(outcome)])
+    return (error if is_error(verdict) else success)(said, **fields, **outcome.facts())

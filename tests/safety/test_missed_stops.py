@@ -1,0 +1,595 @@
+"""Robots that were away ask which stops they missed, and others answer with the originals."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from fixtures.stop_bus import BusLink, BusMachine, StopBus, stop_message
+from fixtures.waiting import eventually
+
+from strands_robots.audit import flush_audit, read_audit_log
+from strands_robots.safety import ed25519, missed_stops
+from strands_robots.safety.answer_slots import SWEPT_ABOVE, AnswerSlots
+from strands_robots.safety.clearance import clear_here
+from strands_robots.safety.controller import SafetyController
+from strands_robots.safety.estop_listener import ESTOP, notification
+from strands_robots.safety.lockout import RESUMED_MAX, LockoutLatch
+from strands_robots.safety.missed_stops import (
+    ANSWER,
+    ANSWER_MAX_BYTES,
+    ANSWERS_ENOUGH,
+    QUESTION,
+    STOPS_MAX_BYTES,
+    Answerer,
+    Asker,
+    answer_fields,
+    waiting_s,
+)
+from strands_robots.safety.network_key import DEVICE_CONNECT, NetworkKey
+from strands_robots.safety.orders import StopRules, new_epoch, params_of
+from strands_robots.safety.originals import ORIGINAL_MAX_BYTES, STOPS_MAX, Original, Originals
+from strands_robots.safety.persistence import LockoutStore, ResumedEpochs
+from strands_robots.safety.state_files import uptime
+
+Join = Callable[..., BusMachine]
+
+SETTLED_S = 0.5
+"""Longer than an answer takes in which nothing may come."""
+
+
+@pytest.fixture
+def bus() -> StopBus:
+    return StopBus()
+
+
+@pytest.fixture
+def join(bus: StopBus) -> Iterator[Join]:
+    made: list[BusMachine] = []
+
+    def one(*names: str, **options: Any) -> BusMachine:
+        made.append(BusMachine(bus, *names, **options))
+        return made[-1]
+
+    yield one
+    for each in made:
+        each.close()
+
+
+@pytest.fixture
+def estop_key() -> Ed25519PrivateKey:
+    return Ed25519PrivateKey.generate()
+
+
+@pytest.fixture
+def signed_only(estop_key: Ed25519PrivateKey) -> Callable[[], StopRules]:
+    return lambda: StopRules(allow=(), keys=(ed25519.public_half(estop_key),))
+
+
+@pytest.fixture
+def operator(monkeypatch: pytest.MonkeyPatch) -> Ed25519PrivateKey:
+    key = Ed25519PrivateKey.generate()
+    monkeypatch.setenv("STRANDS_MESH_RESUME_PUBLIC_KEY", ed25519.encode(ed25519.public_half(key)))
+    return key
+
+
+def locked_and_cut_off(bus: StopBus, join: Join, key: Ed25519PrivateKey | None = None, **options: Any) -> Any:
+    """Return a machine that is locked by a stop, one that was cut off meanwhile, and the stop."""
+    there, away = join("there", **options), join("away", **options)
+    away.link.change(False)
+    epoch = bus.stop(key=key)
+    eventually(there.epochs)
+    return there, away, epoch
+
+
+def asks(bus: StopBus) -> int:
+    return len(bus.of(QUESTION))
+
+
+def given(bus: StopBus) -> list[dict[str, Any]]:
+    return [params_of(payload) for _, payload in bus.of(ANSWER)]
+
+
+def answered(bus: StopBus, before: int = 0) -> None:
+    eventually(lambda: len(bus.of(ANSWER)) > before, what="an answer")
+
+
+def audit_of(event: str) -> list[dict[str, Any]]:
+    flush_audit()
+    return [each for each in read_audit_log() if each["event"] == event]
+
+
+def forged(stops: list[dict[str, Any]], nonce: str = "") -> bytes:
+    return notification(ANSWER, {"nonce": nonce or new_epoch(), "stops": stops, "more": 0})
+
+
+def row(source: str, payload: bytes, age_s: object = 0.1) -> dict[str, Any]:
+    return {"source": source, "event": ed25519.encode(payload), "age_s": age_s}
+
+
+def answer_first(bus: StopBus, *payloads: bytes | int, source: str = "stranger") -> None:
+    """Have a stranger answer each question before anybody else."""
+
+    def on_event(event: str, asker: str, payload: bytes | int) -> None:
+        for number, each in enumerate(payloads):
+            bus.send(source if len(payloads) < 100 else f"{source}-{number}", ANSWER, each)
+
+    BusLink(bus).open((QUESTION,), on_event, lambda up: None)
+
+
+def test_robot_that_was_cut_off_locks_by_the_stop_that_it_missed(bus: StopBus, join: Join) -> None:
+    _, away, epoch = locked_and_cut_off(bus, join)
+    assert away.epochs() == ()
+    away.link.change(True)
+    eventually(away.epochs)
+    assert away.epochs() == (epoch,)
+    assert away.robots["away"].refuses()
+    eventually(lambda: audit_of("missed_stop_learnt"))
+    record = audit_of("missed_stop_learnt")[0]
+    assert record["peer_id"] == "away"
+    assert record["payload"]["answerer"] == "there"
+    assert audit_of("missed_stops_answered")[0]["payload"]["epochs"] == [epoch]
+
+
+def test_robot_that_did_not_run_for_a_while_asks(bus: StopBus, join: Join) -> None:
+    there, away = join("there"), join("away")
+    away.link.up = False  # it does not even see that the link went
+    epoch = bus.stop()
+    eventually(there.epochs)
+    away.link.up = True
+    away.listener.awake()
+    eventually(away.epochs)
+    assert away.epochs() == (epoch,)
+
+
+def test_answer_holds_the_original_verbatim_and_never_goes_to_the_topics_of_stops(bus: StopBus, join: Join) -> None:
+    _, away, _ = locked_and_cut_off(bus, join)
+    original = bus.of(ESTOP)[0][1]
+    away.link.change(True)
+    eventually(away.epochs)
+    (stop,) = given(bus)[0]["stops"]
+    assert ed25519.decode_up_to(stop["event"], ORIGINAL_MAX_BYTES) == original
+    assert 0 <= stop["age_s"] < 60
+    assert len(bus.of(ESTOP)) == 1
+
+
+def test_robot_that_learnt_a_stop_answers_the_next_one_with_its_true_age(bus: StopBus, join: Join) -> None:
+    third = join("third")
+    third.link.change(False)
+    there, away, epoch = locked_and_cut_off(bus, join)
+    away.link.change(True)
+    eventually(away.epochs)
+    there.plane.clear_local("test")
+    third.link.change(True)
+    eventually(third.epochs)
+    assert third.epochs() == (epoch,)
+
+
+def test_newcomer_does_not_ask_and_is_not_locked(bus: StopBus, join: Join) -> None:
+    there = join("there")
+    bus.stop()
+    eventually(there.epochs)
+    newcomer = join("newcomer")
+    time.sleep(SETTLED_S)
+    assert asks(bus) == 0
+    assert newcomer.epochs() == ()
+
+
+def test_robot_that_was_here_before_its_start_asks_unless_its_state_was_reset(
+    bus: StopBus, join: Join, tmp_path: Path
+) -> None:
+    there = join("there")
+    known, reset = tmp_path / "known", tmp_path / "reset"
+    LockoutStore(known).save_resumed({"simulation:back": ResumedEpochs({}, uptime() - 300)})
+    epoch = bus.stop()
+    eventually(there.epochs)
+    join("reset", folder=reset, was_here=True)
+    time.sleep(SETTLED_S)
+    assert asks(bus) == 0
+    back = join("back", folder=known, was_here=True)
+    eventually(back.epochs)
+    assert back.epochs() == (epoch,)
+
+
+def test_stop_from_before_the_robot_s_time_does_not_lock_it(bus: StopBus, join: Join) -> None:
+    there = join("there")
+    bus.stop()
+    eventually(there.epochs)
+    time.sleep(0.01)
+    younger = join("younger")
+    younger.listener.awake()
+    answered(bus)
+    time.sleep(SETTLED_S)
+    assert younger.epochs() == ()
+
+
+@pytest.mark.parametrize("how", ["key", "local"])
+def test_robot_never_locks_again_by_an_epoch_that_it_was_resumed_from(
+    bus: StopBus, join: Join, operator: Ed25519PrivateKey, tmp_path: Path, how: str
+) -> None:
+    there, away = join("there"), join("away", folder=tmp_path)
+    first = bus.stop()
+    eventually(away.epochs)
+    if how == "key":
+        assert away.resume(operator, "away", first)
+    else:
+        assert away.plane.clear_local("test")
+    # So many stops that the plane itself has forgotten the first.
+    there.link.change(False)
+    for _ in range(400):
+        epoch = bus.stop()
+        eventually(lambda epoch=epoch: epoch in away.epochs())  # type: ignore[misc]
+        away.plane.clear_local("test")
+    there.link.change(True)
+    away.listener.awake()
+    answered(bus)
+    time.sleep(SETTLED_S)
+    assert away.epochs() == ()
+    away.close()
+    back = join("away", folder=tmp_path, was_here=True)
+    before = len(bus.of(ANSWER))
+    back.listener.awake()
+    answered(bus, before)
+    time.sleep(SETTLED_S)
+    assert back.epochs() == ()
+
+
+def test_epochs_that_an_overflow_stood_for_count_as_resumed_once_it_was_cleared() -> None:
+    latch = LockoutLatch("arm-1")
+    epochs = [new_epoch() for _ in range(100)]
+    for each in epochs:
+        latch.engage(each, "safety-1", "")
+    latch.clear()
+    assert set(epochs) <= set(latch.resumed)
+    assert not any(latch.engage(each, "safety-1", "") for each in epochs)
+
+
+def test_stops_cannot_evict_a_resumed_epoch_and_resumes_evict_the_oldest() -> None:
+    latch = LockoutLatch("arm-1")
+    first = new_epoch()
+    latch.engage(first, "safety-1", "")
+    latch.resume(first)
+    for _ in range(2000):
+        latch.engage(new_epoch(), "stranger", "")
+    assert not latch.engage(first, "safety-1", "")
+    latch.forgo(new_epoch() for _ in range(RESUMED_MAX))
+    assert len(latch.resumed) == RESUMED_MAX
+    assert first not in latch.resumed
+
+
+def test_answerer_that_was_restarted_still_answers(bus: StopBus, join: Join, tmp_path: Path) -> None:
+    also = join("also", folder=tmp_path)
+    there, away, epoch = locked_and_cut_off(bus, join)
+    eventually(lambda: also.epochs() and not also.entries[0].unsaved)
+    there.plane.clear_local("test")
+    also.close()
+    assert join("also", folder=tmp_path).epochs() == (epoch,)
+    away.link.change(True)
+    eventually(away.epochs)
+    assert away.epochs() == (epoch,)
+
+
+def test_lockout_file_of_yesterday_loads_and_its_robot_has_no_original(tmp_path: Path) -> None:
+    store = LockoutStore(tmp_path)
+    store.save({})
+    epoch = new_epoch()
+    hold = {"epoch": epoch, "source": "safety-1", "reason": "", "at": 1.0}
+    record = {"v": 2, "key": "k", "name": "arm-1", "holds": [hold], "overflow": None, "seen": [epoch]}
+    store.file("k").write_text(json.dumps(record))
+    kept = store.load("k")
+    assert kept.state.epochs == (epoch,)
+    assert (kept.originals, kept.resumed) == ((), None)
+
+
+def test_unreadable_record_of_resumed_epochs_locks_as_an_unreadable_lockout_does(tmp_path: Path) -> None:
+    store = LockoutStore(tmp_path)
+    store.save_resumed({"k": ResumedEpochs({new_epoch(): None})})
+    store.resumed_file("k").write_text("{")
+    assert store.load("k").state.locked
+
+
+def test_local_clearance_of_a_robot_that_does_not_run_keeps_its_epochs_resumed(
+    bus: StopBus, join: Join, state_directory: Path
+) -> None:
+    machine = join("arm-1", folder=state_directory)
+    epoch = bus.stop()
+    eventually(lambda: not machine.entries[0].unsaved and machine.epochs())
+    machine.close()
+    assert clear_here("the operator", ["arm-1"], 0.1) == {"arm-1": "cleared on disk"}
+    kept = LockoutStore(state_directory).load("simulation:arm-1")
+    assert not kept.state.locked
+    assert kept.resumed is not None
+    assert epoch in kept.resumed.epochs
+
+
+def test_another_network_is_neither_asked_nor_answered(bus: StopBus, join: Join) -> None:
+    other = NetworkKey(DEVICE_CONNECT, ("127.0.0.1:7447",), "other")
+    there, away = join("there"), join("away")
+    away.link.change(False)
+    bus.stop()
+    eventually(there.epochs)
+    # The robot is on both networks: it is locked, and its stop is not passed on from one to the other.
+    assert there.plane.originals(other.text) == []
+    away.link.change(True)
+    eventually(away.epochs)
+
+
+def test_signed_stop_locks_and_unsigned_ones_in_an_answer_do_not_where_signatures_are_demanded(
+    bus: StopBus, join: Join, estop_key: Ed25519PrivateKey, signed_only: Callable[[], StopRules]
+) -> None:
+    _, away, epoch = locked_and_cut_off(bus, join, estop_key, rules=signed_only)
+    unsigned = stop_message("safety-1")[1]
+    wrong = stop_message("safety-1", Ed25519PrivateKey.generate())[1]
+    answer_first(bus, forged([row("safety-1", unsigned), row("safety-1", wrong)]))
+    away.link.change(True)
+    eventually(away.epochs)
+    time.sleep(SETTLED_S)
+    assert away.epochs() == (epoch,)
+
+
+def test_unsigned_stop_in_an_answer_does_not_lock_where_only_some_may_stop(bus: StopBus, join: Join) -> None:
+    _, away, _ = locked_and_cut_off(bus, join, rules=lambda: StopRules(allow=("safety-*",), keys=()))
+    away.link.change(True)
+    answered(bus)
+    time.sleep(SETTLED_S)
+    assert away.epochs() == ()
+
+
+@pytest.mark.parametrize(
+    "answers",
+    [
+        [forged([])],
+        [b"", b"{", b"[" * 60_000, b"\xff" * 1000, notification(ANSWER, {"stops": "x"})],
+        [8 * 2**20],
+        [forged([row("safety-1", b"x"), row("", b"{}"), row("safety-1", b"{}", "old"), {"source": 1}, 7] * 20)],
+        [forged([row("safety-1", stop_message("x")[1], bad) for bad in (-1, True, "1", 1e30, float("nan"))])],
+        [forged([]) for _ in range(10_000)],
+    ],
+    ids=["none", "garbage", "8 MB", "stops that are none", "ages that are none", "10,000 answers"],
+)
+def test_stranger_who_answers_first_hides_nothing_and_locks_nothing(
+    bus: StopBus,
+    join: Join,
+    estop_key: Ed25519PrivateKey,
+    signed_only: Callable[[], StopRules],
+    answers: list[bytes | int],
+) -> None:
+    _, away, epoch = locked_and_cut_off(bus, join, estop_key, rules=signed_only)
+    answer_first(bus, *answers)
+    away.link.change(True)
+    eventually(away.epochs)
+    time.sleep(SETTLED_S)
+    assert away.epochs() == (epoch,)
+
+
+def test_recorded_stop_that_was_resumed_locks_nobody_again(
+    bus: StopBus, join: Join, operator: Ed25519PrivateKey, estop_key: Ed25519PrivateKey,
+    signed_only: Callable[[], StopRules],
+) -> None:  # fmt: skip
+    away = join("away", rules=signed_only)
+    epoch = bus.stop(key=estop_key)
+    eventually(away.epochs)
+    recorded = bus.of(ESTOP)[0][1]
+    assert isinstance(recorded, bytes)
+    assert away.resume(operator, "away", epoch)
+    answer_first(bus, forged([row("safety-1", recorded, 0.0)]))
+    away.listener.awake()
+    answered(bus)
+    time.sleep(SETTLED_S)
+    assert away.epochs() == ()
+
+
+def test_stop_without_an_id_of_its_own_is_not_passed_on(bus: StopBus, join: Join) -> None:
+    there = join("there")
+    bus.send("safety-1", ESTOP, json.dumps({"method": ESTOP, "params": {}}).encode())
+    eventually(there.epochs)
+    assert there.plane.originals("device-connect default 127.0.0.1:7447") == []
+
+
+def test_stop_too_long_to_be_passed_on_locks_all_the_same(bus: StopBus, join: Join) -> None:
+    there = join("there")
+    bus.stop(padding="x" * ORIGINAL_MAX_BYTES)
+    eventually(there.epochs)
+    assert there.plane.originals("device-connect default 127.0.0.1:7447") == []
+
+
+def test_scope_of_a_missed_stop_is_judged_as_that_of_a_direct_one(bus: StopBus, join: Join) -> None:
+    there, away, other = join("there"), join("away"), join("other")
+    away.link.change(False), other.link.change(False)
+    epoch = bus.stop(scope={"only": ["there", "away"]})
+    eventually(there.epochs)
+    away.link.change(True), other.link.change(True)
+    eventually(away.epochs)
+    time.sleep(SETTLED_S)
+    assert away.epochs() == (epoch,)
+    assert other.epochs() == ()
+
+
+def test_process_asks_again_after_two_seconds_and_not_more_than_once_a_second() -> None:
+    asker, asked = Asker(), list[float]()
+    for step in range(100):
+        now = step / 10
+        if step < 10:
+            asker.want(now)  # a link that comes and goes
+        if now >= asker.due:
+            asker.settle(now, dropped=False)
+            if now >= asker.due:
+                asker.asked(now)
+                asked.append(now)
+    assert asked == [0.0, 1.0, 3.0]
+
+
+def test_process_whose_robots_are_all_locked_asks_later_and_seldom() -> None:
+    asker, asked = Asker(), list[float]()
+    for step in range(120):
+        now = step / 10
+        asker.want(now, 1.5)
+        if now >= asker.due:
+            asker.asked(now)
+            asker.not_asked()
+            asked.append(now)
+    assert asked == [1.5, 6.5, 11.5]
+    asker.want(12.0, 1.5)
+    asker.want(12.6)  # it was resumed, and was away since
+    assert asker.due == 12.6
+
+
+def test_processes_of_one_machine_give_three_answers_to_a_question(tmp_path: Path) -> None:
+    slots, (one, other) = [AnswerSlots(tmp_path) for _ in range(10)], (new_epoch(), new_epoch())
+    epochs = [new_epoch()]
+    assert [each.take([one], epochs) for each in slots].count([one]) == 3
+    assert slots[0].take([one, other], epochs) == [other]
+    assert slots[0].take([one], [*epochs, new_epoch()]), "nobody else has these stops"
+    assert len(list((tmp_path / "answers").iterdir())) == 5
+
+
+def test_machine_that_cannot_share_its_answers_gives_them_all(tmp_path: Path) -> None:
+    (tmp_path / "answers").mkdir()
+    (tmp_path / "answers").chmod(0o777)
+    assert all(AnswerSlots(tmp_path).take([new_epoch()], []) for _ in range(5))
+
+
+def test_slots_of_old_questions_are_removed(tmp_path: Path) -> None:
+    slots = AnswerSlots(tmp_path)
+    for _ in range(SWEPT_ABOVE + 1):
+        slots.take([new_epoch()], [])
+    for each in (tmp_path / "answers").iterdir():
+        os.utime(each, (1.0, 1.0))
+    slots.take([new_epoch()], [])
+    assert len(list((tmp_path / "answers").iterdir())) == 1
+
+
+def test_process_whose_answers_had_to_be_dropped_goes_on_asking_a_few_times() -> None:
+    asker, asked = Asker(), list[float]()
+    asker.want(0.0)
+    for now in range(100):
+        asker.settle(now, dropped=True)
+        if now >= asker.due:
+            asker.asked(now)
+            asked.append(now)
+    assert asked == [0.0, 2.0, 4.0, 6.0, 8.0]
+
+
+def test_flood_of_questions_gets_a_bounded_number_of_answers(bus: StopBus, join: Join) -> None:
+    there = join("there")
+    bus.stop()
+    eventually(there.epochs)
+    started = time.monotonic()
+    for number in range(10_000):
+        bus.send(f"stranger-{number % 100}", QUESTION, notification(QUESTION, {"nonce": new_epoch()}))
+    answered(bus)
+    time.sleep(SETTLED_S)
+    assert len(bus.of(ANSWER)) <= 2 + (time.monotonic() - started) / missed_stops.ANSWER_EVERY_S
+
+
+def test_answerers_with_known_keys_fall_silent_once_three_have_answered(bus: StopBus, join: Join) -> None:
+    many = [join(f"there-{number}") for number in range(20)]
+    away = join("away")
+    away.link.change(False)
+    bus.stop()
+    eventually(lambda: all(each.epochs() for each in many))
+    away.link.change(True)
+    eventually(away.epochs)
+    time.sleep(SETTLED_S)
+    assert len(bus.of(ANSWER)) <= 6
+
+
+def test_answers_without_a_key_that_is_known_silence_nobody() -> None:
+    answerer, original = Answerer(lambda: 0.5), Original(new_epoch(), "safety-1", b"{}", "", 0.0)
+    answerer.ask("a" * 32, 0.0)
+    for number in range(ANSWERS_ENOUGH - 1):
+        answerer.given("a" * 32, f"arm-{number}", [original.epoch])
+        answerer.given("a" * 32, f"arm-{number}", [original.epoch])
+    answerer.given("b" * 32, "arm-9", [original.epoch])  # an answer to no question that waits
+    assert answerer.take([original], 1.0) == [original]
+
+
+def test_stop_that_the_given_answers_lacked_is_answered_all_the_same() -> None:
+    answerer = Answerer(lambda: 0.5)
+    told, untold = (Original(new_epoch(), "safety-1", b"{}", "", 0.0) for _ in range(2))
+    answerer.ask("a" * 32, 0.0)
+    for number in range(ANSWERS_ENOUGH):
+        answerer.given("a" * 32, f"arm-{number}", [told.epoch])
+    assert answerer.take([told, untold], 1.0) == [untold]
+
+
+def test_of_many_answerers_few_wait_shortly() -> None:
+    chance = random.Random(7)
+    counts = []
+    for _ in range(200):
+        due = sorted(waiting_s(chance.random()) for _ in range(400))
+        # An answer is heard 3 ms after it was sent.
+        sent: list[float] = []
+        for moment in due:
+            if sum(each + 0.003 <= moment for each in sent) < ANSWERS_ENOUGH:
+                sent.append(moment)
+        counts.append(len(sent))
+    assert max(due) <= missed_stops.WAIT_MAX_S
+    assert sum(counts) / len(counts) <= 4
+    assert sorted(counts)[int(0.95 * len(counts))] <= 6
+
+
+def test_answer_is_bounded_and_the_newest_stops_of_each_source_come_first() -> None:
+    def original(source: str, number: int, size: int = 100) -> Original:
+        return Original(new_epoch(), source, bytes(size), "", float(number))
+
+    flood = [original("stranger", number, ORIGINAL_MAX_BYTES) for number in range(50, 200)]
+    true = original("safety-1", 3)
+    fields = answer_fields("a" * 32, [true, *flood])
+    assert len(notification(ANSWER, fields)) <= ANSWER_MAX_BYTES
+    assert [each["source"] for each in fields["stops"]].count("safety-1") == 1
+    assert fields["more"] == 151 - len(fields["stops"])
+    small = [original("safety-1", number) for number in range(100)]
+    ages = [each["age_s"] for each in answer_fields("a" * 32, small)["stops"]]
+    assert len(ages) == STOPS_MAX
+    assert ages == sorted(ages, reverse=True)
+    assert sum(missed_stops.encoded_length(each) for each in small[:STOPS_MAX]) < STOPS_MAX_BYTES
+
+
+def test_originals_are_bounded_and_forgotten_with_their_lockout() -> None:
+    originals, now = Originals(), uptime()
+    epochs = [new_epoch() for _ in range(200)]
+    for number, epoch in enumerate(epochs):
+        originals.add(Original(epoch, "stranger", b"x", "net", now + number))
+        originals.keep(frozenset(epochs))
+    assert [each.epoch for each in originals.of(frozenset(epochs), "net")] == epochs[-STOPS_MAX:]
+    assert originals.of(frozenset(epochs), "other") == []
+    originals.keep(frozenset())
+    assert originals.of(frozenset(epochs)) == []
+
+
+def test_controller_answers_with_its_stop_until_all_who_must_answer_have(bus: StopBus, join: Join) -> None:
+    there, away = join("there"), join("away")
+    controller = SafetyController("safety-1", lambda: BusLink(bus))
+    try:
+        away.link.change(False)
+        report = controller.stop(["there", "away"], deadline_s=0.3)
+        assert report.silent == ("away",)
+        there.plane.clear_local("test")
+        away.link.change(True)
+        eventually(away.epochs)
+        assert away.epochs() == (report.estop_id,)
+        away.plane.clear_local("test")
+        before = len(bus.of(ANSWER))
+        assert controller.stop(["there", "away"], deadline_s=5.0).ok
+        there.plane.clear_local("test"), away.plane.clear_local("test")
+        third = join("third")
+        third.listener.awake()
+        eventually(lambda: len(bus.of(ANSWER)) > before)
+        assert [each["epoch"] for each in map(stated, given(bus)[before:])] == [report.estop_id]
+    finally:
+        controller.close()
+
+
+def stated(answer: dict[str, Any]) -> dict[str, Any]:
+    (stop,) = answer["stops"]
+    payload = ed25519.decode_up_to(stop["event"], ORIGINAL_MAX_BYTES)
+    assert payload is not None
+    return {"epoch": params_of(payload)["estop_id"]}
