@@ -10,6 +10,7 @@ import sys
 import time
 import tracemalloc
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -21,7 +22,7 @@ from strands_robots.device_connect.enrollment import network_of
 from strands_robots.safety import sighting_file
 from strands_robots.safety.identity import ROBOTS, EnrolledKeys, Exemption, KeyFile, SigningIdentity
 from strands_robots.safety.network_key import DEVICE_CONNECT, MESH, NetworkKey
-from strands_robots.safety.sighting_file import Note, process_start
+from strands_robots.safety.sighting_file import Note, Served, process_start
 from strands_robots.safety.sightings import Known, Moment, Sighting, Sightings, flush_sightings, this_moment
 from strands_robots.safety.statements import Purpose, signed
 from strands_robots.utils import ValidationError
@@ -171,6 +172,21 @@ def test_a_served_robot_counts_while_its_process_lives(store: Sightings, clock: 
         "cell-1",
         True,
     )
+
+
+def test_a_robot_that_two_living_processes_serve_is_a_problem(store: Sightings, clock: Clock) -> None:
+    """One of them may be frozen, and the other answers."""
+    both = [Served(HERE, "arm-1", pid, process_start(pid), clock()) for pid in (os.getpid(), os.getppid())]
+    store.file.write([], both[:1], clock())
+    assert store.read()[1] == ""
+    store.file.write([], both[1:], clock())
+    rows, problem = store.read()
+    assert [each.name for each in rows] == ["arm-1"]
+    assert "arm-1" in problem
+    assert str(os.getpid()) in problem
+    gone = Served(HERE, "arm-1", os.getppid(), "an earlier process", clock())
+    store.file.write([], [replace(both[1], ended=True), gone], clock())
+    assert store.read()[1] == ""
 
 
 def test_an_orderly_end_takes_a_robot_out_though_others_heard_it(store: Sightings, clock: Clock) -> None:

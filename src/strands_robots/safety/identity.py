@@ -169,6 +169,15 @@ def robot_identity(name: str) -> SigningIdentity | None:
         return None
 
 
+def key_here(name: str) -> bytes | None:
+    """Return the public key of a robot of this machine, None without a usable one."""
+    try:
+        identity = KeyFile(ROBOTS, name).load()
+    except (StrandsRobotsError, OSError):
+        return None
+    return None if identity is None else identity.public
+
+
 def robots_here(directory: Path | None = None) -> dict[str, SigningIdentity | str]:
     """Return the identities of this machine's robots by name, or why one is unusable."""
     found: dict[str, SigningIdentity | str] = {}

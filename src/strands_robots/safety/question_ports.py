@@ -12,10 +12,9 @@ from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety import ed25519
 from strands_robots.safety.identity import (
     DEFAULT_TENANT,
-    ROBOTS,
     EnrolledKeys,
-    KeyFile,
     SigningIdentity,
+    key_here,
     local_name,
 )
 from strands_robots.safety.network_key import NetworkKey
@@ -24,7 +23,6 @@ from strands_robots.safety.originals import ORIGINAL_MAX_BYTES, STOPS_MAX, Origi
 from strands_robots.safety.plane import SafetyPlane
 from strands_robots.safety.state_files import uptime
 from strands_robots.safety.stop_log import stop_logger
-from strands_robots.utils import ValidationError
 
 logger = stop_logger(__name__)
 
@@ -70,7 +68,7 @@ class KnownKeys:
         if self._enrolled.get(own) == key:
             return True
         if own not in self._known and len(self._known) < KEYS_MAX:
-            self._known[own] = _key_here(own)
+            self._known[own] = key_here(own)
         return self._known.get(own) == key
 
 
@@ -79,14 +77,6 @@ def _enrolled() -> Mapping[str, bytes]:
         return EnrolledKeys().load()
     except (StrandsRobotsError, OSError):
         return {}
-
-
-def _key_here(name: str) -> bytes | None:
-    try:
-        identity = KeyFile(ROBOTS, name).load()
-    except (ValidationError, StrandsRobotsError, OSError):
-        return None
-    return None if identity is None else identity.public
 
 
 class RobotsPort:

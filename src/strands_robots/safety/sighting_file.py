@@ -279,7 +279,7 @@ class SightingFile:
             problem = (
                 "sightings.db was damaged and begun again less than ten minutes ago; robots heard before may be missing"
             )
-        return _united(heard, served, now), problem
+        return _united(heard, served, now), problem or _twofold(served, now)
 
     def served(self) -> list[Served]:
         """Return the rows of served robots, those that ended included.
@@ -425,6 +425,20 @@ def _served_row(row: Served) -> tuple[object, ...]:
 
 def _moment_row(at: Moment) -> tuple[str, float, float]:
     return at.boot, at.uptime, at.wall
+
+
+def _twofold(served: Sequence[Served], now: Moment) -> str:
+    """Return a sentence on a robot that two living processes serve, or "".
+
+    An answer of one says nothing of the other.
+    """
+    living: dict[tuple[NetworkKey, str], set[int]] = {}
+    for row in served:
+        if row.lives(now):
+            living.setdefault((row.network, row.name), set()).add(row.pid)
+    twice = {name: sorted(pids) for (_, name), pids in living.items() if len(pids) > 1}
+    name = min(twice, default="")
+    return f"{name} is served by the processes {', '.join(map(str, twice[name]))} of this machine" if name else ""
 
 
 def _united(heard: Sequence[tuple[object, ...]], served: Sequence[Served], now: Moment) -> list[Sighting]:

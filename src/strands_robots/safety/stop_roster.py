@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Set
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 from strands_robots.audit import queue_safety_event
 from strands_robots.safety.answers import Answer
 from strands_robots.safety.controller import StopReport
-from strands_robots.safety.network_key import NetworkKey
+from strands_robots.safety.identity import key_here, local_name
+from strands_robots.safety.network_key import DEVICE_CONNECT, NetworkKey
 from strands_robots.safety.roster import Roster, RosterRow
 from strands_robots.safety.roster_report import RosterReport
 from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope
 from strands_robots.safety.sightings import Known, sightings
 from strands_robots.safety.silence import Sending, reason_of
 from strands_robots.safety.state_files import uptime
-from strands_robots.safety.statements import Purpose
+from strands_robots.safety.statements import Proof, Purpose, proof_of
 
 OTHERS_AWAITED = 64
 """Names that do not alter the exit code, and for whose answer a stop goes on all the same."""
@@ -225,6 +226,7 @@ class StopRoster:
                 if each.more
             ]
         rows = {row.name: row for row in roster.rows}
+        report = self._proven(report, {name for name, row in rows.items() if row.alive})
         must = {row.name for row in roster.rows if counts(roster, row)} | report.alarms.keys()
         no_stop = tuple(row.name for row in roster.rows if row.stoppable is False and row.name not in must)
         told = {*rows} - must - {*no_stop}
@@ -236,6 +238,19 @@ class StopRoster:
             if name in rows
         }
         return StopOutcome(counted, others, roster, no_stop, unproven, reasons, tuple(problems), sending)
+
+    def _proven(self, report: StopReport, served: Set[str]) -> StopReport:
+        """Return the report with unsigned answers of robots served here as claims.
+
+        Their keys lie on this machine, whether or not they are enrolled.
+        """
+        claimed = dict(report.claimed)
+        for name in served & report.stopped.keys() if self._network.kind == DEVICE_CONNECT else ():
+            answer, key = report.stopped[name], key_here(local_name(self._network.tenant, name))
+            if key is not None and proof_of(Purpose.STOP_VERDICT, name, answer.facts, key) is not Proof.SIGNED:
+                claimed[name] = replace(answer, required=True)
+        stopped = {name: each for name, each in report.stopped.items() if name not in claimed}
+        return replace(report, stopped=stopped, claimed=claimed)
 
     def _whole(self, answered: Collection[tuple[str, Answer]]) -> Roster:
         """Return the roster with all that was named, found, reported and answered since."""

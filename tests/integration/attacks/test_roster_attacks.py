@@ -59,8 +59,10 @@ def red(console: Machine, lab: RosterLab, name: str = "arm-1", *more: str) -> No
     assert name in said.stdout + said.stderr
 
 
-def test_stranger_says_stopped_for_a_frozen_robot(console: Machine, lab: RosterLab) -> None:
-    stranger = lab.stranger()
+@pytest.mark.parametrize("how", ["robots", "enrolled"])
+def test_stranger_says_stopped_for_a_frozen_robot(lab: RosterLab, how: str) -> None:
+    """A machine that has neither served nor enrolled the robot knows no key to check its answer with."""
+    console, stranger = known_by(how, lab), lab.stranger()
     robot(lab).freeze()
     stranger.ask("claim", "arm-1")
     red(console, lab)
@@ -105,7 +107,9 @@ def test_thousands_of_made_up_names_hide_no_frozen_robot(console: Machine, lab: 
     red(console, lab)
 
 
-def test_second_process_of_the_same_name_answers_for_a_frozen_one(console: Machine, lab: RosterLab) -> None:
+def test_second_process_of_the_same_name_answers_for_a_frozen_one(lab: RosterLab) -> None:
+    """Their own machine knows of both; for another one they are the same robot."""
+    console = known_by("robots", lab)
     robot(lab).freeze()
     lab.robots("arm-1", state="robots")
     red(console, lab)
