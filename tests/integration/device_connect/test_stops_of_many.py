@@ -89,7 +89,9 @@ def devices(link: LinkConfig) -> Iterator[Fleet]:
     fleet.close()
 
 
-def test_stop_of_all_asks_and_names_every_device_and_starts_no_thread_for_each(link: LinkConfig, devices: Fleet) -> None:
+def test_stop_of_all_asks_and_names_every_device_and_starts_no_thread_for_each(
+    link: LinkConfig, devices: Fleet
+) -> None:
     with FleetClient(link) as fleet:
         before = {each.name for each in threading.enumerate()}
         answers = fleet.stop_all(30.0)
