@@ -578,10 +578,10 @@ class _Running:
     def settled_scope(self) -> bool:
         """A robot in the scope has answered.
 
-        What is claimed for an enrolled one is no answer.
+        Where robots are enrolled, only a signed answer shows that one is there: anyone can claim a name or a cell.
         """
         return any(
-            self.scope.names(name, each.facts.get("cell")) and not (each.claimed and each.enrolled)
+            self.scope.names(name, each.facts.get("cell")) and self.graded.shows(each)
             for name, each in self.graded.by_robot.items()
         )
 
