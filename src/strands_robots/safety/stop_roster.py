@@ -281,8 +281,8 @@ class StopRoster:
             return []
         return [pid for run, pid in row.processes if run not in runs]
 
-    """Return the run ids in answers that its key has signed, "" for none stated."""
-        """Return the run ids in answers that the robot's key has signed, "" for none stated."""
+    def _proven_runs(self, name: str, answer: Answer) -> frozenset[str]:
+        """Return the run ids in answers that the robot's key has signed; "" for none."""
         if self._network.kind != DEVICE_CONNECT or not answer.facts:
             return frozenset(answer.runs or ("",))
         if name not in self._keys:
