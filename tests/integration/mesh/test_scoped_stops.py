@@ -10,18 +10,18 @@ from tests.integration.mesh.conftest import Join
 
 
 @pytest.mark.parametrize(
-    ("scope", "known", "locked"),
+    ("scope", "known", "stopped"),
     [
-        ({"only": ["arm-1"]}, True, {"arm-1"}),
-        ({"cell": "cell-1"}, True, {"arm-1", "nowhere"}),
-        ({"only": ["arm-9"]}, False, {"arm-1", "arm-2", "nowhere"}),
+        ({"only": ["arm-1"]}, True, ("arm-1",)),
+        ({"cell": "cell-1"}, True, ("arm-1", "nowhere")),
+        ({"only": ["arm-9"]}, False, ("arm-1", "arm-2", "nowhere")),
     ],
     ids=str,
 )
 def test_stop_of_some_robots_leaves_the_others_alone(
-    join: Join, scope: dict[str, Any], known: bool, locked: set[str]
+    join: Join, scope: dict[str, Any], known: bool, stopped: tuple[str, ...]
 ) -> None:
-    console = join("console", "none")
+    console, locked = join("console", "none"), set(stopped)
     cells = {"arm-1": "cell-1", "arm-2": "cell-2", "nowhere": ""}
     arms = {name: join(name, "arm", STRANDS_CELL=cell) for name, cell in cells.items()}
     console.sees(*arms)
