@@ -12,6 +12,7 @@ from strands_robots.safety.answers import Answer, Answers, Received
 from strands_robots.safety.controller import StopReport
 from strands_robots.safety.identity import ROBOTS, EnrolledKeys, Exemption, KeyFile, of_tenant
 from strands_robots.safety.network_key import DEVICE_CONNECT, MESH, NetworkKey
+from strands_robots.safety.scope import Scope
 from strands_robots.safety.sighting_file import Served, own_run, process_start
 from strands_robots.safety.sightings import sightings, this_moment
 from strands_robots.safety.statements import Purpose, signed
@@ -179,3 +180,38 @@ def test_joined_network_makes_no_name_count_less() -> None:
     one = outcome(answered("arm-1"))
     assert one.roster.joined == (OTHER_NAME,)
     assert one.report.silent == ("arm-3", "arm-9")
+
+
+CELL_1 = Scope(cell="cell-1")
+
+
+def awaited_in_cell(name: str, stated: str | None) -> bool:
+    """Return whether a robot must answer a stop of cell-1 while its presence states a cell."""
+    roster = StopRoster(NETWORK, scope=CELL_1)
+    roster.read()
+    roster.find({name: True}, {name: stated})
+    return name in roster.awaited()
+
+
+def test_unsigned_presence_takes_no_robot_that_is_served_here_out_of_a_scope() -> None:
+    sightings().serve(NETWORK, "arm-1")
+    sightings().serve(NETWORK, "arm-2", cell="cell-2")
+    assert awaited_in_cell("arm-1", "cell-2")
+    # Its record is what counts.
+    assert not awaited_in_cell("arm-2", "cell-2")
+    assert not awaited_in_cell("arm-2", "")
+
+
+@pytest.mark.parametrize("known", ["", "cell-1"])
+def test_presence_that_contradicts_the_memory_takes_no_enrolled_robot_out_of_a_scope(known: str) -> None:
+    enroll(NETWORK, "arm-1")
+    sightings().note(NETWORK, "arm-1", cell=known)
+    assert awaited_in_cell("arm-1", "cell-2")
+
+
+def test_enrolled_robot_of_another_cell_need_not_answer_the_stop_of_one() -> None:
+    enroll(NETWORK, "arm-1", "arm-2")
+    sightings().note(NETWORK, "arm-1", cell="cell-2")
+    assert not awaited_in_cell("arm-1", "cell-2")
+    # Not heard for ten minutes: its presence is all that is known.
+    assert not awaited_in_cell("arm-2", "cell-2")
