@@ -30,6 +30,7 @@ PARTS = {
     "reach": "Arms that reach and grasp",
     "safety": "From the controller's call to the last write",
     "answers": "Strangers that answer for a robot",
+    "roster": "Robots that were away during a stop",
     "attacks": "Attacks on the way of a stop",
     "reachy": "Reachy Mini",
     "mesh": "The native mesh beside bare Zenoh",

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from strands_robots.envelope import Envelope, success
 from strands_robots.ros.memory import MemoryLink
 from strands_robots.ros_telemetry import RosTelemetryBase
+from strands_robots.safety.gate import MotionGate
 from strands_robots.utils import ValidationError
 
 NAMES = st.lists(st.sampled_from(["a.pos", "b.pos", "c.pos"]), max_size=4)
@@ -26,6 +27,7 @@ class Arm:
     tool_name_str = "arm"
 
     def __init__(self) -> None:
+        self.gate = MotionGate()
         self.taken: list[dict[str, float]] = []
         self.state: dict[str, Any] = {"joints": {"a.pos": 0.5}}
 
@@ -169,3 +171,11 @@ def test_stream_that_paused_starts_where_the_arm_is(monkeypatch: pytest.MonkeyPa
 def test_unusable_joint_speed_is_refused_by_name(speed: Any) -> None:
     with pytest.raises(ValidationError, match="max_joint_speed"):
         streaming(Arm(), speed)
+
+
+def test_command_that_comes_while_motions_hold_is_left_out() -> None:
+    arm = Arm()
+    bridge = Bridge(arm)
+    arm.gate.hold(60.0)
+    assert bridge.apply({"name": ["a.pos"], "position": [0.5]}) is False
+    assert arm.taken == []

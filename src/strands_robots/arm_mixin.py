@@ -8,7 +8,7 @@ import math
 import threading
 import time
 from abc import abstractmethod
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, ParamSpec
@@ -25,9 +25,9 @@ from strands_robots.utils import ValidationError, choice, identifier, missing_ex
 if TYPE_CHECKING:  # numpy and MuJoCo are loaded with the first motion
     from strands_robots.kinematics.arm import Arm, ArmState
     from strands_robots.kinematics.detector import ObjectDetector
-    from strands_robots.kinematics.grasp import Held, SeenObject
     from strands_robots.kinematics.motion import Motion
     from strands_robots.kinematics.moves import Start
+    from strands_robots.kinematics.objects import Held, SeenObject
     from strands_robots.kinematics.sight import Sight
 
 logger = stop_logger(__name__)
@@ -36,6 +36,9 @@ P = ParamSpec("P")
 
 FRESH_S = 0.02
 """Greatest age of joints that are not read again, so that a pose takes no turn on the bus from a running motion."""
+
+PLAN_S = 2.0
+"""Longest search for a way around objects."""
 
 HOME = "home"
 """Place that every arm has: the home pose of its model."""
@@ -148,8 +151,11 @@ class ArmMixin:
         return detected(self.detector, {} if frames is None else frames())
 
     @abstractmethod
-    def start_motion(self, robot_name: str, verb: str, plan: Callable[[float], Motion]) -> Rollout:
-        """Plan with the control rate (Hz) and start, once the body is found free."""
+    def start_motion(self, robot_name: str, verb: str, plan: Callable[[float, Permit], Motion]) -> Rollout:
+        """Plan with the control rate (Hz) and start, once the body is found free.
+
+        The plan's search ends when its permit is void.
+        """
 
     @planned
     def arm_pose(self, robot_name: str = "") -> Envelope:
@@ -185,12 +191,20 @@ class ArmMixin:
 
     @planned
     def move_joints(
-        self, joints: Mapping[str, float], speed: float = 0.5, wait: bool = True, robot_name: str = ""
+        self,
+        joints: Mapping[str, float],
+        speed: float = 0.5,
+        wait: bool = True,
+        robot_name: str = "",
+        *,
+        around: bool = True,
     ) -> Envelope:
         """Move joints to positions in degrees, by name; the others stay."""
         from strands_robots.kinematics import moves  # noqa: PLC0415 - loaded with the first motion
 
-        return self._move("moveJoints", partial(moves.move_joints, degrees=joints), speed, wait, robot_name, whole=True)
+        return self._move(
+            "moveJoints", partial(moves.move_joints, degrees=joints), speed, wait, robot_name, whole=True, around=around
+        )
 
     @planned
     def move_to(
@@ -203,12 +217,13 @@ class ArmMixin:
         speed: float = 0.5,
         wait: bool = True,
         robot_name: str = "",
+        around: bool = True,
     ) -> Envelope:
         """Move the tip to a point; ``approach`` is the steepest reachable by default."""
         from strands_robots.kinematics import moves  # noqa: PLC0415 - loaded with the first motion
 
         plan = partial(moves.move_to, position=_vector(x, y, z), approach=approach)
-        return self._move("moveTo", plan, speed, wait, robot_name)
+        return self._move("moveTo", plan, speed, wait, robot_name, around=around)
 
     @planned
     def move_by(
@@ -222,6 +237,7 @@ class ArmMixin:
         speed: float = 0.5,
         wait: bool = True,
         robot_name: str = "",
+        around: bool = True,
     ) -> Envelope:
         """Move the tip on a straight line, by an offset or a distance in a direction."""
         from strands_robots.kinematics import moves  # noqa: PLC0415 - loaded with the first motion
@@ -233,7 +249,7 @@ class ArmMixin:
             offset = distance * _vector(*moves.DIRECTIONS[choice("direction", direction, tuple(moves.DIRECTIONS))])
         if not offset.any():
             raise ValidationError("moveBy needs dx, dy or dz, or a direction.")
-        return self._move("moveBy", partial(moves.move_by, offset=offset), speed, wait, robot_name)
+        return self._move("moveBy", partial(moves.move_by, offset=offset), speed, wait, robot_name, around=around)
 
     @planned
     def set_gripper(self, opening: float, wait: bool = True, robot_name: str = "") -> Envelope:
@@ -272,9 +288,10 @@ class ArmMixin:
         speed: float = 0.5,
         wait: bool = True,
         robot_name: str = "",
+        around: bool = True,
     ) -> Envelope:
         """Pick up an object by its name, or one of a width at a point."""
-        from strands_robots.kinematics import grasp, sight  # noqa: PLC0415 - loaded with the first motion
+        from strands_robots.kinematics import grasp, objects, sight  # noqa: PLC0415 - loaded with the first motion
 
         body, seen = self.body(robot_name), self._seen(robot_name, "pick")
         if object:
@@ -284,19 +301,19 @@ class ArmMixin:
             raise ValidationError("pick needs object, or x, y and z.")
         else:
             given, size = _vector(x, y, z), _vector(width, width, 2 * min(z, width))
-            target = grasp.SeenObject(sight.nearest(given, seen or ()), given, math.radians(yaw), size)
+            target = objects.SeenObject(sight.nearest(given, seen or ()), given, math.radians(yaw), size)
         held: list[Held] = []
 
         def plan(start: Start) -> Motion:
             motion, grasped = grasp.pick(start, target, approach)
             held.append(grasped)
-            if around is not None:
-                around.wanted = grasped.centre(motion.end)
+            if looked is not None:
+                looked.wanted = grasped.centre(motion.end)
             return motion
 
-        around = None if seen is None else sight.Sight(seen, target.name, within_mm=sight.CARRIED_MM)
+        looked = None if seen is None else sight.Sight(seen, target.name, within_mm=sight.CARRIED_MM)
         kept = lambda: self._held.update({body.name: held[-1]})  # noqa: E731 - one argument of the call below
-        return self._move("pick", plan, speed, wait, robot_name, started=kept, sight=around)
+        return self._move("pick", plan, speed, wait, robot_name, started=kept, sight=looked, around=around)
 
     @planned
     def place(
@@ -310,6 +327,7 @@ class ArmMixin:
         speed: float = 0.5,
         wait: bool = True,
         robot_name: str = "",
+        around: bool = True,
     ) -> Envelope:
         """Put the held object down on the table at a point, or on another object."""
         from strands_robots.kinematics import grasp, sight  # noqa: PLC0415 - loaded with the first motion
@@ -331,13 +349,15 @@ class ArmMixin:
         else:
             position = _vector(x, y, self.arm(robot_name).chain.table_z if z is None else z)
         sight.require_vacant(position, held, seen or (), on)
-        plan = partial(grasp.place, position=position, approach=approach, held=held)
+        plan = partial(grasp.place, position=position, approach=approach, held=held, on=on)
         stands = position + _vector(0.0, 0.0, held.below)
-        around = None if seen is None else sight.Sight(seen, held.name, stands)
-        return self._move("place", plan, speed, wait, robot_name, sight=around)
+        looked = None if seen is None else sight.Sight(seen, held.name, stands)
+        return self._move("place", plan, speed, wait, robot_name, sight=looked, around=around)
 
     @planned
-    def go_to(self, place: str, speed: float = 0.5, wait: bool = True, robot_name: str = "") -> Envelope:
+    def go_to(
+        self, place: str, speed: float = 0.5, wait: bool = True, robot_name: str = "", *, around: bool = True
+    ) -> Envelope:
         """Move to the joints of a saved place, or to ``home``."""
         from strands_robots.kinematics import moves  # noqa: PLC0415 - loaded with the first motion
 
@@ -348,7 +368,7 @@ class ArmMixin:
         if name not in places:
             raise ValidationError(f"place must be one of {', '.join(places)}, not {shown(name)}.")
         plan = partial(moves.go_to, place=name, degrees=places[name])
-        return self._move("goTo", plan, speed, wait, robot_name, whole=True)
+        return self._move("goTo", plan, speed, wait, robot_name, whole=True, around=around)
 
     @planned
     def save_place(self, place: str, robot_name: str = "") -> Envelope:
@@ -464,19 +484,26 @@ class ArmMixin:
         whole: bool = False,
         started: Callable[[], object] = lambda: None,
         sight: Sight | None = None,
+        around: bool = False,
     ) -> Envelope:
         from strands_robots.kinematics.moves import Start  # noqa: PLC0415 - loaded with the first motion
         from strands_robots.kinematics.sight import Sight  # noqa: PLC0415 - as above
 
         body, arm = self.body(robot_name), self.arm(robot_name)
         arm = arm.whole() if whole else arm
-        if sight is None and self.knows_objects:
-            sight = Sight(self.objects(robot_name))
+        seen: Sequence[SeenObject] = () if sight is None else sight.before
+        if sight is None and (self.knows_objects or (around and self.detector is not None)):
+            seen = self.objects(robot_name)
+            sight = Sight(seen) if self.knows_objects else None
         planned: list[Motion] = []
 
-        def planned_at(hz: float) -> Motion:
-            state = arm.state(_observed(body)[1]).told(arm.told(self.targets(body.name)))
-            motion = plan(Start(arm, state, hz, speed))
+        def planned_at(hz: float, permit: Permit) -> Motion:
+            observed = arm.state(_observed(body)[1])
+            state = observed.told(arm.told(self.targets(body.name)))
+            held = self._held.get(body.name) if self._holding(body.name, arm, observed) else None
+            until = time.monotonic() + PLAN_S
+            going = lambda: permit.valid and time.monotonic() < until  # noqa: E731 - one argument of the next call
+            motion = plan(Start(arm, state, hz, speed, seen if around else (), held, going))
             motion.clock = getattr(body, "clock", motion.clock)
             motion.stall_lag = getattr(body, "stall_lag", motion.stall_lag)
             planned.append(motion)

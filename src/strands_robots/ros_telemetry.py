@@ -19,6 +19,7 @@ from strands_robots.ros.link import BroadcastLink, Message
 from strands_robots.ros.names import DOMAIN_MAX
 from strands_robots.ros.names import node_name as checked_node_name
 from strands_robots.ros.rclpy import MAX_QOS_HISTORY_DEPTH, RclpyLink
+from strands_robots.safety.gate import MotionGate
 from strands_robots.utils import ValidationError, flag, number, shown, text, whole
 
 __all__ = ["MAX_QOS_HISTORY_DEPTH", "RosTelemetryBase", "RosTelemetryBridge", "checked_limits", "refuse_unsecured"]
@@ -236,7 +237,8 @@ class RosTelemetryBase:
             logger.warning("A command on %s is dropped whole: %s.", self.command_topic, problem)
             return False
         try:
-            if self._robot.gate.held:
+            gate = getattr(self._robot, "gate", None)
+            if isinstance(gate, MotionGate) and gate.held:
                 return False  # one of a stream; those after the hold count
             action = self._within_speed({str(n): float(p) for n, p in zip(names, positions, strict=True)})
             # The robot's own verb asks its own gate: a locked robot refuses here as on every other path.

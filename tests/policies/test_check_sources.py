@@ -200,6 +200,11 @@ GOOD: dict[str, tuple[dict[str, dict[str, Any]], RobotFacts]] = {
         | dataset(low=(-90.0, 5.0, 0.0), high=(90.0, 5.0, 100.0)),
         replace(ROBOT, state={**ROBOT.state, "lift.pos": 3.0}),
     ),
+    "a joint that stood still, but for noise": (
+        processors(*[statistics((-90.0, 5.0, 0.0), (90.0, 5.00001, 100.0))] * 2)
+        | dataset(low=(-90.0, 5.00003, 0.0), high=(90.0, 5.0002, 100.0)),
+        replace(ROBOT, state={**ROBOT.state, "lift.pos": 3.0}),
+    ),
     "a leader that turns further than its follower": (
         processors(action=statistics((-125.0, -115.0, 0.0), (125.0, 115.0, 104.0))),
         ROBOT,

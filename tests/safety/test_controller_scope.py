@@ -162,3 +162,12 @@ def test_stop_of_every_robot_has_no_scope(stop: Callable[..., Any]) -> None:
     report = stop(fleet, EVERY_ROBOT, ("arm-1",), deadline_s=20)
     assert report.ok and "scope" not in envelope(report)
     assert all("scope" not in params and "scope_sig" not in params for _, params in fleet.sent)
+
+
+def test_stranger_in_a_mistyped_scope_does_not_keep_the_others_moving(stop: Callable[..., Any]) -> None:
+    key = ed25519.public_half(Ed25519PrivateKey.generate())
+    fleet = Fleet({"stranger": "cell-9"})
+    report = stop(fleet, Scope(cell="cell-9"), enrolled=lambda: {"arm-1": key})
+    assert report.widened
+    assert fleet.scopes[-1] == EVERY_ROBOT
+    assert not report.ok

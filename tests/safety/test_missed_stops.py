@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import random
 import time
 from collections.abc import Callable, Iterator
@@ -16,6 +17,7 @@ from fixtures.waiting import eventually
 
 from strands_robots.audit import flush_audit, read_audit_log
 from strands_robots.safety import ed25519, missed_stops
+from strands_robots.safety.answer_slots import SWEPT_ABOVE, AnswerSlots
 from strands_robots.safety.clearance import clear_here
 from strands_robots.safety.controller import SafetyController
 from strands_robots.safety.estop_listener import ESTOP, notification
@@ -424,6 +426,46 @@ def test_process_asks_again_after_two_seconds_and_not_more_than_once_a_second() 
     assert asked == [0.0, 1.0, 3.0]
 
 
+def test_process_whose_robots_are_all_locked_asks_later_and_seldom() -> None:
+    asker, asked = Asker(), list[float]()
+    for step in range(120):
+        now = step / 10
+        asker.want(now, 1.5)
+        if now >= asker.due:
+            asker.asked(now)
+            asker.not_asked()
+            asked.append(now)
+    assert asked == [1.5, 6.5, 11.5]
+    asker.want(12.0, 1.5)
+    asker.want(12.6)  # it was resumed, and was away since
+    assert asker.due == 12.6
+
+
+def test_processes_of_one_machine_give_three_answers_to_a_question(tmp_path: Path) -> None:
+    slots, (one, other) = [AnswerSlots(tmp_path) for _ in range(10)], (new_epoch(), new_epoch())
+    epochs = [new_epoch()]
+    assert [each.take([one], epochs) for each in slots].count([one]) == 3
+    assert slots[0].take([one, other], epochs) == [other]
+    assert slots[0].take([one], [*epochs, new_epoch()]), "nobody else has these stops"
+    assert len(list((tmp_path / "answers").iterdir())) == 5
+
+
+def test_machine_that_cannot_share_its_answers_gives_them_all(tmp_path: Path) -> None:
+    (tmp_path / "answers").mkdir()
+    (tmp_path / "answers").chmod(0o777)
+    assert all(AnswerSlots(tmp_path).take([new_epoch()], []) for _ in range(5))
+
+
+def test_slots_of_old_questions_are_removed(tmp_path: Path) -> None:
+    slots = AnswerSlots(tmp_path)
+    for _ in range(SWEPT_ABOVE + 1):
+        slots.take([new_epoch()], [])
+    for each in (tmp_path / "answers").iterdir():
+        os.utime(each, (1.0, 1.0))
+    slots.take([new_epoch()], [])
+    assert len(list((tmp_path / "answers").iterdir())) == 1
+
+
 def test_process_whose_answers_had_to_be_dropped_goes_on_asking_a_few_times() -> None:
     asker, asked = Asker(), list[float]()
     asker.want(0.0)
@@ -466,7 +508,7 @@ def test_answers_without_a_key_that_is_known_silence_nobody() -> None:
         answerer.given("a" * 32, f"arm-{number}", [original.epoch])
         answerer.given("a" * 32, f"arm-{number}", [original.epoch])
     answerer.given("b" * 32, "arm-9", [original.epoch])  # an answer to no question that waits
-    assert answerer.take([original], 1.0) == ("a" * 32, [original])
+    assert answerer.take([original], 1.0) == [original]
 
 
 def test_stop_that_the_given_answers_lacked_is_answered_all_the_same() -> None:
@@ -475,7 +517,7 @@ def test_stop_that_the_given_answers_lacked_is_answered_all_the_same() -> None:
     answerer.ask("a" * 32, 0.0)
     for number in range(ANSWERS_ENOUGH):
         answerer.given("a" * 32, f"arm-{number}", [told.epoch])
-    assert answerer.take([told, untold], 1.0)[1] == [untold]
+    assert answerer.take([told, untold], 1.0) == [untold]
 
 
 def test_of_many_answerers_few_wait_shortly() -> None:

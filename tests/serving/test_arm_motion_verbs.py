@@ -31,7 +31,8 @@ def test_joints_must_be_degrees_by_name(joints: Any) -> None:
 
 def test_approach_may_be_left_out_and_the_other_options_have_defaults() -> None:
     checked = ARM_MOTION_VERBS["moveTo"].checked({"x": 0, "y": 0, "z": 0.1})
-    options = {"approach": None, "speed": 0.5, "wait": True, "picture": "", "lease_id": "", "lease_ttl_s": 0.0}
+    options = {"approach": None, "speed": 0.5, "wait": True, "picture": "", "around": True}
+    options |= {"lease_id": "", "lease_ttl_s": 0.0}
     assert checked == {"x": 0.0, "y": 0.0, "z": 0.1, **options}
 
 

@@ -143,4 +143,4 @@ def test_joint_that_stops_short_is_an_error_by_its_name(world_of: Make) -> None:
     weak = POSITIONS.replace('joint="roll" kp="80"', 'joint="roll" kp="80" forcerange="-.001 .001"')
     answer = world_of(ARM.format(actuators=weak)).move_joints({"roll": 60.0}, speed=1.0)
     assert answer["status"] == "error"
-    assert answer["why"].startswith("roll is ")
+    assert answer["why"].startswith("roll was blocked at ")

@@ -58,7 +58,7 @@ def test_pushed_object_is_named_with_its_millimetres(world: Simulation) -> None:
     world.move_to(0.24, -0.08, 0.02, speed=1.0)
     world.add_object("glass", "box", (0.0125, 0.0125, 0.03), (0.24, 0.0, 0.03))
     before = world.get_objects()["objects"]["glass"]
-    answer = world.move_joints({"shoulder_pan": -25.0}, speed=1.0)
+    answer = world.move_joints({"shoulder_pan": -25.0}, speed=1.0, around=False)
     after = world.get_objects()["objects"]["glass"]
     distance = 1000 * ((after["x"] - before["x"]) ** 2 + (after["y"] - before["y"]) ** 2) ** 0.5
     assert answer["moved"]["glass"] == pytest.approx(distance, abs=8)

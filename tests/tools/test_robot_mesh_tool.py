@@ -265,6 +265,10 @@ class TimedMesh:
     def sleep(self, seconds: float) -> None:
         self.now += seconds
 
+    @property
+    def peers_by_id(self) -> dict[str, dict[str, Any]]:
+        return {row["peer_id"]: row for row in self.peers}
+
     def listen(self, topic: str, heard: object, name: str) -> bool:
         return True
 

@@ -32,6 +32,10 @@ def main() -> None:
         _leave(exit_.code)
 
 
+AUDIT_S = 1.0
+"""Seconds that the end of a command waits for its last record."""
+
+
 def _leave(code: object) -> NoReturn:
     """End the process after flushing all output.
 
@@ -51,4 +55,7 @@ def _leave(code: object) -> NoReturn:
             stream.flush()
         except BrokenPipeError:
             code = code or 1
+    audit = sys.modules.get("strands_robots.audit")
+    if audit is not None:
+        audit.flush_audit(AUDIT_S)
     os._exit(code if isinstance(code, int) else int(code is not None))

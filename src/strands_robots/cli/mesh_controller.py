@@ -42,7 +42,7 @@ class MeshController:
         self.controller_id, self.network = mesh.peer_id, mesh_network()
         self.sending = Sending(signed=signing_key is not None)
         self._reports = MeshReports(mesh)
-        self._reports.listen()
+        self._reports.begin()
 
     @property
     def link_up(self) -> bool:

@@ -22,10 +22,13 @@ from strands_robots.safety.approval import GRANT_S, Grants, state_dir
 from strands_robots.safety.clearance import clear_here
 from strands_robots.safety.identity import KeyFileError
 from strands_robots.safety.lockout import OVERFLOW, Lockout, utc
+from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.orders import new_epoch
 from strands_robots.safety.persistence import LockoutStore
 from strands_robots.safety.resume import sign
 from strands_robots.safety.statements import Purpose, distrust
+from strands_robots.safety.stop_roster import unheard
+from strands_robots.tools.mesh_roster import mesh_network
 from strands_robots.tools.networks import discover
 from strands_robots.utils import device_id, number
 
@@ -72,12 +75,15 @@ def resume(
     signer = signing_key(key, passphrase_file)
     if on_mesh:
         network.use_mesh()
-        _report(screen, _resume_on_mesh(wanted, signer, seconds), THEN)
+        _report(screen, _resume_on_mesh(screen, wanted, signer, seconds), THEN)
         return
+    from strands_robots.device_connect.enrollment import network_of  # noqa: PLC0415 - the network is loaded when it is used
+
     with network.fleet() as fleet:
         found = ask_robots(fleet, wanted or lockable_robots(fleet), seconds)
         if not found:
             raise CliError(f"No robot answered. {describe(fleet.link)}", Exit.SILENT, devices={})
+        _say_missing(screen, found, network_of(fleet.link))
         outcome = resume_robots(fleet, found, signer, seconds)
     _report(screen, outcome, THEN)
 
@@ -187,15 +193,23 @@ def ask_mesh(network: Network, seconds: float, wanted: Iterable[str] = ()) -> li
         return ask_peers(mesh, wanted or lockable_peers(mesh), seconds)
 
 
-def _resume_on_mesh(wanted: list[str], signer: Any, seconds: float) -> dict[str, tuple[bool, str]]:
+def _resume_on_mesh(screen: Screen, wanted: list[str], signer: Any, seconds: float) -> dict[str, tuple[bool, str]]:
     with mesh_peer(None, temporary_mesh_id("console"), "tool") as mesh:
         discover(mesh)
         answers = ask_peers(mesh, wanted or lockable_peers(mesh), seconds)
         if not answers:
             raise CliError("No robot answered on the mesh of this machine.", Exit.SILENT, devices={})
+        _say_missing(screen, answers, mesh_network())
         silent = {each.name: (False, each.problem) for each in answers if each.problem}
         found = {each.name: each.lockouts for each in answers if not each.problem}
         return resume_peers(mesh, found, signer, seconds) | silent
+
+
+def _say_missing(screen: Screen, found: list[LockoutReport], network: NetworkKey) -> None:
+    """Name the robots of the roster that have not answered, before others move again."""
+    missing = unheard(network, {each.name for each in found if not each.problem})
+    if missing:
+        screen.say(plain(f"NOT HEARD, and what they do is not known: {missing}.", 2000), "bold red")
 
 
 def operator() -> str:

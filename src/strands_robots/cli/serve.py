@@ -298,6 +298,7 @@ def _announce(screen: Screen, peer_id: str, link: LinkConfig, driver: DeviceDriv
         label(describe(link)),
         *([label(EVERY_PROGRAM_HERE)] if link.loopback_only and not link.authenticated else []),
         *([label(f"Tenant {link.tenant}.")] if link.tenant != "default" else []),
+        *([label(f"Cell {cell}.")] if (cell := settings.raw("STRANDS_CELL")) else []),
         table("", ("function", "what it does"), ((name, first_line(text)) for name, text in functions.items())),
         label("From another terminal:", "bold"),
         label(f"  strands-robots peers{flags}"),

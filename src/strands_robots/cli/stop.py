@@ -180,7 +180,7 @@ def estop(
     code = exit_code(outcome)
     if code is not Exit.OK:
         where = "" if report.link else f" {describe(link)}"
-        missed = "".join(f" {each.rstrip('.')}." for each in outcome.problems)
+        missed = "".join(f" {each.rstrip('.')}." for each in outcome.problems if each != report.widening)
         raise CliError(plain(f"{text_of(answer)}{missed}{where}", 2000), code, **facts)
     screen.data({"status": "success", **facts})
     if link.loopback_only:

@@ -85,6 +85,5 @@ def envelope(report: StopReport, reasons: Mapping[str, str] | None = None) -> En
     failures += [f"{name} gave no answer{f' ({why[name]})' if name in why else ''}" for name in report.silent]
     if not report.link:
         failures.append("the stop was not sent: the link is down")
-    if report.widened:
-        failures.append(f"no robot was there for {report.scope}, so every robot was stopped")
+    failures += [report.widening] if report.widening else []
     return error(f"{'; '.join(failures) or 'No robot answered the emergency stop'}.", **fields)

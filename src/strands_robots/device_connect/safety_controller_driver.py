@@ -13,7 +13,7 @@ from strands_robots.device_connect._compat import emit, rpc
 from strands_robots.device_connect.safety_controller import envelope
 from strands_robots.envelope import success
 from strands_robots.safety.controller import DEADLINE_S, SafetyController
-from strands_robots.serving.stop_arguments import noted, stop_reason, stop_robot
+from strands_robots.serving.stop_arguments import noted, stop_reason, stop_robot, stop_scope
 from strands_robots.serving.verbs import unknown_arguments
 from strands_robots.utils import ValidationError, number
 
@@ -47,16 +47,24 @@ class SafetyControllerDriver(DeviceDriver):  # type: ignore[misc]  # the framewo
 
     @rpc(labels={"direction": "write", "safety": "critical"})
     async def stopAll(
-        self, reason: str = "", expected: list[str] | None = None, deadline_s: float = DEADLINE_S
+        self,
+        reason: str = "",
+        expected: list[str] | None = None,
+        deadline_s: float = DEADLINE_S,
+        only: list[str] | None = None,
+        cell: str = "",
     ) -> dict[str, Any]:
-        """Stop every robot of the tenant and answer for each by name.
+        """Stop every robot of the tenant, or some, and answer for each by name.
 
         Args:
             reason: Why, told to the robots
             expected: Ids of the robots that must answer
             deadline_s: Seconds until a robot that gave no answer is reported as silent
+            only: Ids of the robots to stop; empty for all
+            cell: Cell to stop, with every robot that is in none; empty for all
         """
-        return await self._stop_all({"reason": reason, "expected": expected, "deadline_s": deadline_s})
+        given = {"reason": reason, "expected": expected, "deadline_s": deadline_s, "only": only, "cell": cell}
+        return await self._stop_all(given)
 
     async def invoke(self, function_name: str, **params: Any) -> Any:
         """Serve one call; a stop is refused for none of its arguments."""
@@ -76,8 +84,12 @@ class SafetyControllerDriver(DeviceDriver):  # type: ignore[misc]  # the framewo
             within = number("deadline_s", given.get("deadline_s", DEADLINE_S), above=0, high=60)
         except ValidationError:
             notes.append(f"deadline_s is not above 0 and at most 60, so it is {DEADLINE_S:g}")
-        notes.append(unknown_arguments(len(given.keys() - {"reason", "expected", "deadline_s"})))
-        report = await asyncio.to_thread(self.controller.stop, list(filter(None, names)), why, deadline_s=within)
+        scope, unread = stop_scope(given.get("only"), given.get("cell"))
+        unknown = given.keys() - {"reason", "expected", "deadline_s", "only", "cell"}
+        notes += [unread, unknown_arguments(len(unknown))]
+        report = await asyncio.to_thread(
+            self.controller.stop, list(filter(None, names)), why, deadline_s=within, scope=scope
+        )
         return noted(envelope(report), *notes)
 
     @rpc(labels={"direction": "read"})

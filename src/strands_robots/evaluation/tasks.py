@@ -10,9 +10,9 @@ import numpy as np
 
 from strands_robots.envelope import is_error
 from strands_robots.kinematics.chain import Floats
-from strands_robots.kinematics.grasp import SeenObject
 from strands_robots.kinematics.motion import Motion
 from strands_robots.kinematics.moves import Start
+from strands_robots.kinematics.objects import SeenObject
 from strands_robots.kinematics.planner import Planner
 from strands_robots.simulation.tabletop import CUBE, PLATE
 from strands_robots.simulation.world import Simulation

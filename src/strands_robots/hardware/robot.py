@@ -544,12 +544,12 @@ class HardwareRobot(ArmMixin, TeleopMixin):
 
         return made
 
-    def start_motion(self, robot_name: str, verb: str, plan: Callable[[float], Motion]) -> Rollout:
+    def start_motion(self, robot_name: str, verb: str, plan: Callable[[float, Permit], Motion]) -> Rollout:
         """Plan and start a motion of the arm."""
         self.body(robot_name)
 
         def made(permit: Permit) -> Rollout:
-            motion = plan(self.control_hz)
+            motion = plan(self.control_hz, permit)
             permit.check()
             return motion_rollout(self._body, motion, permit, self.control_hz, self.observers)
 

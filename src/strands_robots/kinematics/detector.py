@@ -7,7 +7,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from strands_robots.kinematics.grasp import SeenObject
+from strands_robots.kinematics.objects import SeenObject
 from strands_robots.utils import ValidationError, flag, mapping, number, shown, text
 
 OBJECTS_MAX = 64

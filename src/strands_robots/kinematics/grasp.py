@@ -13,10 +13,11 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from strands_robots.kinematics.chain import Chain, Floats, TipPose
+from strands_robots.kinematics.chain import Chain, Floats
 from strands_robots.kinematics.inverse import rolled
 from strands_robots.kinematics.motion import Motion, Segment
 from strands_robots.kinematics.moves import Start, require_gripper
+from strands_robots.kinematics.objects import Held, SeenObject
 from strands_robots.kinematics.planner import APPROACH_STEP_DEG, Planner
 from strands_robots.utils import ValidationError
 
@@ -42,46 +43,6 @@ _GAP_STEPS = 41
 
 
 @dataclass(frozen=True, slots=True)
-class SeenObject:
-    """An object: centre (m) and yaw (rad) in the base frame, and its extents (m).
-
-    ``round`` objects have no faces that the jaws must follow; ``fixed`` ones cannot be picked up.
-    """
-
-    name: str
-    position: Floats
-    yaw: float
-    size: Floats
-    round: bool = False
-    fixed: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class Held:
-    """An object between the jaws.
-
-    Attributes:
-        offset: of its centre from the tip, in the frame of the tip (m).
-        below: of its bottom from its centre (m).
-        width: between the jaws (m).
-        approach_deg: at which it was grasped, so that it stands upright.
-        radius: of the circle within its outline from above (m).
-    """
-
-    name: str
-    offset: Floats
-    below: float
-    width: float
-    approach_deg: float
-    radius: float = 0.0
-
-    def centre(self, pose: TipPose) -> Floats:
-        """Return the place of its centre for a pose of the tip (m)."""
-        centre: Floats = pose.position + pose.rotation @ self.offset
-        return centre
-
-
-@dataclass(frozen=True, slots=True)
 class _Grip:
     """Jaws across an object: the closing direction and the object's width along it."""
 
@@ -99,14 +60,15 @@ def pick(start: Start, target: SeenObject, approach: float | None) -> tuple[Moti
     if target.fixed:
         raise ValidationError(f"{target.name} is fixed and cannot be picked up.")
     opening = _opening_for(start, target)
-    planner = start.planner(opening)
+    planner, past = start.planner(opening, besides=(target.name,)), start.planner(opening)
     for degrees, grip in itertools.product(_approaches(approach), _grips(target)):
         found = _grasp(planner, target, grip, degrees)
         if found is None:
             continue
         way, tip = found
         try:
-            legs = planner.path(way[-1])
+            # Past the object itself, but where the gripper is over it already.
+            legs = past.path(way[-1]) if past.free(way[-1]) else planner.path(way[-1])
         except ValidationError:
             continue
         segments = [
@@ -134,14 +96,18 @@ def pick(start: Start, target: SeenObject, approach: float | None) -> tuple[Moti
     raise ValidationError(f"no way to grasp {target.name} at {_shown(target.position)} is free of contact.")
 
 
-def place(start: Start, position: Floats, approach: float | None, held: Held) -> Motion:
+def place(start: Start, position: Floats, approach: float | None, held: Held, on: str = "") -> Motion:
     """Plan to put the held object down with its bottom at ``position``.
+
+    It is put on the object ``on``, or on the table where that is empty.
 
     Raises:
         ValidationError: no free way leads there.
     """
     require_gripper(start)
-    planner, chain = start.planner(), start.arm.chain
+    chain = start.arm.chain
+    # Between the jaws it may touch what it is put on; on the way there it goes around everything.
+    planner, carrying = start.planner(besides=(on,), carries=False), start.planner()
     centre = position + np.array([0.0, 0.0, held.below + RELEASE_M])
     wanted = [approach] if approach is not None else sorted(_approaches(None), key=lambda d: abs(d - held.approach_deg))
     release = _share_of(chain, held.width + OPEN_MORE_M)
@@ -150,7 +116,7 @@ def place(start: Start, position: Floats, approach: float | None, held: Held) ->
         if way is None:
             continue
         try:
-            legs = planner.path(way[-1])
+            legs = carrying.path(way[-1])
         except ValidationError:
             continue
         segments = [

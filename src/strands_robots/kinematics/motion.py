@@ -179,7 +179,7 @@ class Motion:
         if index is not None:
             joint = self.arm.chain.joints[index]
             at = f"{np.degrees(state.joints[index]):.0f} degrees" if joint.turns else f"{state.joints[index]:.3f} m"
-            self.contact = f"{joint.name} met something at {at} and could not go on"
+            self.contact = f"{joint.name} was blocked at {at}: it met something, or its servo is too weak"
             raise PolicyError(self.contact)
 
     def interrupt(self) -> None:

@@ -5,7 +5,7 @@ Each function raises :class:`~strands_robots.utils.ValidationError` with the rea
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,6 +14,8 @@ import numpy as np
 from strands_robots.kinematics.arm import Action, Arm, ArmState
 from strands_robots.kinematics.chain import Floats
 from strands_robots.kinematics.motion import Motion, Segment
+from strands_robots.kinematics.objects import Held, SeenObject
+from strands_robots.kinematics.obstacles import beside
 from strands_robots.kinematics.planner import Planner
 from strands_robots.kinematics.trajectory import Bounds, joined, timed
 from strands_robots.utils import ValidationError
@@ -40,22 +42,38 @@ class Start:
         state: the arm's present state.
         hz: control rate.
         speed: share of full speed, above 0 to 1.
+        objects: those that the motion goes around.
+        held: the object between the jaws.
+        going: false once the motion is not wanted any more.
     """
 
     arm: Arm
     state: ArmState
     hz: float
     speed: float
+    objects: Sequence[SeenObject] = ()
+    held: Held | None = None
+    going: Callable[[], bool] = lambda: True
 
     @property
     def bounds(self) -> Bounds:
         """Speed and acceleration of each joint."""
         return self.arm.bounds.scaled(self.speed)
 
-    def planner(self, opening: float | None = None) -> Planner:
-        """Return a planner from the present joints, with this or the present opening."""
+    def planner(self, opening: float | None = None, *, besides: Collection[str] = (), carries: bool = True) -> Planner:
+        """Return a planner from the present joints.
+
+        Args:
+            opening: of the gripper; the present one by default.
+            besides: names of objects that are no obstacles.
+            carries: false to leave the held object out.
+        """
         jaw = self.arm.jaw_radians(self.state.opening if opening is None else opening)
-        return Planner(self.arm.chain, self.state.joints, jaw)
+        held = self.held
+        names = {*besides, *(() if held is None else (held.name,))}
+        obstacles = [each for each in self.objects if each.name not in names]
+        chain = beside(self.arm.chain, obstacles, held if carries and self.objects else None)
+        return Planner(chain, self.state.joints, jaw, self.going)
 
     def frames(self, legs: Sequence[Floats]) -> list[Action]:
         """Return the setpoints of joint paths, one after another."""

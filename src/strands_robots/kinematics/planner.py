@@ -7,7 +7,7 @@ reachable point. Positions are metres in the base frame, angles of the caller de
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +15,8 @@ import numpy as np
 from strands_robots.kinematics.chain import ArmJoint, Chain, Floats
 from strands_robots.kinematics.contacts import ContactCheck, new_contact
 from strands_robots.kinematics.inverse import TipGoal, nearest, solve
+from strands_robots.kinematics.rrt import path_around
+from strands_robots.safety.turns import shorten_turns
 from strands_robots.utils import ValidationError
 
 APPROACH_STEP_DEG = 5.0
@@ -44,13 +46,21 @@ class Planner:
         chain: the arm.
         start: its joint positions (rad).
         gripper: position of its gripper's joint; None for that of the home pose.
+        going: false once the motion is not wanted any more, which ends a search.
     """
 
-    def __init__(self, chain: Chain, start: Floats, gripper: float | None = None) -> None:
+    def __init__(
+        self, chain: Chain, start: Floats, gripper: float | None = None, going: Callable[[], bool] = lambda: True
+    ) -> None:
         self.chain = chain
+        self._going = going
         self.start = np.clip(start, chain.lows, chain.highs)
         self._check = ContactCheck(chain, gripper)
-        self._touching = self._check.at(self.start)
+        # An object that the arm touches already, as one between its jaws, is none to go around.
+        self._touching = {
+            pair: np.inf if self._check.objects & set(pair) else depth
+            for pair, depth in self._check.at(self.start).items()
+        }
 
     def joints(self, targets: Mapping[str, float]) -> Floats:
         """Return the present joints with some replaced, by name (rad).
@@ -102,6 +112,13 @@ class Planner:
         """True for joints that bring no new contact."""
         return not new_contact(self._check.at(joints), self._touching)
 
+    def _free_of_itself(self, joints: Floats) -> bool:
+        """Return True for joints whose only new contacts are with objects."""
+        contacts = {
+            pair: depth for pair, depth in self._check.at(joints).items() if not self._check.objects & set(pair)
+        }
+        return not new_contact(contacts, self._touching)
+
     def direction(self, position: Floats, degrees: float) -> Floats:
         """Return the approach away from the shoulder, ``degrees`` below level."""
         away = position - self.chain.shoulder
@@ -117,7 +134,7 @@ class Planner:
     def path(self, goal: Floats, start: Floats | None = None) -> list[Floats]:
         """Return joint paths to ``goal``, one after another, without contact.
 
-        One path where that is free, else up, across and down again.
+        One path where that is free, else up, across and down again, else around by a search.
         """
         begin = self.start if start is None else start
         direct = np.array([begin, goal])
@@ -130,7 +147,28 @@ class Planner:
             legs = [np.array(pair) for pair in itertools.pairwise(known)]
             if len(legs) > 1 and not any(self._check.along(leg, self._touching) for leg in legs):
                 return legs
-        raise ValidationError(f"the way there is blocked: {problem}.")
+        around = self._around(begin, goal)
+        if around is None:
+            raise ValidationError(f"the way there is blocked: {problem}.")
+        return around
+
+    def _around(self, begin: Floats, goal: Floats) -> list[Floats] | None:
+        """Return legs that a search finds around contacts, None without any."""
+        lows, highs = self.chain.lows.copy(), self.chain.highs.copy()
+        for index, joint in enumerate(self.chain.joints):
+            if joint.refusal:
+                lows[index] = highs[index] = begin[index]
+        if not (self.free(begin) and self.free(goal)):
+            return None
+        end_short_turns = shorten_turns()
+        try:
+            poses = path_around(begin, goal, (lows, highs), self._clear, self._going)
+        finally:
+            end_short_turns()
+        return None if poses is None else [np.array(pair) for pair in itertools.pairwise(poses)]
+
+    def _clear(self, first: Floats, last: Floats) -> bool:
+        return not self._check.along(np.array([first, last]), self._touching)
 
     def line(self, goal: Floats, start: Floats | None = None, direction: Floats | None = None) -> Floats:
         """Return a joint path (n, joints) with the tip on a line to ``goal`` (m).
@@ -172,7 +210,8 @@ class Planner:
         return None if found is None else found.joints
 
     def _unreachable(self, goal: TipGoal, start: Floats, approach_deg: float | None) -> ValidationError:
-        best = nearest(self.chain, goal, start)
+        best = solve(self.chain, goal, start, accept=self._free_of_itself) if self._check.objects else None
+        best = nearest(self.chain, goal, start) if best is None else best
         wanted = f"({', '.join(f'{v:.3f}' for v in goal.position)}) m"
         how = "" if approach_deg is None else f" with an approach of {approach_deg:g} degrees"
         if best.reached:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from strands_robots.kinematics.chain import Floats
-from strands_robots.kinematics.grasp import Held, SeenObject
+from strands_robots.kinematics.objects import Held, SeenObject
 from strands_robots.utils import ValidationError
 
 PLACED_MM = 15.0

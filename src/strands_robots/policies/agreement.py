@@ -32,6 +32,9 @@ CHANGES_SHARE = 0.2
 RATIO_MAX = 3.0
 """Greatest ratio of the ranges that two sources state of the same data."""
 
+NOISE_SHARE = 0.02
+"""Part of the widest range that two sources may always differ by, as of a joint that stood still."""
+
 _SO_ARMS = frozenset({"so", "so100", "so101"})
 """Arms with the same joints, units and directions."""
 
@@ -117,19 +120,20 @@ def _limits(profile: Profile, robot: RobotFacts) -> dict[str, tuple[float, float
 
 def _inside(profile: Profile, limits: Mapping[str, tuple[float, float]], source: str, bounds: Bounds) -> CheckRow:
     """The actions lie in the joints' ranges, and cover more than a sliver of them."""
-    outside, shares = [], []
+    outside: list[tuple[str, str]] = []
+    shares: list[float] = []
     for key, low, high in zip(profile.action, *bounds, strict=True):
         if key not in limits:
             continue
         bottom, top = limits[key]
         width = top - bottom
         if low < bottom - OUTSIDE_SHARE * width or high > top + OUTSIDE_SHARE * width:
-            outside.append(f"{key} {low:g} to {high:g}")
+            outside.append((f"{key} {low:g} to {high:g}", f"{key} {bottom:g} to {top:g}"))
         if profile.unit(key) != "percent":
             shares.append((high - low) / width)
     narrow = bool(shares) and max(shares) < NARROW_SHARE
-    wrong = "; ".join(outside) or ("less than 4 % of every joint" if narrow else "inside")
-    theirs = "; ".join(f"{key} {low:g} to {high:g}" for key, (low, high) in limits.items())
+    wrong = "; ".join(each for each, _ in outside) or ("less than 4 % of every joint" if narrow else "inside")
+    theirs = "; ".join(each for _, each in outside) or "ranges of the joints"
     change = "check units, and that the actions are positions of joints"
     fits = not outside and not narrow
     return compared("range of the actions", of(wrong, source), of(theirs, ROBOT), fits, change)
@@ -152,10 +156,12 @@ def _positions(profile: Profile, source: str, states: Bounds, actions: Bounds) -
 def _same_data(feature: str, keys: Sequence[str], one: tuple[str, Bounds], other: tuple[str, Bounds]) -> CheckRow:
     """Two sources state about the same range, as of the same data."""
     far = []
+    every = [high - low for bounds in (one[1], other[1]) for low, high in zip(*bounds, strict=True)]
+    noise = NOISE_SHARE * max(every)
     for key, low, high, bottom, top in zip(keys, *one[1], *other[1], strict=True):
         spans = sorted((high - low, top - bottom))
-        apart = low > top or bottom > high
-        if apart or spans[1] > RATIO_MAX * spans[0] + 1e-9:
+        apart = low > top + noise or bottom > high + noise
+        if apart or spans[1] > RATIO_MAX * spans[0] + noise:
             far.append((f"{key} {low:g} to {high:g}", f"{key} {bottom:g} to {top:g}"))
     sides = ["; ".join(each[side] for each in far) or "the same range" for side in (0, 1)]
     change = "name the dataset that the checkpoint was trained on, or the checkpoint of this dataset"

@@ -182,7 +182,7 @@ def _values(profile: Profile, statements: Sequence[Statement], robot: RobotFacts
                 far.append(f"{key} {value:g} outside {low:g} to {high:g}")
         change = "move the robot to where the data begins, or check units and zero"
         outside = "; ".join(far) or "inside"
-        yield compared("state in the data", f"its range ({each.source})", outside, not far, change)
+        yield compared("state in the data", f"its range ({each.source})", of(outside, ROBOT), not far, change)
 
 
 def _cameras(profile: Profile, statements: Sequence[Statement], robot: RobotFacts) -> Iterator[CheckRow]:
@@ -276,7 +276,7 @@ def _rate(profile: Profile, statements: Sequence[Statement], robot: RobotFacts) 
         outcome: Outcome = "confirmed" if "rate" in profile.confirmed else "unverified"
         hint = f", {stated[0][1]:g} in {stated[0][0]}" if stated else ""
         change = f'set rate to that of the data{hint}, or list "rate" under confirmed'
-        yield CheckRow("rate", "not stated", f"{robot.rate:g} Hz", outcome, change)
+        yield CheckRow("rate", "not stated", of(f"{robot.rate:g} Hz", ROBOT), outcome, change)
         return
     for source, rate in stated:
         same = math.isclose(rate, profile.rate, rel_tol=1e-3)

@@ -178,7 +178,7 @@ def bounds_of(kinds: Mapping[str, tuple[float, ...]]) -> Bounds | None:
 
 
 def _of(values: Mapping[str, tuple[float, ...]], feature: str) -> dict[str, tuple[float, ...]]:
-    """Return the finite statistics of a feature by kind, without its count of samples."""
+    """Return the finite statistics of a feature, by kind."""
     found = {kind: values[f"{feature}.{kind}"] for kind in _STATISTICS if f"{feature}.{kind}" in values}
     return {kind: each for kind, each in found.items() if all(map(math.isfinite, each))}
 

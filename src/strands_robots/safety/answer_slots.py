@@ -1,4 +1,4 @@
-"""Answers to one question that the processes of a state directory share among them.
+"""Slots of a question, by which the processes of one machine share its answers.
 
 On a machine with hundreds of processes an answer is heard by all of them only after as many have given one. So a
 process first takes one of three slots of a question: a file that only its first maker makes.
@@ -37,10 +37,10 @@ class AnswerSlots:
     def __init__(self, state: Path | None = None) -> None:
         self._state = state
 
-    def take(self, nonces: Sequence[str], epochs: Iterable[str]) -> bool:
-        """Return True where a slot of one of these questions is free, and take it for each.
+    def take(self, nonces: Sequence[str], epochs: Iterable[str]) -> list[str]:
+        """Take a free slot of each of these questions; return those that had one.
 
-        Also where the directory cannot be used: two answers too many are better than none.
+        All, where the directory cannot be used: answers too many are better than none.
 
         Args:
             nonces: ids of questions, 32 hex digits.
@@ -56,11 +56,10 @@ class AnswerSlots:
             taken = frozenset(each.name for each in folder.iterdir())
             if len(taken) > SWEPT_ABOVE:
                 _sweep(folder)
-            made = [_made(folder, f"{nonce}-{stops}", taken) for nonce in nonces]
-            return any(made)
+            return [nonce for nonce in nonces if _made(folder, f"{nonce}-{stops}", taken)]
         except (OSError, StateFileError) as exc:
             logger.warning("The processes of this machine cannot share their answers: %s", exc)
-            return True
+            return list(nonces)
 
 
 def _made(folder: Path, name: str, taken: frozenset[str]) -> bool:

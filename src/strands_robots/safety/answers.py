@@ -88,6 +88,13 @@ class Answers:
         self.by_robot: dict[str, Answer] = {}
         self.alarms: dict[str, str] = {}
 
+    def shows(self, answer: Answer) -> bool:
+        """Return True for an answer that shows that its robot is there.
+
+        Where no robot is enrolled, each answer does.
+        """
+        return not self._keys or answer.proof is Proof.SIGNED
+
     def take(self, source: str, received: Received) -> bool:
         """Grade a verdict, and keep it if it outranks the robot's last; True if so."""
         key = self._keys.get(source)

@@ -116,6 +116,11 @@ class StopReport:
     widened: bool = False
 
     @property
+    def widening(self) -> str:
+        """Reason why a stop of some robots became one of all, or ""."""
+        return f"no robot was there for {self.scope}: every robot was stopped" if self.widened else ""
+
+    @property
     def answered(self) -> Mapping[str, Answer]:
         """The answer of each robot that gave one."""
         return {**self.stopped, **self.not_stopped, **self.refused, **self.claimed}
@@ -573,10 +578,10 @@ class _Running:
     def settled_scope(self) -> bool:
         """A robot in the scope has answered.
 
-        What is claimed for an enrolled one is no answer.
+        Where robots are enrolled, only a signed answer shows that one is there: anyone can claim a name or a cell.
         """
         return any(
-            self.scope.names(name, each.facts.get("cell")) and not (each.claimed and each.enrolled)
+            self.scope.names(name, each.facts.get("cell")) and self.graded.shows(each)
             for name, each in self.graded.by_robot.items()
         )
 

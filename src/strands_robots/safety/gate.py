@@ -320,7 +320,10 @@ class MotionGate:
 
     @property
     def given(self) -> int:
-        """Rises with every permit that is given; for a settling, which begins only where none was since its halt."""
+        """Number that rises with every permit that is given.
+
+        A settling begins only where none was given since its halt.
+        """
         return self._given
 
     def revoke(self) -> int:

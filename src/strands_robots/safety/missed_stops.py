@@ -46,6 +46,12 @@ LISTEN_S = 1.9
 """Seconds from the question in which an answer counts; a busy machine answers late."""
 
 ASK_EVERY_S = 1.0
+LOCKED_EVERY_S = 5.0
+"""The same, while every robot of the process is locked: a fleet that stands still does not crowd a busy machine."""
+
+LOCKED_WAIT_S = 2.0
+"""Longest wait of such a process before it asks; drawn anew each time."""
+
 ASK_AGAIN_S = 2.0
 ASKS_MAX = 5
 """Questions after one reason: two, and more only while answers had to be dropped."""
@@ -89,6 +95,9 @@ class MissedStopsPort(Protocol):
 
     def was_here(self) -> bool:
         """Return True where a robot was served from here before its start."""
+
+    def locked(self) -> bool:
+        """Return True while every robot of the process is locked."""
 
     def devices(self) -> Sequence[str]:
         """Return the names of the robots that ask; none, and nothing is asked."""
@@ -162,9 +171,17 @@ class Asker:
         """The moment of the next question; infinite where none is wanted."""
         return self._due if self._asks else float("inf")
 
-    def want(self, now: float) -> None:
-        """Ask, at once or as soon as a second has passed since the last question."""
-        self._due, self._asks = max(now, self._asked + ASK_EVERY_S), ASKS_MAX
+    def want(self, now: float, later_s: float = 0.0) -> None:
+        """Ask, at once or as soon as a second has passed since the last question.
+
+        Args:
+            later_s: seconds that a process whose robots are all locked waits; it does so at most every five seconds.
+        """
+        if not later_s:
+            self._due = max(now, self._asked + ASK_EVERY_S)
+        elif not self._asks:
+            self._due = max(now + later_s, self._asked + LOCKED_EVERY_S)
+        self._asks = ASKS_MAX
 
     def asked(self, now: float) -> None:
         """Note that a question leaves, and plan the next one."""
@@ -233,8 +250,8 @@ class Answerer:
                 for epoch in named:
                     given.setdefault(epoch, set()).add(answerer)
 
-    def take(self, originals: Iterable[Original], now: float) -> tuple[str, list[Original]]:
-        """Return one question and the stops that it is still to be told; end all."""
+    def take(self, originals: Iterable[Original], now: float) -> list[Original]:
+        """Return the stops that one of the questions is still to be told; end all."""
         questions, self._questions, self._due = self._questions, {}, float("inf")
         rest = [
             each
@@ -243,7 +260,7 @@ class Answerer:
         ]
         if rest:
             self._answered = now
-        return next(iter(questions), ""), rest
+        return rest
 
 
 def waiting_s(chance: float) -> float:
@@ -308,7 +325,7 @@ class MissedStops:
         chance: Callable[[], float] = random.random,
     ) -> None:
         self._port, self._parse, self._clock = port, parse, clock
-        self._slots = AnswerSlots()
+        self._chance, self._slots = chance, AnswerSlots()
         self._asker, self._answerer = Asker(), Answerer(chance)
         self._reasons: deque[str] = deque(maxlen=8)
         self._questions: deque[tuple[str, bytes]] = deque(maxlen=QUESTIONS_MAX)
@@ -393,7 +410,7 @@ class MissedStops:
                     continue
                 self._port.hold(UNITE_S)
             logger.info("Asking for the stops missed: %s.", reason)
-            self._asker.want(self._clock())
+            self._asker.want(self._clock(), self._chance() * LOCKED_WAIT_S if self._port.locked() else 0.0)
         self._take_questions()
         if self._asker.listens(self._clock()):
             self._take_answers()
@@ -463,19 +480,20 @@ class MissedStops:
 
     def _answer(self) -> None:
         originals = self._port.originals()
-        if originals and self._slots.take(self._answerer.nonces, [each.epoch for each in originals]):
+        questions = self._slots.take(self._answerer.nonces, [each.epoch for each in originals]) if originals else []
+        if questions:
             # What others answered is checked now: most processes get no slot and need not.
             self._take_answers()
         else:
             originals = ()
         now = self._clock()
-        nonce, rest = self._answerer.take(originals, now)
+        rest = self._answerer.take(originals, now)
         if not self._asker.listens(now):
             self._answers.clear()
         if not rest:
             return
         name, identity = self._port.signer()
-        fields = answer_fields(nonce, rest)
+        fields = answer_fields(questions[0], rest)
         self._port.publish(ANSWER, name, signed(identity, Purpose.MISSED_STOPS, name, fields))
         if now - self._audited >= AUDIT_EVERY_S:
             self._audited = now

@@ -152,7 +152,7 @@ class Registered:
             self.latch.engage(each.epoch, each.source, each.reason, each.scope)
 
     def returned(self) -> bool:
-        """Count as a robot that was here before its process; False for one that has no record of that."""
+        """Count as a robot that was here before its process; False without a record."""
         if self.registered_before:
             self._here_since = min(self._here_since, self._recorded_since)
         return self.registered_before

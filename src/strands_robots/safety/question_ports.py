@@ -110,6 +110,9 @@ class RobotsPort:
         returned = [each.robot_id for each in back if each is not None and each.returned()]
         return bool(returned)
 
+    def locked(self) -> bool:
+        return all(each.locked for each in self._plane.robots.values())
+
     def devices(self) -> Sequence[str]:
         return [each.name for each in self._members()]
 
@@ -201,6 +204,9 @@ class ControllerPort:
         self._open.pop(estop_id, None)
 
     def was_here(self) -> bool:
+        return False
+
+    def locked(self) -> bool:
         return False
 
     def devices(self) -> Sequence[str]:

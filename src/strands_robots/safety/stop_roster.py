@@ -232,7 +232,7 @@ class StopRoster:
             roster, found = self._whole(report.answered.items()), dict(self._found)
             unproven = _missed_by(self._unproven, roster)
             problems = [*roster.problems, *([problem] if problem else [])]
-            problems += [f"no robot was there for {self._asked}: every robot was stopped"] if report.widened else []
+            problems += [report.widening] if report.widening else []
             problems += [
                 f"{each.source} misses {each.more} more robots than it names"
                 for each in self._trusted.values()
@@ -377,6 +377,20 @@ def robots_known_at(network: Callable[[], NetworkKey]) -> Remembers:
         return any(scope.names(row.name, row.cell) for row in roster.rows if counts(roster, row))
 
     return remembers
+
+
+def unheard(network: NetworkKey, answered: Collection[str]) -> str:
+    """Return the robots of the roster that are not among ``answered``, as text.
+
+    Names that were only heard are left out where robots are enrolled. It reads the disk.
+    """
+    try:
+        roster = Roster.of(network)
+    except Exception as exc:  # noqa: BLE001 - said in place of the names
+        return f"the roster cannot be read: {exc}"
+    names = [row.name for row in roster.rows if counts(roster, row) and row.name not in answered]
+    more = f" and {len(names) - NAMED_MAX} more" if len(names) > NAMED_MAX else ""
+    return f"{', '.join(names[:NAMED_MAX])}{more}"
 
 
 def counts(roster: Roster, row: RosterRow) -> bool:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from strands_robots.kinematics.chain import Floats
-from strands_robots.kinematics.grasp import SeenObject
+from strands_robots.kinematics.objects import SeenObject
 from strands_robots.simulation.physics import Snapshot
 from strands_robots.simulation.plan import ObjectPlan
 from strands_robots.utils import yaw_of

@@ -14,8 +14,8 @@ from strands_robots.arm_mixin import ArmMixin, motion_rollout
 from strands_robots.contract import Observer, Unsubscribe
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.kinematics.arm import Arm
-from strands_robots.kinematics.grasp import SeenObject
 from strands_robots.kinematics.motion import Motion
+from strands_robots.kinematics.objects import SeenObject
 from strands_robots.policies import create_policy
 from strands_robots.policies.base import SPEED_MAX
 from strands_robots.policies.check_rows import RobotFacts
@@ -29,7 +29,7 @@ from strands_robots.policies.rollout import (
     rollout_options,
     unfollowed,
 )
-from strands_robots.safety.gate import MotionGate, Waiting, answered
+from strands_robots.safety.gate import MotionGate, Permit, Waiting, answered
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stop_targets import note_motion
 from strands_robots.safety.stopping import PendingVerdict, StopLevel, StopVerdict, halts_in_parts, read_verdict
@@ -524,13 +524,13 @@ class Simulation(PicturesMixin, ArmMixin, TeleopMixin):
         """Return the objects of the world in the base frame of one robot."""
         return targets_of(self.physics.snapshot, self.body(robot_name).base_pose())
 
-    def start_motion(self, robot_name: str, verb: str, plan: Callable[[float], Motion]) -> Rollout:
+    def start_motion(self, robot_name: str, verb: str, plan: Callable[[float, Permit], Motion]) -> Rollout:
         """Plan and start a motion of one robot."""
         hz = settings.number("STRANDS_CONTROL_HZ")
         permit = self.gate.permit(verb)
         with self._waiting.until_begun(permit, robot_name), self.starting:
             body = self._free_body(robot_name)
-            motion = plan(hz)
+            motion = plan(hz, permit)
             permit.check()
             rollout = motion_rollout(body, motion, permit, hz, self.observers)
             self._rollouts[body.name] = rollout

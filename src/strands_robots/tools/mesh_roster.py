@@ -41,7 +41,7 @@ class MeshReports:
     def __init__(self, mesh: Mesh) -> None:
         self._mesh, self.inbox = mesh, RosterInbox(_fields)
 
-    def listen(self) -> None:
+    def begin(self) -> None:
         """Receive reports from now on."""
         from strands_robots.mesh import topics  # noqa: PLC0415 - the network is loaded when it is used
 

@@ -157,7 +157,7 @@ class NativeMesh:
 
             def left(replies: list[dict[str, Any]]) -> None:
                 if not listening:
-                    listening.append(threading.Thread(target=reports.listen, name="missed rosters", daemon=True))
+                    listening.append(threading.Thread(target=reports.begin, name="missed rosters", daemon=True))
                     listening[0].start()
 
             def send() -> list[dict[str, Any]]:
@@ -224,7 +224,7 @@ def _stop_all(mesh: Mesh, stop: Callable[[], list[dict[str, Any]]], roster: Stop
 
 
 def _cells(mesh: Mesh, peer: str) -> frozenset[str]:
-    cell = (mesh.peers_by_id.get(peer) or {}).get("cell")
+    cell = next((row.get("cell") for row in mesh.peers if row["peer_id"] == peer), None)
     return frozenset({cell} if isinstance(cell, str) and cell else ())
 
 

@@ -50,6 +50,7 @@ PARSERS = {
     "kinematics/places.py": OWN_FILE,
     "mesh/commands.py": BOUNDED,
     "mesh/input_receiver.py": BOUNDED,
+    "mesh/missed.py": BOUNDED,
     "mesh/presence.py": BOUNDED,
     "mesh/rpc.py": BOUNDED,
     "mesh/safety.py": BOUNDED,
@@ -58,6 +59,7 @@ PARSERS = {
     "mesh/transport/access.py": OWN_FILE,
     "mesh/wire.py": BOUNDED,
     "ros/rosbridge_session.py": BOUNDED,
+    "tools/mesh_roster.py": BOUNDED,
     "safety/approval.py": OWN_FILE,
     "safety/clearance.py": OWN_FILE,
     "safety/identity.py": OWN_FILE,
@@ -86,6 +88,7 @@ RECEIVERS = {
     "mesh/children.py": "by the transport: the topic's own bound",
     "mesh/core.py": "by the transport: the topic's own bound",
     "mesh/input_receiver.py": "by the transport: the topic's own bound",
+    "mesh/missed.py": "by the transport: the topic's own bound",
     "mesh/presence.py": "by the transport: the topic's own bound",
     "mesh/stream.py": "events of this process",
     "mesh/subscriptions.py": "by the transport: the topic's own bound",
@@ -94,6 +97,7 @@ RECEIVERS = {
     "mesh/transport/zenoh.py": "the topic's own bound, by Zenoh and before it is copied",
     "ros/dds.py": "by ros/dds_types.py, before a sample is decoded",
     "ros/rclpy.py": "decoded by rclpy itself",
+    "tools/mesh_roster.py": "by the transport: the topic's own bound",
 }
 """Each module that receives foreign messages, and their bound."""
 

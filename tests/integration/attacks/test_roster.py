@@ -11,6 +11,7 @@ import pytest
 from fixtures.command_line import Machine
 from fixtures.network_lab import missing
 from fixtures.roster_lab import KINDS, Kind, RosterLab
+from fixtures.roster_returns import CASES, Returning, cases_on
 from fixtures.roster_trials import ABSENCES, Absence, stop_while_away
 from fixtures.waiting import eventually
 
@@ -52,6 +53,16 @@ def test_robots_away_during_a_one_shot_stop_are_named_and_lock_themselves(
     lab.meet(console, "arm-0", *AWAY)
     trials = stop_while_away(lab, console, witness, away, absence)
     assert all(each.ok for each in trials), trials
+
+
+@pytest.mark.parametrize("turn", range(3))
+@pytest.mark.parametrize("case", CASES)
+def test_robot_that_comes_back_is_locked_by_what_it_missed_and_by_nothing_else(
+    lab: RosterLab, case: str, turn: int
+) -> None:
+    if case not in cases_on(lab):
+        pytest.skip("the mesh has no tenants")
+    assert CASES[case](Returning(lab)) == ""
 
 
 def enrolled(lab: RosterLab, *names: str) -> Machine:

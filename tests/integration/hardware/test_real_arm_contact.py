@@ -15,7 +15,7 @@ def test_joint_that_meets_a_fixed_thing_ends_the_motion_by_its_name(arm: Any, bu
     bus.servos[1].blocked_at = start + 200
     first = robot.move_joints({"shoulder_pan": 60.0}, speed=speed)
     assert first["status"] == "error"
-    assert first["why"].startswith("shoulder_pan met something at 17 degrees"), first
+    assert first["why"].startswith("shoulder_pan was blocked at 17 degrees"), first
     bus.servos[1].blocked_at = None
     free = robot.move_joints({"shoulder_pan": 40.0}, speed=speed)
     assert free["why"] == "it is done"

@@ -110,15 +110,17 @@ def test_two_threads_import_a_policy_and_a_driver() -> None:
 def test_the_first_commands_of_the_page_check_serve_and_move_an_arm(
     machine: Machine, bus: FeetechBus, tmp_path: Path
 ) -> None:
-    check, serve, call = commands(0)
+    check, serve, grant, call = commands(0)
     assert (check[:2], serve[0], call[0]) == (["policy", "check"], "serve", "call")
     before = bus.shafts()
     checked = run(machine, *on(bus, check, tmp_path))
     assert checked.returncode == 0, checked.stdout + checked.stderr
     assert bus.shafts() == pytest.approx(before, abs=3), "a check moves nothing"
-    with serving(machine, *on(bus, serve, tmp_path), "--command-allow", "execute") as said:
+    with serving(machine, *on(bus, serve, tmp_path)) as said:
         assert "Loading the policies pick-cube." in said()
         eventually(lambda: "arm-1" in machine.run("peers").stdout, within=60, what="the arm on the network")
+
+        assert machine.run(*grant).returncode == 0
 
         def begun() -> bool:
             answer = machine.json(*call)[1]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import secrets
+import signal
 from typing import Any
 
 import pytest
@@ -134,3 +135,19 @@ def test_robot_that_reads_no_scope_stops_and_is_in_the_report(stage: Stage) -> N
         assert locked(robots) == {"arm-1"}
     finally:
         yesterday.close()
+
+
+def test_robot_outside_of_the_scope_that_was_away_is_not_locked_by_it(stage: Stage) -> None:
+    inside, away = stage.robots("arm-1"), stage.robots("arm-2")
+    hand, scoped, everyone = stage.controller(), new_epoch(), new_epoch()
+    free(hand, inside, away)
+    away.signal(signal.SIGSTOP)
+    try:
+        assert hand.ask("stop_some", {"only": ["arm-1"]}, 20.0, scoped)["ok"]
+        # What it learns of this one shows that it was told of what it missed.
+        hand.ask("stop", ["arm-1", "arm-2"], 1.0, everyone)
+    finally:
+        away.signal(signal.SIGCONT)
+    eventually(lambda: away.ask("facts")["arm-2"]["epochs"])
+    assert away.ask("facts")["arm-2"]["epochs"] == [everyone]
+    assert inside.ask("facts")["arm-1"]["epochs"] == [scoped, everyone]

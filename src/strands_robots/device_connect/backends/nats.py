@@ -142,7 +142,7 @@ class NatsBackend(Backend):
 
     def denied(self, subject: str) -> str:
         """Return what the server said to refuse a message to ``subject``, or ""."""
-        return self._connection.denied.get(subject, "") if self._connection is not None else ""
+        return self._connection.denied.get(subject.lower(), "") if self._connection is not None else ""
 
     @property
     def is_connected(self) -> bool:

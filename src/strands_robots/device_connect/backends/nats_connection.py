@@ -169,9 +169,10 @@ class NatsConnection:
 
     def _note_denied(self, problem: str) -> None:
         """Keep a refusal to publish; the server names the subject in quotes."""
-        subject = problem.partition(DENIED)[2].strip().strip('"')
+        at = problem.lower().find(DENIED)
+        subject = problem[at + len(DENIED) :].strip().strip("\"'") if at >= 0 else ""
         if subject:
-            self.denied[subject[:SUBJECT_MAX]] = problem[:SUBJECT_MAX]
+            self.denied[subject[:SUBJECT_MAX].lower()] = problem[:SUBJECT_MAX]
             while len(self.denied) > PROBLEMS_KEPT:
                 del self.denied[next(iter(self.denied))]
 
@@ -202,8 +203,8 @@ class _Topic:
             sink(message)
 
 
-DENIED = "Permissions Violation for Publish to"
-"""Words of a NATS server before the subject that a client may not publish to."""
+DENIED = "permissions violation for publish to"
+"""Words of a NATS server before the subject that a client may not publish to, in the small letters of nats-py."""
 
 SUBJECT_MAX = 300
 

@@ -235,7 +235,7 @@ class BridgeTransport(Transport):
         return self._local.anchored()
 
     def links_back(self) -> int:
-        return self._local.links_back()
+        return self._local.links_back() + self._cloud.links_back()
 
     def lost_link_at(self) -> float | None:
         # A local leg that comes up late is judged like one whose link can be lost.

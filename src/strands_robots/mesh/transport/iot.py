@@ -107,6 +107,7 @@ class IotMqttTransport(Transport):
         self._up = threading.Event()
         self._failed: str = ""
         self._reachable = True
+        self._was_up, self._links_back = False, 0
         self._lock = threading.Lock()
         self._subscribers: list[_Subscriber] = []
         self._refusals: dict[str, str] = {}
@@ -163,6 +164,9 @@ class IotMqttTransport(Transport):
         self._up.clear()
         if client is not None:
             client.stop()
+
+    def links_back(self) -> int:
+        return self._links_back
 
     def is_alive(self) -> bool:
         return self._client is not None and self._up.is_set()
@@ -344,6 +348,8 @@ class IotMqttTransport(Transport):
         settled = getattr(data, "negotiated_settings", None)
         with self._lock:
             self._up.set()
+            self._links_back += self._was_up
+            self._was_up = True
             rejoined = getattr(settled, "rejoined_session", False)
             keys = {each.key for each in self._subscribers} if not rejoined else set(self._refusals)
         for key in keys:

@@ -1,0 +1,89 @@
+"""Motions go around the objects that are seen, or are refused by the object's name."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from strands_robots.simulation import Simulation
+
+SIDE = (0.22, -0.12, 0.05)
+OTHER_SIDE = (0.22, 0.12, 0.05)
+
+
+@pytest.fixture
+def world() -> Iterator[Simulation]:
+    simulation = Simulation()
+    assert simulation.add_robot("arm", "so101")["status"] == "success"
+    assert simulation.move_to(*SIDE, speed=1.0)["status"] == "success"
+    yield simulation
+    simulation.cleanup()
+
+
+def post(world: Simulation) -> None:
+    world.add_object("post", "box", (0.02, 0.02, 0.06), (0.25, 0.0, 0.06))
+
+
+def test_motion_goes_around_an_object_in_its_way(world: Simulation) -> None:
+    post(world)
+    answer = world.move_to(*OTHER_SIDE, speed=1.0)
+    assert answer["why"] == "it is done"
+    assert answer["moved"] == {}
+    assert world.tip_position("arm") == pytest.approx(OTHER_SIDE, abs=5e-3)
+
+
+def test_around_false_is_the_straight_way_through_it(world: Simulation) -> None:
+    post(world)
+    assert world.move_to(*OTHER_SIDE, speed=1.0, around=False)["moved"]["post"] > 20
+
+
+def test_motion_without_a_way_is_refused_by_the_objects_name_and_nothing_moves(world: Simulation) -> None:
+    world.add_object("wall", "box", (0.4, 0.01, 0.4), (0.2, 0.05, 0.4), fixed=True)
+    before = world.body("arm").targets
+    assert "touches the wall" in world.move_to(*OTHER_SIDE)["reason"]
+    assert "touches the wall" in world.move_joints({"shoulder_pan": -60.0})["reason"]
+    assert "touches the wall" in world.move_by(dy=0.2)["reason"]
+    assert world.body("arm").targets == before
+
+
+def test_free_way_is_straight_and_searches_nothing(world: Simulation, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("strands_robots.kinematics.planner.path_around", lambda *_: pytest.fail("no search is needed"))
+    world.add_object("cube", "box", (0.0125,) * 3, (0.3, 0.15, 0.0125))
+    assert world.move_to(*OTHER_SIDE, speed=1.0)["status"] == "success"
+
+
+def test_stop_ends_a_motion_that_is_still_planned(world: Simulation, monkeypatch: pytest.MonkeyPatch) -> None:
+    post(world)
+    searching, answers = threading.Event(), []
+
+    def endless(start: object, goal: object, limits: object, clear: object, going: Callable[[], bool]) -> None:
+        searching.set()
+        while going():
+            pass
+
+    monkeypatch.setattr("strands_robots.kinematics.planner._RETREAT_M", ())
+    monkeypatch.setattr("strands_robots.kinematics.planner.path_around", endless)
+    monkeypatch.setattr("strands_robots.arm_mixin.PLAN_S", 60.0)
+    before = world.body("arm").targets
+    moving = threading.Thread(target=lambda: answers.append(world.move_to(*OTHER_SIDE)))
+    moving.start()
+    assert searching.wait(10.0)
+    assert world.halt("test").stopped
+    moving.join(5.0)
+    assert not moving.is_alive()
+    ended: dict[str, Any] = dict(answers[0])
+    assert ended["status"] == "error"
+    assert "task_id" not in ended
+    assert world.body("arm").targets == pytest.approx(before, abs=0.05)
+
+
+def test_carried_object_goes_around_as_well(world: Simulation) -> None:
+    world.add_object("cube", "box", (0.0125,) * 3, (0.2, -0.12, 0.0125))
+    assert world.pick("cube", speed=1.0)["why"] == "it is done"
+    world.add_object("post", "box", (0.015, 0.015, 0.05), (0.24, 0.0, 0.05))
+    placed = world.place(0.2, 0.12, speed=1.0)
+    assert placed["status"] == "success", placed
+    assert "post" not in placed["moved"]
