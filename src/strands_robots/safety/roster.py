@@ -193,13 +193,10 @@ class Roster:
         rows = {row.name: row for row in joined.rows}
         for row in self.rows:
             also = rows.get(row.name, row)
-            surer = also.known < row.known
-            rows[row.name] = replace(
-                row,
-                known=also.known if surer else row.known,
-                stoppable=True if surer else row.stoppable,
-                processes=also.processes,
-            )
+            if also.known < row.known:
+                rows[row.name] = replace(also, stoppable=True)
+            else:
+                rows[row.name] = replace(row, alive=also.alive, pid=also.pid, processes=also.processes)
         exempt = tuple(row for row in joined.exempt if row.name not in rows)
         # Names that were only heard count on as they did.
         enrolled = joined.enrolled if self.enrolled else 0

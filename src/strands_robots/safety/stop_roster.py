@@ -282,7 +282,7 @@ class StopRoster:
         return [pid for run, pid in row.processes if run not in runs]
 
     def _proven_runs(self, name: str, answer: Answer) -> frozenset[str]:
-        """Return the run ids in answers that the robot's key has signed; "" for none."""
+        """Return the run ids in answers that the robot's key signed; "" for none."""
         if self._network.kind != DEVICE_CONNECT or not answer.facts:
             return frozenset(answer.runs or ("",))
         if name not in self._keys:
@@ -334,7 +334,15 @@ class StopRoster:
         return proofs
 
     def _covers(self, row: RosterRow) -> bool:
+        """Return False for a robot of another cell.
+
+        Anyone may forge a presence: of a robot that has shown a key it does not contradict what is remembered.
+        """
         cell = self._cells.get(row.name, row.cell)
+        if row.processes:
+            cell = row.cell
+        elif cell and cell != row.cell and row.age_s is not None and row.known is not Known.HEARD:
+            cell = ""
         return self.scope.everything or cell is None or self.scope.covers(row.name, {cell} - {""})
 
     def _elsewhere(self, silent: Collection[str]) -> dict[str, tuple[NetworkKey, float]]:

@@ -109,10 +109,23 @@ def test_thousands_of_made_up_names_hide_no_frozen_robot(console: Machine, lab: 
 
 def test_second_process_of_the_same_name_answers_for_a_frozen_one(lab: RosterLab) -> None:
     """Their own machine knows of both; for another one they are the same robot."""
-    console = known_by("robots", lab)
-    robot(lab).freeze()
-    lab.robots("arm-1", state="robots")
-    red(console, lab)
+    console, first = known_by("robots", lab), robot(lab)
+    first.freeze()
+    # Of a name that answers it is refused.
+    second = lab.robots("arm-1", state="robots")
+    missed(console, lab)
+    first.wake()
+    eventually(lambda: console.run(*STOP, *lab.flags).returncode == 0, 60)
+    assert "is served by the processes" in console.run(*STOP, *lab.flags).stdout
+    second.freeze()
+    missed(console, lab)
+
+
+def missed(console: Machine, lab: RosterLab) -> None:
+    """The stop names a process of arm-1 that gave no answer."""
+    said = json.loads(console.run(*STOP, "--json", *lab.flags).stdout)
+    assert said["silent"] == ["arm-1"], said
+    assert said["reasons"]["arm-1"].endswith("gives no answer; another process of that name did")
 
 
 def test_robot_killed_and_served_under_another_name(console: Machine, lab: RosterLab) -> None:

@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 from fixtures.command_line import COMMAND, Machine, on_a_terminal
 from fixtures.nats_server import NatsServer
+from fixtures.tcp_proxy import TcpProxy
 from fixtures.waiting import eventually, free_port
 
 from strands_robots.device_connect.backends import LinkConfig, loopback_config, open_client
@@ -91,6 +92,22 @@ def test_enrolled_robot_that_was_killed_is_named(site: Site) -> None:
         assert code == 3, said
         assert said["silent"] == ["arm-2"]
         assert "its process on this machine has ended" in said["reasons"]["arm-2"]
+
+
+@pytest.mark.parametrize("site", ["zenoh", "nats"], indirect=True)
+def test_robot_that_answers_brings_those_known_under_another_address_of_its_network(site: Site) -> None:
+    target = site.flags[1].rpartition(":")[2] if site.flags else site.environment["STRANDS_DC_PORT"]
+    with TcpProxy(int(target)) as proxy, site.serving("arm-0", *site.flags):
+        through = f"127.0.0.1:{proxy.port}"
+        there = ("--nats", f"nats://{through}") if site.flags else ("--connect", f"tcp/{through}")
+        with site.serving("arm-1", *there), site.serving("arm-2", *there) as (second, _):
+            site.remembers("arm-0", "arm-1", "arm-2")
+            code, said = site.estop("--deadline", "10")
+            assert (code, said["stopped"].keys()) == (0, {"arm-0", "arm-1", "arm-2"}), said
+            with frozen(second):
+                code, said = site.estop()
+            assert (code, said["silent"], said["elsewhere"]) == (3, ["arm-2"], 0), said
+            assert "SIGSTOP" in said["reasons"]["arm-2"]
 
 
 NAMES = 10_000
