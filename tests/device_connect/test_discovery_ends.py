@@ -53,6 +53,8 @@ class Wire:
             meeting_point="tcp/127.0.0.1:1",
             is_peer=False,
             identified=False,
+            uses_multicast=False,
+            transport="zenoh",
         )
         self.links = 0
         self._answers: dict[str, float] = {f"arm-{number}": at for number, at in enumerate(answers)}

@@ -171,6 +171,11 @@ def seeds(peers: Fleet, signer: Signer) -> dict[str, dict[str, Any]]:
             "estop_id": "1" * 32,
             "audit": {"log": "a" * 32, "count": 1, "last": "b" * 64},
         },
+        "strands/arm-9/missed/roster": {
+            "estop_id": "1" * 32,
+            "missing": [{"name": "arm-1", "how": "heard", "cell": ""}],
+            "more": 0,
+        },
         "strands/arm-9/missed/ask": {"nonce": "1" * 32, "devices": ["arm-9"], "t": now},
         "strands/arm-9/missed/answer": {
             "nonce": "1" * 32,

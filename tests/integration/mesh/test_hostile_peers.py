@@ -234,6 +234,9 @@ def floods(attacker: Attacker) -> dict[str, Callable[[int], tuple[str, object]]]
                              {"peer_id": "m", "t": now, "assertion": assertion, "source_zid": zid}),
         "checkin": lambda n: ("strands/m/checkin", {"peer_id": "m", "t": now, "n": n}),
         "checkin_answer": lambda n: ("strands/m/checkin/answer", {"peer_id": "m", "t": now, "n": n}),
+        "missed_ask": lambda n: ("strands/m/missed/ask", {"nonce": f"{n:032x}", "devices": ["m"], "t": now}),
+        "missed_answer": lambda n: ("strands/m/missed/answer", {"nonce": f"{n:032x}", "stops": [], "more": 0}),
+        "missed_roster": lambda n: ("strands/m/missed/roster", {"estop_id": f"{n:032x}", "missing": [], "more": n}),
         "other": lambda n: ("strands/m/anything/else", b"{" * 100),
     }  # fmt: skip
     for name, leaf in sensors.items():
