@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from contextlib import closing
 from pathlib import Path
 from typing import Annotated
 
@@ -40,10 +41,12 @@ def mcp(
     try:
         from strands_robots.mcp.caller import Caller  # noqa: PLC0415 - loaded when it is used
         from strands_robots.mcp.server import serve_stdio  # noqa: PLC0415 - as above
+        from strands_robots.mcp.standing import StandingController  # noqa: PLC0415 - as above
     except ModuleNotFoundError as missing:
         raise CliError(f"The MCP server needs the extra mcp ({install_line('mcp')}): {missing}.") from missing
     if http is None:
-        with network.fleet(name) as fleet:
+        with network.fleet(name) as fleet, closing(StandingController(name, fleet.link)) as standing:
+            standing.open()
             asyncio.run(serve_stdio(Caller(fleet), read_only=read_only))
         return
     from strands_robots.device_connect import FleetClient  # noqa: PLC0415 - as above
@@ -58,7 +61,13 @@ def mcp(
     address = Address(host.strip("[]") or "127.0.0.1", at, http_cert, http_key, tuple(http_name or ()))
     link = network.link()
     default = Token(name, read_only=read_only)
+
+    def ready(url: str) -> None:
+        screen.say(url)
+        standing.open()
+
     try:
-        asyncio.run(serve_http(lambda who: FleetClient(link, who), address, default=default, ready=screen.say))
+        with closing(StandingController(name, link)) as standing:
+            asyncio.run(serve_http(lambda who: FleetClient(link, who), address, default=default, ready=ready))
     except (StrandsRobotsError, OSError) as problem:
         raise CliError(str(problem), Exit.USAGE) from problem
