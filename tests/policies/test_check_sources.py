@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fixtures.checkpoints import MODES, Vectors, statistics, write_checkpoint, write_dataset
+from fixtures.checkpoints import MODES, Vectors, statistics, write_checkpoint, write_dataset, write_safetensors
 
+from strands_robots.policies import dataset_facts
 from strands_robots.policies.check import PolicyCheck, PolicyCheckError, check_policy, statements_of
 from strands_robots.policies.check_rows import RobotFacts
 from strands_robots.policies.profiled import ProfiledPolicy
@@ -253,6 +254,104 @@ def test_the_checkpoints_own_bounds_count_where_no_dataset_is_named(tmp_path: Pa
     check = check_policy(profile, statements_of(profile), replace(ROBOT, state={**ROBOT.state, "pan.pos": 60.0}))
     assert {"state in the data", "range of the actions"} <= {row.question for row in check.failures}
     assert "(policy_preprocessor.json)" in check.refusal()
+
+
+def in_type(folder: Path, profile: Profile, dtype: str, held: Mapping[str, Vectors]) -> PolicyCheck:
+    """The check of a checkpoint whose statistics are numbers of another type."""
+    tensors = {f"{feature}.{kind}": each for feature, kinds in held.items() for kind, each in kinds.items()}
+    for path in (folder / "checkpoint").glob("policy_*.safetensors"):
+        write_safetensors(path, tensors, dtype)
+    return check_policy(profile, statements_of(profile), ROBOT)
+
+
+def test_statistics_in_bf16_are_read(tmp_path: Path) -> None:
+    profile = written(tmp_path, "v3.0", {})
+    check = in_type(tmp_path, profile, "BF16", HELD)
+    assert check.passed, check.refusal()
+    radians = in_type(tmp_path, profile, "BF16", {STATE: RADIANS, ACTION: RADIANS})
+    assert {"range of observation.state", "range of action"} <= {row.question for row in radians.failures}
+
+
+def test_statistics_of_an_unknown_type_are_there_with_unknown_values(tmp_path: Path) -> None:
+    profile = written(tmp_path, "v3.0", {})
+    check = in_type(tmp_path, profile, "F8_E4M3", HELD)
+    assert check.passed, check.refusal()
+    lacking = in_type(tmp_path, profile, "F8_E4M3", {STATE: SPREAD, ACTION: without(SPREAD, "std")})
+    assert "statistics of action" in {row.question for row in lacking.failures}
+
+
+WIDE = replace(ROBOT, ranges={**ROBOT.ranges, "pan.pos": (-360.0, 360.0), "lift.pos": (-360.0, 360.0)})
+
+
+def outcomes(profile: Profile, robot: RobotFacts) -> tuple[dict[str, set[str]], bool]:
+    check = check_policy(profile, statements_of(profile), robot)
+    found: dict[str, set[str]] = {}
+    for row in check.rows:
+        found.setdefault(row.question, set()).add(row.outcome)
+    return found, check.passed
+
+
+def moving(low: float, high: float) -> dict[str, dict[str, Any]]:
+    """Sources that agree on the range of both joints."""
+    spread = statistics((low, low, 0.0), (high, high, 100.0))
+    return {**processors(spread, spread), **dataset(low=spread["min"], high=spread["max"])}
+
+
+def test_small_motions_of_joints_that_turn_widely_are_positions(tmp_path: Path) -> None:
+    rows, passed = outcomes(written(tmp_path, "v3.0", moving(-13.0, 13.0)), WIDE)
+    assert rows["range of the actions"] == {"ok"}
+    assert passed
+
+
+def test_very_small_motions_may_be_vouched_for_but_changes_may_not(tmp_path: Path) -> None:
+    profile = written(tmp_path / "small", "v3.0", moving(-2.0, 3.0))
+    rows, passed = outcomes(profile, WIDE)
+    assert rows["range of the actions"] == {"unverified"}
+    assert not passed
+    vouched = replace(profile, confirmed=frozenset({"units"}))
+    assert outcomes(vouched, WIDE)[1]
+    changes = written(tmp_path / "changes", "v3.0", {**processors(action=UNIT), **dataset(action=UNIT)})
+    rows, passed = outcomes(replace(changes, confirmed=frozenset({"units"})), WIDE)
+    assert rows["range of the actions"] == {"refused"}
+    assert not passed
+
+
+def test_training_on_more_than_the_named_data_may_be_vouched_for(tmp_path: Path) -> None:
+    part = {key: tuple(each / 4 for each in bounds) for key, bounds in (("low", LOW), ("high", HIGH))}
+    profile = written(tmp_path, "v3.0", dataset(**part))
+    rows, passed = outcomes(profile, ROBOT)
+    assert rows["range of action"] == {"ok", "unverified"}, "the processors agree"
+    assert not passed
+    assert outcomes(replace(profile, confirmed=frozenset({"units"})), ROBOT)[1]
+
+
+def test_ranges_in_two_units_and_disjoint_ones_cannot_be_vouched_for(tmp_path: Path) -> None:
+    other = statistics((300.0, 300.0, 0.0), (400.0, 400.0, 100.0))
+    for name, action in (("radians", RADIANS), ("normalised", UNIT), ("disjoint", other)):
+        profile = replace(written(tmp_path / name, "v3.0", processors(action=action)), confirmed=frozenset({"units"}))
+        assert "refused" in outcomes(profile, ROBOT)[0]["range of action"], name
+
+
+def test_quantiles_are_not_compared_with_bounds(tmp_path: Path) -> None:
+    quantiles = {"q01": [-9.0, -8.0, 0.0], "q99": [9.0, 8.0, 10.0]}
+    profile = written(tmp_path, "v3.0", processors(*[{**without(SPREAD, "min", "max"), **quantiles}] * 2))
+    check = check_policy(profile, statements_of(profile), ROBOT)
+    said = [row for row in check.unanswered if row.question == "range of action"]
+    assert said
+    assert {"quantiles", "bounds"} == {side.split()[0] for row in said for side in (row.policy, row.robot)}
+    assert not any(row.question.startswith("range of ") for row in check.failures), check.refusal()
+
+
+@pytest.mark.parametrize(("more", "read"), [(0, True), (1, False)])
+def test_the_greatest_number_of_episodes_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, more: int, read: bool
+) -> None:
+    monkeypatch.setattr(dataset_facts, "EPISODES_MAX", 4)
+    profile = written(tmp_path, "v2.1", {})
+    path = tmp_path / "dataset" / "meta" / "episodes_stats.jsonl"
+    lines = path.read_text().splitlines() * 2
+    path.write_text("\n".join(lines + lines[:more]) + "\n")
+    assert check_policy(profile, statements_of(profile), ROBOT).passed is read
 
 
 UNANSWERED: dict[str, tuple[dict[str, dict[str, Any]], RobotFacts, bool, str]] = {

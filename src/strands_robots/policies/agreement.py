@@ -17,7 +17,7 @@ from strands_robots.policies.check_rows import (
     of,
     unanswered,
 )
-from strands_robots.policies.checkpoint import ACTION, STATE, Bounds, Size, Statement
+from strands_robots.policies.checkpoint import ACTION, STATE, Size, Spread, Statement
 from strands_robots.policies.profiles import Profile
 
 OUTSIDE_SHARE = 0.5
@@ -29,8 +29,14 @@ NARROW_SHARE = 0.04
 CHANGES_SHARE = 0.2
 """Part of the states' range below which the actions of the same data are changes of positions."""
 
+WIDEST = math.pi
+"""Most of a joint's range that the actions are compared with, in radians: few tasks turn a joint further."""
+
 RATIO_MAX = 3.0
 """Greatest ratio of the ranges that two sources state of the same data."""
+
+UNIT_RATIOS, UNIT_RATIO_WITHIN = (math.degrees(1.0), 100.0), 1.25
+"""Ratios of ranges in two units, radians of degrees and parts of percent, and the factor by which they may vary."""
 
 NOISE_SHARE = 0.02
 """Part of the widest range that two sources may always differ by, as of a joint that stood still."""
@@ -85,7 +91,7 @@ def _ranges(profile: Profile, statements: Sequence[Statement], robot: RobotFacts
         yield unanswered("state in the data", change="name the dataset, for its statistics")
     for feature, keys, stated in ((STATE, profile.state, states), (ACTION, profile.action, actions)):
         for (one, first), (other, second) in combinations(stated.items(), 2):
-            yield _same_data(feature, keys, (one, first), (other, second))
+            yield _same_data(profile, feature, keys, (one, first), (other, second))
     limits = _limits(profile, robot)
     if not actions or not limits:
         shown = of("its range", next(iter(actions))) if actions else "not stated"
@@ -93,18 +99,24 @@ def _ranges(profile: Profile, statements: Sequence[Statement], robot: RobotFacts
         yield unanswered("range of the actions", shown, known)
     for source, bounds in actions.items():
         if limits:
-            yield _inside(profile, limits, source, bounds)
+            yield _inside(profile, limits, _spread(states, source, bounds), source, bounds)
         if source in states:
             yield _positions(profile, source, states[source], bounds)
     for source, bounds in actions.items():
         # The preprocessor has the state's statistics, the postprocessor those of the action.
-        if source not in states and states:
-            yield _positions(profile, source, next(iter(states.values())), bounds)
+        spread = _spread(states, source, bounds)
+        if source not in states and spread:
+            yield _positions(profile, source, spread, bounds)
 
 
-def _usable(stated: Sequence[tuple[str, Bounds | None]], size: int) -> dict[str, Bounds]:
+def _spread(states: Mapping[str, Spread], source: str, actions: Spread) -> Spread | None:
+    """Return the range of the states that actions are compared with."""
+    return states.get(source) or next((each for each in states.values() if each.kind == actions.kind), None)
+
+
+def _usable(stated: Sequence[tuple[str, Spread | None]], size: int) -> dict[str, Spread]:
     """Return the ranges of the right size, by source. Sizes have rows of their own."""
-    return {source: bounds for source, bounds in stated if bounds is not None and len(bounds[0]) == size}
+    return {source: bounds for source, bounds in stated if bounds is not None and len(bounds.low) == size}
 
 
 def _limits(profile: Profile, robot: RobotFacts) -> dict[str, tuple[float, float]]:
@@ -118,11 +130,17 @@ def _limits(profile: Profile, robot: RobotFacts) -> dict[str, tuple[float, float
     return found
 
 
-def _inside(profile: Profile, limits: Mapping[str, tuple[float, float]], source: str, bounds: Bounds) -> CheckRow:
+def _inside(
+    profile: Profile,
+    limits: Mapping[str, tuple[float, float]],
+    states: Spread | None,
+    source: str,
+    bounds: Spread,
+) -> CheckRow:
     """The actions lie in the joints' ranges, and cover more than a sliver of them."""
     outside: list[tuple[str, str]] = []
     shares: list[float] = []
-    for key, low, high in zip(profile.action, *bounds, strict=True):
+    for key, low, high in zip(profile.action, bounds.low, bounds.high, strict=True):
         if key not in limits:
             continue
         bottom, top = limits[key]
@@ -130,42 +148,76 @@ def _inside(profile: Profile, limits: Mapping[str, tuple[float, float]], source:
         if low < bottom - OUTSIDE_SHARE * width or high > top + OUTSIDE_SHARE * width:
             outside.append((f"{key} {low:g} to {high:g}", f"{key} {bottom:g} to {top:g}"))
         if profile.unit(key) != "percent":
-            shares.append((high - low) / width)
+            shares.append((high - low) / min(width, converted(WIDEST, "radians", profile.unit(key))))
     narrow = bool(shares) and max(shares) < NARROW_SHARE
     wrong = "; ".join(each for each, _ in outside) or ("less than 4 % of every joint" if narrow else "inside")
     theirs = "; ".join(each for _, each in outside) or "ranges of the joints"
-    change = "check units, and that the actions are positions of joints"
-    fits = not outside and not narrow
-    return compared("range of the actions", of(wrong, source), of(theirs, ROBOT), fits, change)
+    question, change = "range of the actions", "check units, and that the actions are positions of joints"
+    changes = states is not None and 0 < max(_shares(profile, states, bounds), default=0.0) < CHANGES_SHARE
+    if narrow and not outside and not changes:
+        return _vouched(profile, question, of(wrong, source), of(theirs, ROBOT), change)
+    return compared(question, of(wrong, source), of(theirs, ROBOT), not outside and not narrow, change)
 
 
-def _positions(profile: Profile, source: str, states: Bounds, actions: Bounds) -> CheckRow:
-    """The actions span about what the states span, or they are changes of them."""
-    spans = dict(zip(profile.state, zip(*states, strict=True), strict=True))
+def _vouched(profile: Profile, question: str, policy: str, robot: str, change: str) -> CheckRow:
+    """Return the row of a difference that the operator may vouch for."""
+    outcome: Outcome = "confirmed" if "units" in profile.confirmed else "unverified"
+    return CheckRow(question, policy, robot, outcome, f'{change}; or list "units" under confirmed')
+
+
+def _shares(profile: Profile, states: Spread, actions: Spread) -> list[float]:
+    """Return the part of each state's range that its action spans."""
+    spans = dict(zip(profile.state, zip(states.low, states.high, strict=True), strict=True))
     shares = []
-    for key, low, high in zip(profile.action, *actions, strict=True):
+    for key, low, high in zip(profile.action, actions.low, actions.high, strict=True):
         bottom, top = spans.get(key, (0.0, 0.0))
         if top > bottom and profile.unit(key) != "percent":
             shares.append((high - low) / (top - bottom))
+    return shares
+
+
+def _positions(profile: Profile, source: str, states: Spread, actions: Spread) -> CheckRow:
+    """The actions span about what the states span, or they are changes of them."""
+    shares = _shares(profile, states, actions)
     changes = bool(shares) and max(shares) < CHANGES_SHARE
     said = f"at most {100 * max(shares):.0f} % of the states' range" if shares else "no key of the state"
     change = "take a policy whose actions are positions, not changes"
     return compared("actions and states", of(said, source), "positions", not changes, change)
 
 
-def _same_data(feature: str, keys: Sequence[str], one: tuple[str, Bounds], other: tuple[str, Bounds]) -> CheckRow:
+def _same_data(
+    profile: Profile, feature: str, keys: Sequence[str], one: tuple[str, Spread], other: tuple[str, Spread]
+) -> CheckRow:
     """Two sources state about the same range, as of the same data."""
-    far = []
-    every = [high - low for bounds in (one[1], other[1]) for low, high in zip(*bounds, strict=True)]
+    question, (_, first), (_, second) = f"range of {feature}", one, other
+    if first.kind != second.kind:
+        sides = ["quantiles" if bounds.kind != "min" else "bounds" for bounds in (first, second)]
+        return unanswered(question, of(sides[0], one[0]), of(sides[1], other[0]))
+    far: list[tuple[str, str]] = []
+    ratios: list[float] = []
+    disjoint = False
+    every = [high - low for bounds in (first, second) for low, high in zip(bounds.low, bounds.high, strict=True)]
     noise = NOISE_SHARE * max(every)
-    for key, low, high, bottom, top in zip(keys, *one[1], *other[1], strict=True):
+    for key, low, high, bottom, top in zip(keys, *first[:2], *second[:2], strict=True):
         spans = sorted((high - low, top - bottom))
         apart = low > top + noise or bottom > high + noise
+        disjoint |= apart
+        if spans[1] > noise:
+            ratios.append(spans[1] / spans[0] if spans[0] > 0 else math.inf)
         if apart or spans[1] > RATIO_MAX * spans[0] + noise:
             far.append((f"{key} {low:g} to {high:g}", f"{key} {bottom:g} to {top:g}"))
-    sides = ["; ".join(each[side] for each in far) or "the same range" for side in (0, 1)]
+    mine, theirs = (
+        of("; ".join(each[side] for each in far) or "the same range", (one, other)[side][0]) for side in (0, 1)
+    )
     change = "name the dataset that the checkpoint was trained on, or the checkpoint of this dataset"
-    return compared(f"range of {feature}", of(sides[0], one[0]), of(sides[1], other[0]), not far, change)
+    if far and not disjoint and 2 * sum(map(_is_unit, ratios)) < len(ratios):
+        return _vouched(profile, question, mine, theirs, change)
+    return compared(question, mine, theirs, not far, change)
+
+
+def _is_unit(ratio: float) -> bool:
+    """Return True for the ratio of ranges in two units."""
+    return any(unit / UNIT_RATIO_WITHIN <= ratio <= unit * UNIT_RATIO_WITHIN for unit in UNIT_RATIOS)
 
 
 def _normalization(statements: Sequence[Statement]) -> Iterator[CheckRow]:

@@ -60,9 +60,11 @@ class StillBody:
         self._profile = profile
         self._joints = dict.fromkeys((*profile.state, *profile.environment, *profile.action), 0.0)
         for each in statements_of(profile):
-            if each.state_range is not None and len(each.state_range[0]) == len(profile.state):
+            if each.state_range is not None and len(each.state_range.low) == len(profile.state):
                 # In the middle of the data, or the check refuses to begin.
-                middle = [(low + high) / 2 for low, high in zip(*each.state_range, strict=True)]
+                middle = [
+                    (low + high) / 2 for low, high in zip(each.state_range.low, each.state_range.high, strict=True)
+                ]
                 self._joints |= dict(zip(profile.state, middle, strict=True))
         self._pictures: dict[str, Any] = {}
         if profile.cameras:

@@ -167,10 +167,10 @@ def _values(profile: Profile, statements: Sequence[Statement], robot: RobotFacts
             "state values", "finite numbers", f"none for {', '.join(unusable)}", "refused", "look at the robot"
         )
     for each in statements:
-        if each.state_range is None or unusable or len(each.state_range[0]) != len(profile.state):
+        if each.state_range is None or unusable or len(each.state_range.low) != len(profile.state):
             continue
         far = []
-        for key, low, high in zip(profile.state, *each.state_range, strict=True):
+        for key, low, high in zip(profile.state, *each.state_range[:2], strict=True):
             value = converted(robot.state[key], robot.units.get(key), profile.unit(key))
             # A joint that never moved in the data is never exactly there again.
             bottom, top = (

@@ -13,7 +13,7 @@ import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from strands_robots.policies.decoding import ForeignDataError, decode_file, read_json
 from strands_robots.utils import ValidationError, shown
@@ -25,8 +25,14 @@ HEADER_MAX, HEADER_ELEMENTS_MAX = 4 * 2**20, 200_000
 Size = tuple[int, int, int]
 """Height, width and channels of a picture."""
 
-Bounds = tuple[tuple[float, ...], tuple[float, ...]]
-"""Lowest and highest value by place."""
+
+class Spread(NamedTuple):
+    """Lowest and highest value by place, as bounds or as quantiles."""
+
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    kind: str = "min"
+
 
 VECTOR_MAX = 1024
 """Longest vector of statistics that is read."""
@@ -74,8 +80,8 @@ class Statement:
     chunk: int | None = None
     statistics: frozenset[str] | None = None
     needed: frozenset[str] = frozenset()
-    state_range: Bounds | None = None
-    action_range: Bounds | None = None
+    state_range: Spread | None = None
+    action_range: Spread | None = None
     normalization: Mapping[str, str] | None = None
     recorded: Mapping[str, Size] | None = None
     renamed: Mapping[str, str] | None = None
@@ -150,7 +156,7 @@ def _processor(directory: Path, name: str, feature: str) -> Statement:
         return Statement(name, str(exc), statistics=frozenset(), needed=frozenset((STATE, ACTION)))
     has = {key: _of(values, key) for key in (STATE, ACTION)}
     present = frozenset(key for key, kinds in has.items() if _suffices(kinds, modes.get(KINDS[key], "")))
-    own = next(iter(has[feature].values()), None)
+    own = next(filter(None, has[feature].values()), None)
     used = modes.get(KINDS[feature]) != "IDENTITY"
     return Statement(
         name,
@@ -169,16 +175,16 @@ KINDS = {STATE: "STATE", ACTION: "ACTION"}
 """Kind of each feature, as the way to normalise is listed by it."""
 
 
-def bounds_of(kinds: Mapping[str, tuple[float, ...]]) -> Bounds | None:
+def bounds_of(kinds: Mapping[str, tuple[float, ...]]) -> Spread | None:
     """Return the range that statistics state, by bounds or by quantiles."""
     for low, high in (("min", "max"), ("q01", "q99")):
-        if low in kinds and len(kinds[low]) == len(kinds.get(high, ())):
-            return kinds[low], kinds[high]
+        if kinds.get(low) and len(kinds[low]) == len(kinds.get(high, ())):
+            return Spread(kinds[low], kinds[high], low)
     return None
 
 
 def _of(values: Mapping[str, tuple[float, ...]], feature: str) -> dict[str, tuple[float, ...]]:
-    """Return the finite statistics of a feature, by kind."""
+    """Return the finite statistics of a feature; empty ones are not known."""
     found = {kind: values[f"{feature}.{kind}"] for kind in _STATISTICS if f"{feature}.{kind}" in values}
     return {kind: each for kind, each in found.items() if all(map(math.isfinite, each))}
 
@@ -202,7 +208,7 @@ def _texts(given: object) -> dict[str, str]:
 
 
 def _vectors(path: Path) -> dict[str, tuple[float, ...]]:
-    """Return the vectors of a safetensors file, by name; others are left out.
+    """Return the vectors of a safetensors file; empty if of an unknown type.
 
     Raises:
         ValidationError: it is not whole.
@@ -215,12 +221,22 @@ def _vectors(path: Path) -> dict[str, tuple[float, ...]]:
         start = 8 + struct.unpack("<Q", file.read(8))[0]
         for name, tensor in _header(path).items():
             begin, end = (int(each) for each in tensor["data_offsets"])
-            code, count = _CODES.get(str(tensor.get("dtype"))), end - begin
-            if code is None or len(tensor.get("shape", ())) > 1 or not 0 < count <= VECTOR_MAX * 8:
+            if len(tensor.get("shape", ())) > 1 or not 0 < end - begin <= VECTOR_MAX * 8:
                 continue
             file.seek(start + begin)
-            found[name] = struct.unpack(f"<{count // struct.calcsize(code)}{code}", file.read(count))
+            found[name] = _numbers(str(tensor.get("dtype")), file.read(end - begin))
     return found
+
+
+def _numbers(kind: str, raw: bytes) -> tuple[float, ...]:
+    """Return the numbers of a vector; none of a type that is not known."""
+    if kind == "BF16":
+        # The upper half of a 32-bit number.
+        kind, raw = "F32", b"".join(b"\0\0" + raw[place : place + 2] for place in range(0, len(raw) - 1, 2))
+    code = _CODES.get(kind)
+    if code is None or len(raw) % struct.calcsize(code):
+        return ()
+    return tuple(float(each) for (each,) in struct.iter_unpack(f"<{code}", raw))
 
 
 _CODES = {"F16": "e", "F32": "f", "F64": "d"}

@@ -14,8 +14,8 @@ from strands_robots.policies.checkpoint import (
     ACTION,
     ENVIRONMENT,
     STATE,
-    Bounds,
     Size,
+    Spread,
     Statement,
     bounds_of,
     json_object,
@@ -78,27 +78,29 @@ def _episodes(path: Path) -> Iterator[Mapping[str, object]]:
         ForeignDataError: a line has none.
     """
     with path.open("rb") as file:
-        for _ in range(EPISODES_MAX):
+        for number in range(EPISODES_MAX + 1):
             line = file.readline(LINE_MAX + 1)
             if not line:
                 return
+            if number == EPISODES_MAX:
+                raise ValidationError(f"it has more than {EPISODES_MAX:,} episodes")
             if line.strip():
                 episode = decode_file(line, bytes_max=LINE_MAX)
                 stats = episode.get("stats") if isinstance(episode, dict) else None
                 if not isinstance(stats, dict):
                     raise ForeignDataError("a line has no stats")
                 yield stats
-    raise ValidationError(f"it has more than {EPISODES_MAX:,} episodes")
 
 
-def _whole(parts: list[Mapping[str, object]] | list[dict[str, object]], feature: str) -> Bounds | None:
+def _whole(parts: list[Mapping[str, object]] | list[dict[str, object]], feature: str) -> Spread | None:
     """Return the range over all parts; None unless all state it alike."""
     found = [bounds_of(_vectors(part.get(feature))) for part in parts]
     bounds = [each for each in found if each is not None]
-    if not bounds or len(bounds) < len(found) or len({len(lows) for lows, _ in bounds}) > 1:
+    if not bounds or len(bounds) < len(found) or len({(len(each.low), each.kind) for each in bounds}) > 1:
         return None
-    lows, highs = ([pair[side] for pair in bounds] for side in (0, 1))
-    return tuple(map(min, zip(*lows, strict=True))), tuple(map(max, zip(*highs, strict=True)))
+    low = tuple(map(min, zip(*(each.low for each in bounds), strict=True)))
+    high = tuple(map(max, zip(*(each.high for each in bounds), strict=True)))
+    return Spread(low, high, bounds[0].kind)
 
 
 def _vectors(stats: object) -> dict[str, tuple[float, ...]]:
