@@ -113,6 +113,30 @@ def test_stop_for_nobody_that_is_there_becomes_one_of_every_robot(
     assert "every robot was stopped" in text_of(answer)
 
 
+def test_answers_of_robots_without_a_cell_do_not_hide_a_mistyped_one(stop: Callable[..., Any]) -> None:
+    fleet = Fleet({"free-1": "", "moving-1": "cell-1"})
+    report = stop(fleet, Scope(cell="cell-l"), ("free-1",), deadline_s=20)
+    assert report.widened and not report.ok
+    assert "moving-1" in report.stopped
+    # The stop of every robot is repeated: one message may be lost.
+    assert fleet.scopes.count(EVERY_ROBOT) > 1
+
+
+def test_remembered_cell_ends_with_the_answers_of_robots_without_one(stop: Callable[..., Any]) -> None:
+    fleet = Fleet({"free-1": ""})
+    report = stop(fleet, Scope(cell="cell-1"), ("free-1",), deadline_s=20, remembers=lambda asked: True)
+    assert report.ok and not report.widened
+
+
+def test_stop_that_left_just_before_its_deadline_widens_all_the_same(stop: Callable[..., Any]) -> None:
+    fleet = Fleet({"arm-1": "cell-1"}, up=False)
+    back = threading.Timer(0.55, lambda: (setattr(fleet, "up", True), fleet.on_state(True)))
+    back.start()
+    report = stop(fleet, Scope(cell="cell-l"), deadline_s=0.6)
+    back.join()
+    assert report.widened or not report.link
+
+
 def test_known_robot_that_is_silent_keeps_the_stop_to_itself(stop: Callable[..., Any]) -> None:
     fleet, scope = Fleet({"arm-2": ""}), Scope.named(["arm-1"])
     report = stop(fleet, scope, remembers=lambda asked: asked == scope)

@@ -217,6 +217,10 @@ def test_made_up_names_displace_no_row_of_a_bounded_list(store: Sightings, enrol
     assert names(kept)[:4] == ["arm-1", "z-served", "z-signed", "heard-first"]
     assert len(kept) == 64 and 64 + others == len(roster.rows) <= sighting_file.ROWS_MAX + 2
     assert names(roster.must_answer) == ["arm-1", "z-served", "z-signed"]
+    # Nor do they turn a stop red; without an enrolled robot, one that counts may be missing.
+    assert roster.problems == ()
+    enrolled.exempt("arm-1", Exemption("retired", "ann", "", 1.0))
+    assert Roster.of(HERE, store=store).problems == (sighting_file.CROWDED,)
 
 
 def test_a_robot_that_was_heard_here_and_signed_there_must_answer(store: Sightings, enrolled: EnrolledKeys) -> None:

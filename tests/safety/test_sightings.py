@@ -60,7 +60,7 @@ def store(tmp_path: Path, clock: Clock) -> Sightings:
 def found(store: Sightings, now: Moment | None = None) -> dict[str, Sighting]:
     """The robots by name; nothing was wrong with the file."""
     rows, problem = store.read(now)
-    assert problem == ""
+    assert problem in ("", sighting_file.CROWDED)
     return {each.name: each for each in rows}
 
 
@@ -279,6 +279,33 @@ def test_ten_thousand_made_up_names_cost_no_true_row_and_little_memory(
     for _ in range(3):
         store.file.write(made_up(4000, clock(), first=int(time.time() * 1e6) % 10**9), [], clock())
     assert {"heard-first", "signed", "served"} <= found(store).keys()
+
+
+def test_made_up_keys_push_out_no_name_that_was_heard_long_and_are_told(store: Sightings, clock: Clock) -> None:
+    store.file.write([Note(HERE, "true-robot", clock())], [], clock())
+    for each in range(5):
+        fakes = [replace(note, signed=clock()) for note in made_up(1024, clock(), first=1024 * each)]
+        store.file.write(fakes, [], clock())
+    rows, problem = store.file.read(clock())
+    assert problem == sighting_file.CROWDED
+    assert len(rows) == sighting_file.ROWS_MAX and "true-robot" in {each.name for each in rows}
+    clock.pass_(601.0)
+    assert store.file.read(clock()) == ([], "")
+
+
+def test_strangers_key_counts_only_where_no_robot_is_enrolled(store: Sightings, robot: SigningIdentity) -> None:
+    store.serve(HERE, "own-1")
+    assert store.flush(5.0)
+    EnrolledKeys(store.directory).enroll({"arm-9": b"1" * 32}, network=HERE)
+    own = KeyFile(ROBOTS, "own-1", store.directory).load_or_make()
+    for name, identity in (("arm-1", robot), ("own-1", own)):
+        answer = signed(identity, Purpose.LOCKOUT_STATE, name, {"nonce": "a" * 32})
+        store.note_answer(HERE, name, Purpose.LOCKOUT_STATE, answer, {"nonce": "a" * 32})
+    store.leave(HERE, "own-1")
+    store.flush(5.0)
+    with sqlite3.connect(store.file.path) as file:
+        rows = dict(file.execute("SELECT name, signed_boot IS NOT NULL FROM heard"))
+    assert rows == {"arm-1": 0, "own-1": 1}
 
 
 def test_stale_names_make_place_first(store: Sightings, clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:

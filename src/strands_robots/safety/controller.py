@@ -287,7 +287,6 @@ class SafetyController:
         run = _Running(
             estop_id, frozenset(expected) | scope.only, time.monotonic(), press, reason[:REASON_MAX], scope, more=more
         )
-        deadline_s = deadline_s if scope.everything else max(deadline_s, 2 * WIDEN_S)
         with self._changed:
             self._stops[run.estop_id] = run
         try:
@@ -397,9 +396,10 @@ class SafetyController:
             now = time.monotonic()
             late = now - run.started >= UNCONFIRMED_S
             with self._changed:
-                finished = run.complete or now - run.started >= deadline_s
+                ends_at = run.ends_at(deadline_s)
+                finished = (run.complete and run.scope_is_sure(now)) or now >= ends_at
                 if run.widens_at <= now and not run.settled_scope:
-                    run.widened = True
+                    run.widened, run.widened_at = True, now
                     report_widened(run.estop_id, run.scope)
                     pauses, next_send, finished = iter(quick_first), 0.0, False
                 state = hash((run.changes, len(run.expected), late, run.widened, self._link.up))
@@ -419,8 +419,8 @@ class SafetyController:
                 again += 1
                 pause = next(pauses, pause)
                 next_send = now + max(pause, min(REPEAT_EACH_S * len(run.expected), longest_s))
-            marks = [next_send, run.started + deadline_s, *([] if late else [run.started + UNCONFIRMED_S])]
-            marks += [run.widens_at] if run.widens_at > now else []
+            marks = [next_send, ends_at, *([] if late else [run.started + UNCONFIRMED_S])]
+            marks += [at for at in (run.widens_at, run.widened_at + WIDEN_S) if at > now]
             with self._changed:
                 seen = (self._link.up, len(run.expected), run.more)
                 self._changed.wait_for(
@@ -544,6 +544,7 @@ class _Running:
     scope: Scope = EVERY_ROBOT
     known: KnownRobots | None = None
     widened: bool = False
+    widened_at: float = float("-inf")
     inbox: dict[str, deque[Received]] = field(default_factory=dict)
     graded: Answers = field(default_factory=lambda: Answers({}, required=True, pressed_at=0.0))
     left: float | None = None
@@ -584,6 +585,15 @@ class _Running:
             self.scope.names(name, each.facts.get("cell")) and self.graded.shows(each)
             for name, each in self.graded.by_robot.items()
         )
+
+    def scope_is_sure(self, now: float) -> bool:
+        """Return True once it will not widen, or was repeated as a stop of every robot."""
+        return (self.widens_at == float("inf") or self.settled_scope) and now >= self.widened_at + WIDEN_S
+
+    def ends_at(self, deadline_s: float) -> float:
+        """Return the monotonic s of its deadline, with time to widen once it has left."""
+        left = self.started if self.scope.everything or self.left is None else self.left
+        return max(self.started + deadline_s, left + 2 * WIDEN_S * (not self.scope.everything))
 
     @property
     def complete(self) -> bool:

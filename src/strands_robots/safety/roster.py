@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety.identity import EnrolledKeys, EnrolledRobot, Exemption, of_tenant
 from strands_robots.safety.network_key import NetworkKey
+from strands_robots.safety.sighting_file import CROWDED
 from strands_robots.safety.sightings import Known, Sighting, Sightings, sightings, this_moment
 from strands_robots.safety.state_files import uptime
 from strands_robots.utils import field_values
@@ -129,6 +130,11 @@ class Roster:
         except (StrandsRobotsError, OSError) as exc:
             enrolled = {}
             problems.append(f"the enrolled robots cannot be read: {exc}")
+        roster = cls._at(_Memory((network,), tuple(found), enrolled, tuple(problems)))
+        if not roster.enrolled or CROWDED not in problems:
+            return roster
+        # The file forgets names that were heard; where robots are enrolled these do not count.
+        problems.remove(CROWDED)
         return cls._at(_Memory((network,), tuple(found), enrolled, tuple(problems)))
 
     @classmethod

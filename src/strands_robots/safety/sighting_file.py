@@ -31,7 +31,11 @@ logger = stop_logger(__name__)
 VERSION = 1
 BUSY_MS = 200
 ROWS_MAX = 4096
-"""Robots that were heard. Beyond it the stale are forgotten first, then the latest of those that never signed."""
+"""Robots that were heard. Beyond it the stale are forgotten first, then the latest, those that never signed first. A
+quarter is kept for the longest heard of these: keys cost nothing either."""
+
+CROWDED = "more robots were heard in the last ten minutes than sightings.db holds; some are missing"
+"""Problem of a reader where rows were forgotten that were not stale."""
 
 SERVED_MAX = 1024
 
@@ -55,6 +59,8 @@ CREATE TABLE IF NOT EXISTS served (
     UNIQUE (network, name, pid, started));
 CREATE TABLE IF NOT EXISTS lost (boot TEXT NOT NULL, uptime REAL NOT NULL, wall REAL NOT NULL);
 """
+
+_CROWDED = "CREATE TABLE IF NOT EXISTS crowded (boot TEXT NOT NULL, uptime REAL NOT NULL, wall REAL NOT NULL)"
 
 # The same boot by the clock since boot, another one by the wall clock.
 _STALE = "(CASE WHEN {row}.boot = {now_boot} THEN {now_uptime} - {row}.uptime ELSE {now_wall} - {row}.wall END > 600)"
@@ -83,10 +89,12 @@ ON CONFLICT (network, name, pid, started) DO UPDATE SET boot = excluded.boot, up
     wall = excluded.wall, cell = excluded.cell, signed_only = excluded.signed_only, ended = excluded.ended
 """
 
+_NOW_STALE = _STALE.format(row="heard", now_boot=":boot", now_uptime=":uptime", now_wall=":wall")
+
 _EVICT = f"""
 DELETE FROM heard WHERE id IN (
-    SELECT id FROM heard ORDER BY
-        {_STALE.format(row="heard", now_boot=":boot", now_uptime=":uptime", now_wall=":wall")} DESC,
+    SELECT id FROM heard ORDER BY {_NOW_STALE} DESC,
+        id IN (SELECT id FROM heard WHERE signed_boot IS NULL AND NOT {_NOW_STALE} ORDER BY id LIMIT :most / 4) ASC,
         (signed_boot IS NOT NULL) ASC, id DESC
     LIMIT max(0, (SELECT count(*) FROM heard) - :most))
 """
@@ -264,8 +272,11 @@ class SightingFile:
         self.path = directory / "sightings.db"
         self._root = directory
 
-    def write(self, notes: Sequence[Note], served: Sequence[Served], now: Moment) -> None:
+    def write(self, notes: Sequence[Note], served: Sequence[Served], now: Moment, *, crowded: bool = False) -> None:
         """Write these rows, and forget what is too much.
+
+        Args:
+            crowded: robots were heard that are not among the notes.
 
         Raises:
             SightingFileError: nothing was written.
@@ -276,6 +287,11 @@ class SightingFile:
             connection.executemany(_SERVE, [_served_row(each) for each in served])
             if notes:
                 facts = {"boot": now.boot, "uptime": now.uptime, "wall": now.wall, "most": ROWS_MAX}
+                fresh = connection.execute(f"SELECT count(*) FROM heard WHERE NOT {_NOW_STALE}", facts).fetchone()[0]
+                if crowded or fresh > ROWS_MAX:
+                    connection.execute(_CROWDED)
+                    connection.execute("DELETE FROM crowded")
+                    connection.execute("INSERT INTO crowded VALUES (?, ?, ?)", _moment_row(now))
                 connection.execute(_EVICT, facts)
             if served:
                 self._forget_served(connection, now)
@@ -298,6 +314,10 @@ class SightingFile:
                 (2 * ROWS_MAX,),
             ).fetchall()
             served = self._served(connection)
+            made = connection.execute("SELECT 1 FROM sqlite_master WHERE name = 'crowded'").fetchone()
+            crowded = connection.execute("SELECT boot, uptime, wall FROM crowded").fetchall() if made else []
+        if not problem and any(Moment(*row).age_s(now) < RECENT_S for row in crowded):
+            problem = CROWDED
         if any(each.age_s(now) < RECENT_S for each in lost):
             problem = (
                 "sightings.db was damaged and begun again less than ten minutes ago; robots heard before may be missing"

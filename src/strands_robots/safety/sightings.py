@@ -12,7 +12,7 @@ import atexit
 import os
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -22,7 +22,7 @@ from weakref import WeakSet
 from strands_robots.audit import log_safety_event
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety.approval import state_dir
-from strands_robots.safety.identity import EnrolledKeys, local_name
+from strands_robots.safety.identity import ROBOTS, EnrolledKeys, KeyFile, local_name, of_tenant
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.sighting_file import (
     RECENT_S,
@@ -102,6 +102,7 @@ class Sightings:
         self._lock = threading.Condition()
         self._noted: dict[tuple[NetworkKey, str], tuple[float, Facts]] = {}
         self._tidied = float("-inf")
+        self._crowded = False
         self._notes: dict[tuple[NetworkKey, str], Note] = {}
         self._answers: list[_Answer] = []
         self._own: dict[tuple[NetworkKey, str], Served] = {}
@@ -279,10 +280,12 @@ class Sightings:
         """Return True where a name has a place in memory; longest heard first."""
         if key not in self._noted and len(self._noted) >= ROWS_MAX:
             if now - self._tidied < AGAIN_S:
+                self._crowded = True
                 return False
             self._tidied = now
             self._noted = {each: noted for each, noted in self._noted.items() if now - noted[0] < RECENT_S}
             if len(self._noted) >= ROWS_MAX:
+                self._crowded = True
                 return False
         self._noted[key] = now, facts
         return True
@@ -357,9 +360,11 @@ class Sightings:
     ) -> str:
         """Write one batch; return the problem, or ""."""
         signed = [(each, key) for each in answers if (key := _key_of(each)) is not None]
-        all_notes = [*notes.values(), *(Note(each.network, each.name, each.at, each.at) for each, _ in signed)]
+        counted = self._counted(signed)
+        all_notes = [*notes.values(), *(Note(each.network, each.name, each.at, each.at) for each, _ in counted)]
+        crowded, self._crowded = self._crowded, False
         try:
-            self.file.write(all_notes, list(served.values()), self._clock())
+            self.file.write(all_notes, list(served.values()), self._clock(), crowded=crowded)
         except SightingFileError as exc:
             return str(exc)
         # Without a nonce of ours it may be an answer to somebody else.
@@ -370,6 +375,33 @@ class Sightings:
                 proven.append((network, name, public))
         self._heard_signed(proven)
         return ""
+
+    def _counted(self, signed: Collection[tuple[_Answer, bytes]]) -> list[tuple[_Answer, bytes]]:
+        """Return the answers that count as signed.
+
+        A key costs nothing. Where robots are enrolled for the network it must be one of theirs, or of this machine.
+        """
+        try:
+            enrolled = EnrolledKeys(self.directory).robots() if signed else {}
+        except (StrandsRobotsError, OSError):
+            return list(signed)  # the reader says so
+        keys = {each.key for each in enrolled.values()}
+
+        def counts(answer: _Answer, key: bytes) -> bool:
+            network = answer.network
+            known = of_tenant(enrolled, network.tenant).values()
+            here = (each for each in known if not each.networks or any(own.meets(network) for own in each.networks))
+            return key in keys or all(each.exemption for each in here) or key == self._key_here(network, answer.name)
+
+        return [(answer, key) for answer, key in signed if counts(answer, key)]
+
+    def _key_here(self, network: NetworkKey, name: str) -> bytes | None:
+        """Return the key of a robot of this machine."""
+        try:
+            identity = KeyFile(ROBOTS, local_name(network.tenant, name), self.directory).load()
+        except (StrandsRobotsError, OSError):
+            return None
+        return None if identity is None else identity.public
 
     def _heard_signed(self, proven: Iterable[tuple[NetworkKey, str, bytes]]) -> None:
         """End the exemption of enrolled robots that were heard, and keep their network."""
