@@ -68,7 +68,7 @@ class NetworkKey:
         return (self.kind, self.tenant) == (other.kind, other.tenant) and not set(self.where).isdisjoint(other.where)
 
     def may_be(self, other: NetworkKey) -> bool:
-        """False when both are surely different: another kind or tenant, or other ports of this machine."""
+        """False for another kind or tenant, or other ports of this machine."""
         if (self.kind, self.tenant) != (other.kind, other.tenant):
             return False
         return self.meets(other) or not all(each.startswith("127.0.0.1:") for each in (*self.where, *other.where))

@@ -183,7 +183,7 @@ class Roster:
 
     @property
     def perhaps_here(self) -> dict[str, Sighting]:
-        """Robots that living processes of this machine serve under an address that may be of this network."""
+        """Robots served by this machine under an address that may be of this network."""
         memory = self._memory
         if memory is None:
             return {}
