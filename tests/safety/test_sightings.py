@@ -536,6 +536,33 @@ def test_a_network_key_has_no_credentials() -> None:
 
 
 @pytest.mark.parametrize(
+    ("endpoints", "tenant"),
+    [
+        ([], "default"),
+        (["", " "], ""),
+        (["a:1"], "my fleet"),
+        (["a:1"], "50%20"),
+        ([f"{'h' * 250}-{n}:1" for n in range(40)], "t"),
+    ],
+    ids=["no endpoint", "empty ones", "a space in the tenant", "a percent sign", "a long list"],
+)
+def test_every_network_key_is_read_back_as_it_was_written(endpoints: list[str], tenant: str, store: Sightings) -> None:
+    key = NetworkKey.of(DEVICE_CONNECT, endpoints, tenant)
+    assert NetworkKey.parse(key.text) == key
+    store.note(key, "arm-1")
+    assert found(store)["arm-1"].network == key
+
+
+def test_rows_of_unreadable_networks_are_told_for_ten_minutes(store: Sightings, clock: Clock) -> None:
+    store.file.write([Note(NetworkKey("sea", ("a:1",)), "boat-1", clock()), Note(HERE, "arm-1", clock())], [], clock())
+    rows, problem = store.file.read(clock())
+    assert [each.name for each in rows] == ["arm-1"]
+    assert problem.startswith("1 robots in sightings.db are of networks")
+    clock.pass_(601.0)
+    assert store.file.read(clock()) == ([], "")
+
+
+@pytest.mark.parametrize(
     ("link", "where"),
     [
         (loopback_config(12345), ("127.0.0.1:12345",)),

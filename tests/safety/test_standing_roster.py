@@ -7,13 +7,14 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from fixtures.waiting import eventually
 
-from strands_robots.safety import standing_roster
+from strands_robots.safety import ed25519, standing_roster
 from strands_robots.safety.consoles import console_key
-from strands_robots.safety.estop_listener import ESTOP, VERDICT, notification
+from strands_robots.safety.estop_listener import ESTOP, VERDICT, FailureBudget, notification
 from strands_robots.safety.network_key import DEVICE_CONNECT, NetworkKey
-from strands_robots.safety.orders import new_epoch
+from strands_robots.safety.orders import new_epoch, signed_stop
 from strands_robots.safety.roster import Roster, RosterRow
 from strands_robots.safety.roster_inbox import RosterInbox
 from strands_robots.safety.roster_report import (
@@ -99,6 +100,46 @@ def test_flood_of_stops_is_followed_within_bounds(standing: Standing) -> None:
     assert len(standing.roster._pending) <= standing_roster.PENDING_MAX
     eventually(lambda: standing.reports)
     assert len(standing.roster._followed) <= standing_roster.SOURCES_MAX
+
+
+def test_made_up_sources_hold_only_half_of_the_places(standing: Standing) -> None:
+    roster = standing.roster
+    roster._names = frozenset({"desk-1"})
+    for n in range(40):
+        standing.stop(new_epoch(), f"made-up-{n}")
+    true = new_epoch()
+    standing.stop(true)
+    eventually(lambda: "desk-1" in roster._followed or (true in {each["estop_id"] for each in standing.reports}))
+    assert sum(not each.known for each in tuple(roster._followed.values())) <= standing_roster.SOURCES_MAX // 2
+    for n in range(40):
+        standing.stop(new_epoch(), f"another-{n}")
+    eventually(lambda: true in {each["estop_id"] for each in standing.reports})
+
+
+def test_forged_stops_are_checked_within_a_budget(monkeypatch: pytest.MonkeyPatch) -> None:
+    key = Ed25519PrivateKey.generate()
+    monkeypatch.setenv("DEVICE_CONNECT_ESTOP_PUBLIC_KEYS", ed25519.encode(ed25519.public_half(key)))
+    standing, checked = Standing("arm-1"), list[str]()
+    try:
+        real = standing.roster._rules.signature_refusal
+
+        def counted(source: str, *rest: Any) -> str | None:
+            checked.append(source)
+            return real(source, *rest)
+
+        monkeypatch.setattr(standing.roster._rules, "signature_refusal", counted)
+        standing.roster._failures = FailureBudget(per_s=2, in_all_per_s=3)
+        for n in range(40):
+            standing.stop(new_epoch(), f"made-up-{n}")
+        eventually(lambda: len(checked) == 3 and not standing.roster._pending)
+        standing.roster._signers["desk-1"] = None
+        fields = {"estop_id": new_epoch(), "nonce": new_epoch(), "t": 1.0}
+        stop = signed_stop(key, Purpose.EMERGENCY_STOP, "desk-1", fields)
+        standing.roster.hear(ESTOP, "desk-1", notification(ESTOP, stop))
+        eventually(lambda: standing.reports)
+        assert standing.reports[0]["estop_id"] == fields["estop_id"]
+    finally:
+        standing.roster.close()
 
 
 def test_report_is_bounded_and_the_surest_come_first() -> None:

@@ -56,6 +56,28 @@ def serve(name: str, pid: int, network: NetworkKey = NETWORK) -> str:
     return row.run
 
 
+@pytest.mark.parametrize(
+    ("network", "unsure"),
+    [
+        (OTHER_NAME, True),
+        (NetworkKey.of(DEVICE_CONNECT, ["tcp/127.0.0.1:7448"]), False),
+        (NetworkKey.of(DEVICE_CONNECT, ["tcp/router:7447"], "fleet"), False),
+        (NetworkKey.of(MESH, ["tcp/router:7447"]), False),
+    ],
+    ids=lambda each: each.text if isinstance(each, NetworkKey) else "",
+)
+def test_robot_served_under_an_address_that_may_be_this_network_hides_behind_no_green(
+    network: NetworkKey, unsure: bool
+) -> None:
+    serve("arm-2", os.getppid(), network)
+    one = outcome(VERDICT)
+    assert one.ok is not unsure
+    assert [each.startswith("arm-2: ") for each in one.problems] == [True] * unsure
+    roster = StopRoster(NETWORK, scope=Scope.named(["arm-1"]))
+    roster.read()
+    assert outcome(VERDICT, roster=roster).ok
+
+
 @pytest.fixture
 def served() -> None:
     sightings().serve(NETWORK, "arm-1")
@@ -159,8 +181,10 @@ def test_robot_whose_process_is_served_under_another_address_brings_the_robots_o
     sightings().serve(OTHER_NAME, "arm-2")
     one = outcome(answered(run=run))
     assert (one.ok, one.report.silent) == (False, ("arm-2",))
-    # Another process of that name may be on another network.
-    assert outcome(answered(run="f" * 16)).ok
+    # Another process of that name may be on another network, or on this one.
+    other = outcome(answered(run="f" * 16))
+    assert (other.ok, other.report.silent) == (False, ())
+    assert other.problems[0].startswith("arm-1, arm-2: served by this machine under another address")
 
 
 @pytest.mark.parametrize("other", [NetworkKey.of(MESH, ["tcp/router:7447"]), OTHER_NAME])

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterable
 from dataclasses import dataclass
+from urllib.parse import quote, unquote
 
 from strands_robots.utils import ValidationError
 
@@ -12,6 +14,9 @@ KINDS = (DEVICE_CONNECT, MESH)
 
 ENDPOINTS_MAX = 64
 TEXT_MAX = 4096
+NOWHERE = "nowhere"
+PLAIN = "/:@!$&'()*+,;=[]"
+"""Characters of a tenant that stand in a file as they are, besides letters, digits and ``_.-~``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,8 +35,15 @@ class NetworkKey:
 
     @classmethod
     def of(cls, kind: str, endpoints: Iterable[str], tenant: str = "default") -> NetworkKey:
-        """Return the key for these endpoints, which may be written in several ways."""
-        return cls(kind, tuple(sorted({_plain(each) for each in endpoints}))[:ENDPOINTS_MAX], tenant)
+        """Return the key for these endpoints, which may be written in several ways.
+
+        Without an endpoint it is :data:`NOWHERE`; a list that is too long for a file becomes its hash.
+        """
+        where = tuple(sorted({_plain(each) for each in endpoints} - {""})) or (NOWHERE,)
+        key = cls(kind, where[:ENDPOINTS_MAX], tenant or "default")
+        if len(key.text) <= TEXT_MAX:
+            return key
+        return cls(kind, (f"sha256-{hashlib.sha256(','.join(where).encode()).hexdigest()}",), key.tenant)
 
     @classmethod
     def parse(cls, text: str) -> NetworkKey:
@@ -44,16 +56,22 @@ class NetworkKey:
         tenant, _, where = rest.partition(" ")
         if len(text) > TEXT_MAX or kind not in KINDS or not tenant or not where:
             raise ValidationError(f"network must be kind, tenant and endpoints, not {text[:80]!r}.")
-        return cls(kind, tuple(where.split(",")), tenant)
+        return cls(kind, tuple(where.split(",")), unquote(tenant))
 
     @property
     def text(self) -> str:
         """The key in one line, for a file."""
-        return f"{self.kind} {self.tenant} {','.join(self.where)}"
+        return f"{self.kind} {quote(self.tenant, safe=PLAIN)} {','.join(self.where)}"
 
     def meets(self, other: NetworkKey) -> bool:
         """True when both have one kind and tenant, and a common endpoint."""
         return (self.kind, self.tenant) == (other.kind, other.tenant) and not set(self.where).isdisjoint(other.where)
+
+    def may_be(self, other: NetworkKey) -> bool:
+        """False for another kind or tenant, or other ports of this machine."""
+        if (self.kind, self.tenant) != (other.kind, other.tenant):
+            return False
+        return self.meets(other) or not all(each.startswith("127.0.0.1:") for each in (*self.where, *other.where))
 
 
 def _plain(endpoint: str) -> str:

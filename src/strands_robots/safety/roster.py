@@ -181,6 +181,18 @@ class Roster:
             return frozenset()
         return frozenset(each.name for each in memory.found if each.alive and not memory.here(each))
 
+    @property
+    def perhaps_here(self) -> dict[str, Sighting]:
+        """Robots served by this machine under an address that may be of this network."""
+        memory = self._memory
+        if memory is None:
+            return {}
+        return {
+            each.name: each
+            for each in memory.found
+            if each.alive and not memory.here(each) and all(own.may_be(each.network) for own in memory.networks)
+        }
+
     def with_answers(self, proven: Mapping[str, Collection[str]]) -> Roster:
         """Return the roster with the robots of networks that are this one.
 

@@ -316,6 +316,13 @@ class SightingFile:
             served = self._served(connection)
             made = connection.execute("SELECT 1 FROM sqlite_master WHERE name = 'crowded'").fetchone()
             crowded = connection.execute("SELECT boot, uptime, wall FROM crowded").fetchall() if made else []
+            networks = connection.execute(
+                "SELECT network, boot, uptime, wall FROM heard UNION ALL"
+                " SELECT network, boot, uptime, wall FROM served WHERE NOT ended"
+            ).fetchmany(2 * (ROWS_MAX + SERVED_MAX))
+        unread = sum(_network(str(row[0])) is None and _moment(*row[1:]).age_s(now) < RECENT_S for row in networks)
+        if unread and not problem:
+            problem = f"{unread} robots in sightings.db are of networks that this release cannot read"
         if not problem and any(Moment(*row).age_s(now) < RECENT_S for row in crowded):
             problem = CROWDED
         if any(each.age_s(now) < RECENT_S for each in lost):
@@ -343,8 +350,8 @@ class SightingFile:
         )
         found = []
         for network, name, pid, started, since_boot, since, wall, cell, signed_only, ended in rows:
-            with contextlib.suppress(ValidationError):  # of a later release
-                key, at = NetworkKey.parse(network), Moment(since_boot, since, wall)
+            key, at = _network(network), Moment(since_boot, since, wall)
+            if key is not None:
                 found.append(Served(key, name, pid, started, at, cell, bool(signed_only), bool(ended)))
         return found
 
@@ -512,9 +519,8 @@ def _united(heard: Sequence[tuple[object, ...]], served: Sequence[Served], now: 
 
 def _sighting(row: tuple[object, ...], now: Moment) -> Sighting | None:
     network, name, *rest = row
-    try:
-        key = NetworkKey.parse(str(network))
-    except ValidationError:  # of a later release
+    key = _network(str(network))
+    if key is None:
         return None
     since_boot, since, wall, signed_boot, signed_since, signed_wall, cell, signed_only, stoppable, departed, order = (
         rest
@@ -531,6 +537,15 @@ def _sighting(row: tuple[object, ...], now: Moment) -> Sighting | None:
         None if stoppable is None else bool(stoppable),
         bool(departed),
     )
+
+
+@lru_cache(maxsize=64)
+def _network(text: str) -> NetworkKey | None:
+    """Return a network key, None for one that cannot be read, as of a later release."""
+    try:
+        return NetworkKey.parse(text)
+    except ValidationError:
+        return None
 
 
 def _moment(since_boot: object, since: object, wall: object) -> Moment:

@@ -13,7 +13,7 @@ from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety import ed25519
 from strands_robots.safety.answers import ANSWERS_MAX, Answers, Received
 from strands_robots.safety.consoles import console_key
-from strands_robots.safety.estop_listener import ESTOP
+from strands_robots.safety.estop_listener import ESTOP, FailureBudget
 from strands_robots.safety.identity import SigningIdentity
 from strands_robots.safety.orders import StopRules, params_of, stated_epoch
 from strands_robots.safety.roster import Roster, RosterRow
@@ -33,7 +33,8 @@ SPREAD_S = 0.06
 """Longest random delay of a report, so that many controllers do not send at once."""
 
 SOURCES_MAX = 16
-"""Controllers of which a stop is followed at a time, one of each."""
+"""Controllers of which a stop is followed at a time, one of each. Half of the places are for those whose signature is
+valid, or that the roster knows; a new stop takes the place of any."""
 
 PENDING_MAX = 64
 STOP_MAX_BYTES = 16 * 2**10
@@ -62,6 +63,7 @@ class _Followed:
     estop_id: str
     due: list[float]
     scope: Scope = EVERY_ROBOT
+    known: bool = False
     last: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -104,6 +106,9 @@ class StandingRoster:
         self._done: dict[tuple[str, Scope], None] = {}
         self._wake, self._closed = threading.Event(), False
         self._rules = StopRules(allow=())
+        self._failures, self._signers_failures = FailureBudget(), FailureBudget()
+        self._signers: dict[str, None] = {}
+        self._names: frozenset[str] = frozenset()
         self._thread = threading.Thread(target=self._run, name="standing roster", daemon=True)
         self._thread.start()
 
@@ -157,16 +162,39 @@ class StandingRoster:
             estop_id = stated_epoch(source, params)
             last = self._followed.get(source)
             # A stop of some robots may be widened to one of all, under its id.
+            if not estop_id or (estop_id, Scope.read(params.get(SCOPE))) in self._done:
+                continue
+            # What strangers send uses up nothing of those that signed before.
+            budget = self._signers_failures if source in self._signers else self._failures
+            if self._rules.signed and not budget.allows(source, now):
+                continue
+            if self._rules.signature_refusal(source, params, Purpose.EMERGENCY_STOP) is not None:
+                budget.record(source, now)
+                continue
             scope = self._rules.scope(source, params) if SCOPE in params else EVERY_ROBOT
             mark = (estop_id, scope)
-            if not estop_id or mark in self._done or (last is not None and (last.estop_id, last.scope) == mark):
+            if mark in self._done or (last is not None and (last.estop_id, last.scope) == mark):
+                budget.record(source, now)  # replayed with another scope
                 continue
-            if last is None and len(self._followed) >= SOURCES_MAX:
-                continue
-            if self._rules.signature_refusal(source, params, Purpose.EMERGENCY_STOP) is None:
-                self._note_done(mark)
-                spread = random.random() * SPREAD_S
-                self._followed[source] = _Followed(estop_id, [now + at + spread for at in REPORT_AT_S], scope)
+            if self._rules.signed:
+                self._signers[source] = None
+                while len(self._signers) > PENDING_MAX:
+                    del self._signers[next(iter(self._signers))]
+            known = self._rules.signed or source in self._names
+            if last is None:
+                self._make_place(known)
+            self._note_done(mark)
+            spread = random.random() * SPREAD_S
+            self._followed[source] = _Followed(estop_id, [now + at + spread for at in REPORT_AT_S], scope, known)
+
+    def _make_place(self, known: bool) -> None:
+        """Give up a stop at random where no place is left."""
+        strangers = [source for source, each in self._followed.items() if not each.known]
+        full = len(self._followed) >= SOURCES_MAX or (not known and len(strangers) >= SOURCES_MAX // 2)
+        if full:
+            lost = self._followed.pop(random.choice(strangers or tuple(self._followed)))
+            # It is repeated, and followed again.
+            self._done.pop((lost.estop_id, lost.scope), None)
 
     def _note_done(self, mark: tuple[str, Scope]) -> None:
         self._done[mark] = None
@@ -179,6 +207,7 @@ class StandingRoster:
         if not due:
             return
         roster, keys, identity = self._roster(), self._keys(), self._identity()
+        self._names = frozenset(row.name for row in roster.rows if row.known is not Known.HEARD)
         for source in due:
             followed = self._followed[source]
             while followed.due and followed.due[0] <= now:

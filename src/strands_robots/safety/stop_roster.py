@@ -15,7 +15,7 @@ from strands_robots.safety.network_key import DEVICE_CONNECT, NetworkKey
 from strands_robots.safety.roster import Roster, RosterRow
 from strands_robots.safety.roster_report import RosterReport
 from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope
-from strands_robots.safety.sightings import Known, sightings
+from strands_robots.safety.sightings import Known, Sighting, sightings
 from strands_robots.safety.silence import Sending, reason_of
 from strands_robots.safety.state_files import uptime
 from strands_robots.safety.statements import Proof, Purpose, proof_of
@@ -238,6 +238,7 @@ class StopRoster:
                 for each in self._trusted.values()
                 if each.more
             ]
+        problems += self._unsure(roster, report)
         rows = {row.name: row for row in roster.rows}
         report, divided = self._proven(report, rows)
         must = {row.name for row in roster.rows if counts(roster, row)} | report.alarms.keys()
@@ -251,6 +252,23 @@ class StopRoster:
             if name in rows
         } | {name: why for name, why in divided.items() if name in counted.silent}
         return StopOutcome(counted, others, roster, no_stop, unproven, reasons, tuple(problems), sending)
+
+    def _unsure(self, roster: Roster, report: StopReport) -> list[str]:
+        """Return a sentence on robots of this machine that may be on this network."""
+        answered = report.answered
+        unsure = sorted(
+            name
+            for name, each in roster.perhaps_here.items()
+            if (name not in answered or self._unanswered(each, answered[name]))
+            and self.scope.covers(name, {each.cell} - {""})
+        )
+        if not unsure:
+            return []
+        more = f" and {len(unsure) - NAMED_MAX} more" if len(unsure) > NAMED_MAX else ""
+        return [
+            f"{', '.join(unsure[:NAMED_MAX])}{more}: served by this machine under another address, which may be of this"
+            " network, and gave no answer"
+        ]
 
     def _proven(self, report: StopReport, rows: Mapping[str, RosterRow]) -> tuple[StopReport, dict[str, str]]:
         """Return the report without what proves nothing of robots that are served here.
@@ -273,7 +291,7 @@ class StopRoster:
         self._divided = why
         return replace(report, stopped=stopped, claimed=claimed), why
 
-    def _unanswered(self, row: RosterRow, answer: Answer) -> list[int]:
+    def _unanswered(self, row: RosterRow | Sighting, answer: Answer) -> list[int]:
         """Return the processes of a robot that gave no answer of their own."""
         runs = self._proven_runs(row.name, answer)
         # An earlier release states no process: its answer is that of the only one.
