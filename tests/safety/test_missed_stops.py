@@ -369,6 +369,19 @@ def test_stranger_who_answers_first_hides_nothing_and_locks_nothing(
     assert away.epochs() == (epoch,)
 
 
+@pytest.mark.parametrize("signed", [True, False])
+def test_false_age_of_a_true_original_hides_no_later_answer(
+    bus: StopBus, join: Join, signed_only: Callable[[], StopRules], estop_key: Ed25519PrivateKey, signed: bool
+) -> None:
+    options: dict[str, Any] = {"rules": signed_only} if signed else {}
+    _, away, epoch = locked_and_cut_off(bus, join, key=estop_key if signed else None, **options)
+    source, payload = bus.of(ESTOP)[0]
+    answer_first(bus, forged([row(source, payload, 1e6)]), forged([row(source, payload, 5e5)]))
+    away.link.change(True)
+    eventually(away.epochs)
+    assert away.epochs() == (epoch,)
+
+
 def test_recorded_stop_that_was_resumed_locks_nobody_again(
     bus: StopBus, join: Join, operator: Ed25519PrivateKey, estop_key: Ed25519PrivateKey,
     signed_only: Callable[[], StopRules],

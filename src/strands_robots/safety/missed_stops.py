@@ -330,7 +330,8 @@ class MissedStops:
         self._reasons: deque[str] = deque(maxlen=8)
         self._questions: deque[tuple[str, bytes]] = deque(maxlen=QUESTIONS_MAX)
         self._answers = AnswerQueue()
-        self._judged: set[bytes] = set()
+        # The smallest age that a stop was judged with; -inf: no age makes it count.
+        self._judged: dict[bytes, float] = {}
         self._own = ""
         self._linked = False
         self._audited = float("-inf")
@@ -468,11 +469,13 @@ class MissedStops:
         refused = 0
         for each in rows:
             digest = hashlib.sha256(each.source.encode("utf-8", "replace") + b"\0" + each.payload).digest()
-            if digest in self._judged:
+            # Whoever passes on a stop states its age: a false one must not hide the true one.
+            if each.age_s >= self._judged.get(digest, float("inf")):
                 continue
-            if len(self._judged) < JUDGED_MAX:
-                self._judged.add(digest)
-            if not self._port.learn(each.source, each.payload, each.age_s, answerer):
+            counts = self._port.learn(each.source, each.payload, each.age_s, answerer)
+            if digest in self._judged or len(self._judged) < JUDGED_MAX:
+                self._judged[digest] = each.age_s if counts else float("-inf")
+            if not counts:
                 refused += 1
                 if refused >= REFUSED_MAX:
                     logger.info("An answer of %s is not read on: its stops do not count.", shown(answerer))
