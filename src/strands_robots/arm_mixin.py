@@ -24,7 +24,7 @@ from strands_robots.utils import ValidationError, choice, identifier, missing_ex
 
 if TYPE_CHECKING:  # numpy and MuJoCo are loaded with the first motion
     from strands_robots.kinematics.arm import Arm, ArmState
-    from strands_robots.kinematics.detector import ObjectDetector
+    from strands_robots.kinematics.detector import Asking, ObjectDetector
     from strands_robots.kinematics.motion import Motion
     from strands_robots.kinematics.moves import Start
     from strands_robots.kinematics.objects import Held, SeenObject
@@ -39,6 +39,9 @@ FRESH_S = 0.02
 
 PLAN_S = 2.0
 """Longest search for a way around objects."""
+
+LOOK_S = 2.0
+"""Longest wait for the answer of a detector."""
 
 HOME = "home"
 """Place that every arm has: the home pose of its model."""
@@ -68,14 +71,19 @@ class ArmTask:
 
     @property
     def running(self) -> bool:
-        """True until the motion has ended and its end was looked at."""
-        return self.rollout.running or (self.sight is not None and not self.looked.is_set())
+        """True until the motion has ended; a look at its end does not count."""
+        return self.rollout.running
+
+    @property
+    def unseen(self) -> bool:
+        """True while the end of a completed motion is looked at."""
+        return self.rollout.state == "completed" and self.sight is not None and not self.looked.is_set()
 
     def join(self, seconds: float) -> None:
         """Wait for the end and the look at it."""
         until = time.monotonic() + seconds
         self.rollout.join(seconds)
-        if self.sight is not None:
+        if self.unseen:
             self.looked.wait(max(0.0, until - time.monotonic()))
 
 
@@ -270,7 +278,7 @@ class ArmMixin:
                 "size": [round(float(value), 4) for value in each.size],
                 "fixed": each.fixed,
             }
-            for each in self.objects(robot_name)
+            for each in self._objects_in_time(robot_name)
         }
         return success(f"{len(rows)} objects: {', '.join(rows) or 'none'}.", objects=rows, frame="base")
 
@@ -295,7 +303,7 @@ class ArmMixin:
 
         body, seen = self.body(robot_name), self._seen(robot_name, "pick")
         if object:
-            target = _of_name(object, self.objects(body.name) if seen is None else seen)
+            target = _of_name(object, self._objects_in_time(body.name) if seen is None else seen)
             sight.require_uncovered(target, seen or ())
         elif x is None or y is None or z is None:
             raise ValidationError("pick needs object, or x, y and z.")
@@ -342,7 +350,7 @@ class ArmMixin:
                 f"{body.name} was stopped, so what it holds is not known; setGripper with opening 0 tells."
             )
         if on:
-            under = _of_name(on, self.objects(body.name) if seen is None else seen)
+            under = _of_name(on, self._objects_in_time(body.name) if seen is None else seen)
             position = under.position + _vector(0.0, 0.0, float(under.size[2]) / 2)
         elif x is None or y is None:
             raise ValidationError("place needs on, or x and y.")
@@ -461,14 +469,27 @@ class ArmMixin:
     def _seen(self, robot_name: str, verb: str) -> list[SeenObject] | None:
         """Return the objects before a motion; None where they are not looked for."""
         asked = self.knows_objects or (self.detector is not None and verb in ("pick", "place"))
-        return self.objects(robot_name) if asked else None
+        return self._objects_in_time(robot_name) if asked else None
+
+    def _objects_in_time(self, robot_name: str) -> list[SeenObject]:
+        """Return the objects; a detector has :data:`LOOK_S` to answer."""
+        if self.knows_objects or self.detector is None:
+            return self.objects(robot_name)
+        return self._asking.within(partial(self.objects, robot_name), LOOK_S)
+
+    @cached_property
+    def _asking(self) -> Asking:
+        from strands_robots.kinematics.detector import Asking  # noqa: PLC0415 - numpy, with the first motion
+
+        return Asking()
 
     def _look(self, task: ArmTask, sight: Sight) -> None:
-        """Wait for the end of a motion, then look at the objects."""
+        """Wait for the end of a motion, then look at the objects unless it was stopped."""
         task.rollout.join()
         try:
-            sight.after = self.objects(task.rollout.robot)
-        except ValidationError as exc:
+            if self.knows_objects or task.rollout.state == "completed":
+                sight.after = self._objects_in_time(task.rollout.robot)
+        except Exception as exc:  # noqa: BLE001 - an end that cannot be seen is an end all the same
             logger.warning("The objects after %s of %s are not known: %s", task.task_id, task.rollout.robot, exc)
         finally:
             task.looked.set()
@@ -493,7 +514,10 @@ class ArmMixin:
         arm = arm.whole() if whole else arm
         seen: Sequence[SeenObject] = () if sight is None else sight.before
         if sight is None and (self.knows_objects or (around and self.detector is not None)):
-            seen = self.objects(robot_name)
+            try:
+                seen = self._objects_in_time(robot_name)
+            except ValidationError as exc:
+                raise ValidationError(f"{str(exc).rstrip('.')}; around=false moves without it.") from exc
             sight = Sight(seen) if self.knows_objects else None
         planned: list[Motion] = []
 
@@ -531,7 +555,7 @@ class ArmMixin:
         """Return what was asked, what was reached, and why the motion ended."""
         if not task.rollout.running and task.sight is not None and self.knows_objects and not task.looked.is_set():
             self._look(task, task.sight)
-        if task.running:
+        if task.running or task.unseen:
             return self._measured(task, running=True)
         if task.outcome is None:
             task.outcome = self._measured(task, running=False)

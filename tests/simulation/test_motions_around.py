@@ -87,3 +87,62 @@ def test_carried_object_goes_around_as_well(world: Simulation) -> None:
     placed = world.place(0.2, 0.12, speed=1.0)
     assert placed["status"] == "success", placed
     assert "post" not in placed["moved"]
+
+
+@pytest.mark.parametrize("distance", [0.044, 0.0425])
+def test_object_within_the_clearance_is_gone_around_and_not_pushed(world: Simulation, distance: float) -> None:
+    assert world.move_to(0.25, -0.1, 0.05, speed=1.0)["status"] == "success"
+    x, y, _ = world.tip_position("arm")
+    pan = world.arm_pose()["joints"]["shoulder_pan"]
+    world.add_object("post", "box", (0.01, 0.01, 0.06), (x, y + distance, 0.06))
+    answer = world.move_joints({"shoulder_pan": -pan}, speed=1.0)
+    assert "touches the post" in answer.get("reason", "") or answer["moved"] == {}, answer
+
+
+class Eyes(Simulation):
+    """A world whose objects are those of a detector, which can hang."""
+
+    knows_objects = False
+    detector: Any = object()
+    hangs = False
+    asked = 0
+
+    def objects(self, robot_name: str = "") -> list[Any]:
+        self.asked += 1
+        if self.hangs:
+            self.going_on.wait(30.0)
+        return super().objects(robot_name)
+
+
+@pytest.fixture
+def eyes(monkeypatch: pytest.MonkeyPatch) -> Iterator[Eyes]:
+    monkeypatch.setattr("strands_robots.arm_mixin.LOOK_S", 0.3)
+    simulation = Eyes()
+    simulation.going_on = threading.Event()
+    simulation.add_robot("arm", "so101")
+    simulation.add_object("cube", "box", (0.0125,) * 3, (0.25, -0.05, 0.0125))
+    yield simulation
+    simulation.going_on.set()
+    simulation.cleanup()
+
+
+def test_stopped_motion_is_over_at_once_and_is_not_looked_at(eyes: Eyes) -> None:
+    started = eyes.pick("cube", speed=0.2, wait=False)
+    eyes.hangs, asked = True, eyes.asked
+    assert eyes.halt("test").stopped
+    assert eyes.wait_for(started["task_id"], 5.0)["task_status"] == "stopped"
+    assert eyes.asked == asked
+
+
+def test_end_that_a_detector_does_not_answer_for_is_told_after_its_deadline(eyes: Eyes) -> None:
+    started = eyes.pick("cube", speed=1.0, wait=False)
+    eyes.hangs = True
+    assert eyes.wait_for(started["task_id"], 20.0)["task_status"] == "completed"
+
+
+def test_detector_that_hangs_refuses_a_motion_and_names_the_way_without_it(eyes: Eyes) -> None:
+    eyes.hangs = True
+    for _ in range(2):
+        assert "the detector gave no answer" in (reason := eyes.move_by(dz=0.01)["reason"])
+        assert "around=false" in reason
+    assert eyes.move_by(dz=0.01, around=False, speed=1.0)["status"] == "success"

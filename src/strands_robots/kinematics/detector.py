@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import threading
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -33,6 +34,43 @@ class ObjectDetector(Protocol):
         Args:
             frames: pictures by camera, height x width x 3 of uint8 RGB, each taken when it is read.
         """
+
+
+class Asking:
+    """One question to a detector at a time, each with a deadline."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+
+    def within(self, ask: Callable[[], list[SeenObject]], seconds: float) -> list[SeenObject]:
+        """Return what ``ask`` returns, which goes on in a thread of its own if it hangs.
+
+        Raises:
+            ValidationError: it refused, failed, gave no answer in time, or still hangs.
+        """
+        if not self._lock.acquire(timeout=seconds):
+            raise ValidationError(f"the detector gave no answer within {seconds:g} s to an earlier question.")
+        answers: list[list[SeenObject] | Exception] = []
+        done = threading.Event()
+
+        def run() -> None:
+            try:
+                answers.append(ask())
+            except Exception as exc:  # noqa: BLE001 - told by the caller
+                answers.append(exc)
+            finally:
+                self._lock.release()
+                done.set()
+
+        threading.Thread(target=run, name="detector", daemon=True).start()
+        if not done.wait(seconds):
+            raise ValidationError(f"the detector gave no answer within {seconds:g} s.")
+        answer = answers[0]
+        if isinstance(answer, ValidationError):
+            raise answer
+        if isinstance(answer, Exception):
+            raise ValidationError(f"the detector failed: {type(answer).__name__}: {answer}") from answer
+        return answer
 
 
 def detected(detector: ObjectDetector, frames: Mapping[str, Any]) -> list[SeenObject]:

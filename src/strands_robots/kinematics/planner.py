@@ -13,8 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from strands_robots.kinematics.chain import ArmJoint, Chain, Floats
-from strands_robots.kinematics.contacts import ContactCheck, new_contact
+from strands_robots.kinematics.contacts import DEEPER_M, ContactCheck, new_contact
 from strands_robots.kinematics.inverse import TipGoal, nearest, solve
+from strands_robots.kinematics.obstacles import CLEARANCE_M
 from strands_robots.kinematics.rrt import path_around
 from strands_robots.safety.turns import shorten_turns
 from strands_robots.utils import ValidationError
@@ -56,9 +57,11 @@ class Planner:
         self._going = going
         self.start = np.clip(start, chain.lows, chain.highs)
         self._check = ContactCheck(chain, gripper)
-        # An object that the arm touches already, as one between its jaws, is none to go around.
+        # Objects are larger by the clearance: one that is only within it may be neared, but not touched.
         self._touching = {
-            pair: np.inf if self._check.objects & set(pair) else depth
+            pair: min(depth, CLEARANCE_M - DEEPER_M)
+            if self._check.objects & set(pair) and depth <= CLEARANCE_M
+            else depth
             for pair, depth in self._check.at(self.start).items()
         }
 
@@ -149,7 +152,8 @@ class Planner:
                 return legs
         around = self._around(begin, goal)
         if around is None:
-            raise ValidationError(f"the way there is blocked: {problem}.")
+            late = "" if self._going() else "; the search around it was over its time"
+            raise ValidationError(f"the way there is blocked: {problem}{late}.")
         return around
 
     def _around(self, begin: Floats, goal: Floats) -> list[Floats] | None:
