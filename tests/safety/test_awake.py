@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import linecache
+import sys
 import threading
 import time
+from types import FrameType
+from typing import Any
 
 import pytest
 from fixtures.waiting import eventually
@@ -80,6 +84,41 @@ def test_clock_that_nothing_watches_holds_nothing(hands: Hands) -> None:
     end()
     hands.now += 10.0
     assert not gate.held
+
+
+def test_look_that_meets_the_end_of_the_last_watcher_holds_nothing_afterwards(
+    hands: Hands, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "BEAT_S", 3600.0)
+    clock = AwakeClock(hands)
+    ends = [clock.watch(lambda: None)]
+
+    def end_before_the_mark(frame: FrameType, event: str, _: object) -> Any:
+        if frame.f_code is not AwakeClock.look.__code__:
+            return None
+        if (
+            event == "line"
+            and ends
+            and linecache.getline(module.__file__, frame.f_lineno).strip() == "self._last = now"
+        ):
+            ends.pop()()
+        return end_before_the_mark
+
+    hands.now += 0.1
+    tracing = sys.gettrace()
+    sys.settrace(end_before_the_mark)
+    try:
+        clock.look()
+    finally:
+        sys.settrace(tracing)
+    assert not ends
+    for _ in range(5):
+        hands.now += 10.0
+        assert not clock.held_at(clock.look())
+    assert clock.pauses == 0
+    end = clock.watch(lambda: None)
+    assert not clock.held_at(clock.look())
+    end()
 
 
 def test_stale_look_of_a_thread_that_was_held_up_makes_no_second_pause(clock: AwakeClock, hands: Hands) -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 import random
+import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -502,6 +504,27 @@ def test_flood_of_questions_gets_a_bounded_number_of_answers(bus: StopBus, join:
     assert len(bus.of(ANSWER)) <= 2 + (time.monotonic() - started) / missed_stops.ANSWER_EVERY_S
 
 
+def test_question_that_cannot_be_answered_is_dropped_and_the_next_one_answered(
+    bus: StopBus, join: Join, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, away, epoch = locked_and_cut_off(bus, join)
+    tries, take = list[float](), AnswerSlots.take
+
+    def fail(*_: Any) -> Any:
+        tries.append(time.monotonic())
+        raise RuntimeError("a step that fails")
+
+    monkeypatch.setattr(AnswerSlots, "take", fail)
+    away.link.change(True)
+    eventually(lambda: tries)
+    time.sleep(SETTLED_S)
+    assert len(tries) == 1
+    monkeypatch.setattr(AnswerSlots, "take", take)
+    away.listener.awake()
+    eventually(away.epochs)
+    assert away.epochs() == (epoch,)
+
+
 def test_answerers_with_known_keys_fall_silent_once_three_have_answered(bus: StopBus, join: Join) -> None:
     many = [join(f"there-{number}") for number in range(20)]
     away = join("away")
@@ -576,6 +599,29 @@ def test_originals_are_bounded_and_forgotten_with_their_lockout() -> None:
     assert originals.of(frozenset(epochs), "other") == []
     originals.keep(frozenset())
     assert originals.of(frozenset(epochs)) == []
+
+
+def test_original_is_looked_for_while_other_threads_add_and_keep() -> None:
+    originals, over = Originals(), threading.Event()
+    interval = sys.getswitchinterval()
+
+    def change() -> None:
+        while not over.is_set():
+            originals.add(Original(new_epoch(), "safety-1", b"x", "n", 0.0))
+            originals.keep(["none"])
+
+    threads = [threading.Thread(target=change) for _ in range(2)]
+    sys.setswitchinterval(1e-5)
+    try:
+        for each in threads:
+            each.start()
+        for _ in range(20_000):
+            assert not originals.has("another", "n")
+    finally:
+        over.set()
+        for each in threads:
+            each.join()
+        sys.setswitchinterval(interval)
 
 
 def test_controller_answers_with_its_stop_until_all_who_must_answer_have(bus: StopBus, join: Join) -> None:

@@ -49,19 +49,26 @@ class AwakeClock:
         return self._pauses
 
     def look(self) -> float:
-        """Return the present moment, in s of the clock; hold the motions after a pause."""
+        """Return the present moment, in s of the clock; hold the motions after a pause.
+
+        Where nothing watches it changes nothing.
+        """
+        # Read first: the last watcher may end meanwhile, and no thread looks after that.
+        over = self._over
         now, last = self._clock(), self._last
+        if over is None:
+            return now
         if now - last >= PAUSE_S:
             # Before the mark below: whoever finds a fresh mark also finds the hold.
             self._held_until = now + HOLD_S
             self._pauses += 1
-        if now > last and self._over is not None:
+        if now > last:
             self._last = now
         return now
 
     def held_at(self, moment: float) -> bool:
-        """Return True while every motion of the process holds."""
-        return moment < self._held_until
+        """Return True while every motion of the process holds; never where nothing watches."""
+        return self._over is not None and moment < self._held_until
 
     def watch(self, woke: Callable[[], None]) -> Callable[[], None]:
         """Call ``woke`` after each pause, on a thread of this clock; return its end.

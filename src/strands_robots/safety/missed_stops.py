@@ -83,6 +83,9 @@ BUCKET_CAPACITY = 2
 REFUSED_MAX = 4
 """Stops of one answer that do not count, after which the rest of it is not read."""
 
+RETRY_S = 0.1
+"""Wait after a step that failed."""
+
 JUDGED_MAX = 4096
 AUDIT_EVERY_S = 10.0
 
@@ -401,6 +404,10 @@ class MissedStops:
                 self.step()
             except Exception:
                 logger.critical("A question for missed stops failed.", exc_info=True)
+                # What could not be answered is not due for ever; our own question is tried again.
+                self._questions.clear()
+                self._answerer.take((), self._clock())
+                time.sleep(RETRY_S)
 
     def step(self) -> None:
         """Do what is due now; the thread does so whenever something is."""

@@ -107,9 +107,12 @@ class Originals:
 
     def has(self, epoch: str, network: str) -> bool:
         """Return True where this stop is kept, or is about to be."""
-        return (network, epoch) in self._stored or any(
-            (each.network, each.epoch) == (network, epoch) for each in self._new
-        )
+        try:
+            new = tuple(self._new)
+        except RuntimeError:
+            # A collection of garbage let other threads run during the copy. To add one twice is no harm.
+            new = ()
+        return (network, epoch) in self._stored or any((each.network, each.epoch) == (network, epoch) for each in new)
 
     def of(self, epochs: Collection[str], network: str | None = None) -> list[Original]:
         """Return those of these epochs, oldest first."""
