@@ -126,6 +126,9 @@ def _motion(method: str) -> Callable[[Robot, Arguments], Envelope]:
 
     def run(robot: Robot, arguments: Arguments) -> Envelope:
         given = dict(arguments)
+        if given.get("around") is True:
+            # A robot of one's own may have the motion without this argument.
+            del given["around"]
         camera = given.pop("picture", "")
         if camera:
             try:

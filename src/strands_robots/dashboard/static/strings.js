@@ -8,7 +8,7 @@ export const S = {
   stopRegion: "Emergency stop",
   stopOne: (id) => `STOP. All robots stop; ${id} has to answer.`,
   stopOneShort: "STOP all",
-  stopAlone: (id) => `Emergency stop of ${id} alone. Bare devices and robots of earlier releases stop as well. If ${id} is not there, all robots stop.`,
+  stopAlone: (id) => `STOP this one: emergency stop of ${id} alone. Bare devices and robots of earlier releases stop as well. If ${id} is not there, all robots stop.`,
   stopAloneShort: "STOP this one",
   stopOneWhy: "STOP all stops and locks all robots, STOP this one stops and locks this robot. To halt it without a lockout, run its verb stop, below.",
   connecting: "Connecting to the page's server...",
