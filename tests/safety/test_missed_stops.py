@@ -151,6 +151,40 @@ def test_robot_that_did_not_run_for_a_while_asks(bus: StopBus, join: Join) -> No
     assert away.epochs() == (epoch,)
 
 
+def test_link_that_goes_and_comes_for_ever_holds_the_motions_less_and_less() -> None:
+    pace = missed_stops.HoldPace()
+    assert [now for now in range(200) if pace.take(float(now))] == [0, 5, 15, 35, 75, 135, 195]
+    assert not pace.take(200.0)
+    assert [pace.take(now) for now in (270.0, 274.0, 276.0)] == [True, False, True], "after a time without returns"
+
+
+def test_return_of_the_link_holds_the_motions_once_its_question_left(bus: StopBus, join: Join) -> None:
+    away = join("away")
+    gate = away.robots["away"].gate
+    before = gate.holds
+    away.link.change(False)
+    away.link.change(True)
+    eventually(lambda: gate.holds > before)
+    assert asks(bus) == 1
+    for _ in range(3):
+        away.link.change(False)
+        away.link.change(True)
+    eventually(lambda: asks(bus) >= 2)
+    assert gate.holds == before + 1
+
+
+def test_return_of_one_peer_of_several_asks_and_holds_nothing(bus: StopBus, join: Join) -> None:
+    there, away = join("there"), join("away")
+    away.link.up = False
+    epoch = bus.stop()
+    eventually(there.epochs)
+    before = away.robots["away"].gate.holds
+    away.link.change(True)
+    eventually(away.epochs)
+    assert away.epochs() == (epoch,)
+    assert away.robots["away"].gate.holds == before
+
+
 def test_answer_holds_the_original_verbatim_and_never_goes_to_the_topics_of_stops(bus: StopBus, join: Join) -> None:
     _, away, _ = locked_and_cut_off(bus, join)
     original = bus.of(ESTOP)[0][1]

@@ -13,7 +13,7 @@ from strands_robots.mesh.context import Context
 from strands_robots.mesh.safety_adapter import SafetyAdapter
 from strands_robots.mesh.transport import Declaration, Sample, Transport, TransportError, undeclare
 from strands_robots.safety.awake import AWAKE
-from strands_robots.safety.missed_stops import ANSWER, ANSWER_MAX_BYTES, BACK, QUESTION, MissedStops
+from strands_robots.safety.missed_stops import ANSWER, ANSWER_MAX_BYTES, QUESTION, MissedStops
 from strands_robots.safety.orders import MISSED, StopOrder, StopRefused, derived_epoch
 from strands_robots.safety.plane import SafetyPlane
 from strands_robots.safety.question_ports import Member, RobotsPort
@@ -140,7 +140,7 @@ class MeshMissedStops:
             return
         back, refused = self._transport.links_back(), topics.estop() in self._transport.refusals()
         if back != self._links_back or (self._refused and not refused):
-            self._missed.ask(BACK)
+            self._missed.back()
         self._links_back, self._refused = back, refused
 
     def _open(self) -> None:

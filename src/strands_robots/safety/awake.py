@@ -67,7 +67,7 @@ class AwakeClock:
         return now
 
     def held_at(self, moment: float) -> bool:
-        """Return True while every motion of the process holds; never where nothing watches."""
+        """Return True while every motion holds; never where nothing watches."""
         return self._over is not None and moment < self._held_until
 
     def watch(self, woke: Callable[[], None]) -> Callable[[], None]:

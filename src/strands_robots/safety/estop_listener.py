@@ -442,7 +442,7 @@ class EstopListener:
             elif registration in self._registrations:
                 missed = self._open[registration.key] = self._missed_stops(registration)
                 receive = functools.partial(self.receive, network=_text(registration.network), missed=missed)
-                registration.link.open(EVENTS, receive, lambda up: missed.link_up() if up else None)
+                registration.link.open(EVENTS, receive, lambda up: missed.link_up() if up else missed.link_down())
 
     def unregister(self, registration: ListenerRegistration) -> None:
         """Serve a device no longer; the thread ends with the last one."""

@@ -38,9 +38,13 @@ QUESTION = "missedStops"
 ANSWER = "missedStopsAnswer"
 
 STARTED, BACK = "the process started", "its link is back"
+PEER_BACK = "a peer is linked again, while others stayed"
 
 UNITE_S = 0.3
 """Seconds from the question for which motions hold, while the answers come in."""
+
+HOLD_EVERY_S, HOLD_EVERY_MAX_S = 5.0, 60.0
+"""Seconds from one hold because of a link to the next: twice as many each time while the link goes on coming back."""
 
 LISTEN_S = 1.9
 """Seconds from the question in which an answer counts; a busy machine answers late."""
@@ -205,6 +209,25 @@ class Asker:
         return now <= self.listens_until
 
 
+class HoldPace:
+    """Limit of the holds that the returns of a link cause."""
+
+    def __init__(self) -> None:
+        self._gap = HOLD_EVERY_S
+        self._next = self._back = float("-inf")
+
+    def take(self, now: float) -> bool:
+        """Return True where a link that is back at ``now``, monotonic s, may hold."""
+        quiet, self._back = now - self._back, now
+        if now < self._next:
+            return False
+        if quiet >= self._gap:
+            self._gap = HOLD_EVERY_S
+        self._next = now + self._gap
+        self._gap = min(2 * self._gap, HOLD_EVERY_MAX_S)
+        return True
+
+
 class Answerer:
     """Questions that wait for an answer; times are monotonic s.
 
@@ -336,7 +359,8 @@ class MissedStops:
         # The smallest age that a stop was judged with; -inf: no age makes it count.
         self._judged: dict[bytes, float] = {}
         self._own = ""
-        self._linked = False
+        self._linked, self._up = False, False
+        self._back, self._pace = False, HoldPace()
         self._audited = float("-inf")
         self._waiting, self._starting = threading.Event(), threading.Lock()
         self._closed = False
@@ -352,13 +376,29 @@ class MissedStops:
         self._reasons.append(reason)
         self._wake()
 
+    def back(self, reason: str = BACK) -> None:
+        """Ask because of a link; return at once.
+
+        Where the reason is :data:`BACK`, motions hold as the question leaves, as often as :class:`HoldPace` allows.
+        """
+        self._reasons.append(reason)
+        self._wake()
+
     def link_up(self) -> None:
-        """Ask because the link is back, or at its first time :meth:`started`."""
+        """Ask because the link is back, or at its first time :meth:`started`.
+
+        Where it was up already, a peer is back while others stayed linked, and nothing is held.
+        """
+        stayed, self._up = self._up, True
         if self._linked:
-            self.ask(BACK)
+            self.back(PEER_BACK if stayed else BACK)
         else:
             self._linked = True
             self.started()
+
+    def link_down(self) -> None:
+        """Note that the link is lost; its return is a reason to ask."""
+        self._up = False
 
     def started(self) -> None:
         """Ask because a robot is served from now on, unless it is a newcomer."""
@@ -417,6 +457,7 @@ class MissedStops:
                 if not self._port.was_here():
                     continue
                 self._port.hold(UNITE_S)
+            self._back = self._back or reason == BACK
             logger.info("Asking for the stops missed: %s.", reason)
             self._asker.want(self._clock(), self._chance() * LOCKED_WAIT_S if self._port.locked() else 0.0)
         self._take_questions()
@@ -430,6 +471,7 @@ class MissedStops:
 
     def _ask(self) -> None:
         now = self._clock()
+        back, self._back = self._back, False
         self._asker.settle(now, dropped=self._answers.dropped)
         devices = self._port.devices() if self._asker.due <= now else ()
         if not devices:
@@ -443,6 +485,8 @@ class MissedStops:
         fields = {"nonce": self._own, "devices": list(devices[:DEVICES_MAX]), "t": time.time()}
         if not self._port.publish(QUESTION, devices[0], fields):
             self._asker.not_asked()
+        elif back and self._pace.take(now):
+            self._port.hold(UNITE_S)
 
     def _take_questions(self) -> None:
         answers = bool(self._questions) and bool(self._port.originals())
