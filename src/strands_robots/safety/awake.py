@@ -23,6 +23,10 @@ PAUSE_S = 0.5
 HOLD_S = 0.3
 """Seconds for which motions hold from the first look after that."""
 
+LINKS_LOST_S = 4.0
+LONG_HOLD_S = 2.0
+"""Hold after a pause as long as the lease of an e-stop link, whose peers have given it up and dial anew."""
+
 BEAT_S = 0.1
 """Seconds between two looks of the thread of its own."""
 
@@ -60,7 +64,7 @@ class AwakeClock:
             return now
         if now - last >= PAUSE_S:
             # Before the mark below: whoever finds a fresh mark also finds the hold.
-            self._held_until = now + HOLD_S
+            self._held_until = now + (HOLD_S if now - last < LINKS_LOST_S else LONG_HOLD_S)
             self._pauses += 1
         if now > last:
             self._last = now
@@ -107,7 +111,9 @@ class AwakeClock:
             if self._pauses == reported:
                 continue
             reported = self._pauses
-            logger.warning("This process did not run for a while; its motions hold for %g s.", HOLD_S)
+            logger.warning(
+                "This process did not run for a while; its motions hold for %.1f s.", self._held_until - self._last
+            )
             for woke in self._watchers:
                 try:
                     woke()
