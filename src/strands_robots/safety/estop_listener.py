@@ -375,11 +375,7 @@ class EstopListener:
         rules: makes the rules by which a stop counts; they are read when the first device registers.
     """
 
-    def __init__(
-        self,
-        of: SafetyPlane | None = None,
-        rules: Callable[[], StopRules] = StopRules,
-    ) -> None:
+    def __init__(self, of: SafetyPlane | None = None, rules: Callable[[], StopRules] = StopRules) -> None:
         self._plane = of or plane()
         self._make_rules = rules
         self._registering = threading.Lock()
