@@ -13,6 +13,8 @@ import pytest
 from fixtures.child import Child
 from fixtures.nats_server import NatsServer
 from fixtures.network_lab import NetworkLab, Weather, missing
+from fixtures.stop_controller import controller
+from fixtures.stop_robots import robots
 from fixtures.waiting import eventually
 from tests.integration.safety.conftest import Stage
 
@@ -20,6 +22,8 @@ from strands_robots.device_connect.backends import LinkConfig
 from strands_robots.safety.orders import new_epoch
 
 pytestmark = pytest.mark.system
+
+GONE_S = 16.0
 
 
 @pytest.fixture
@@ -71,6 +75,33 @@ def engaged(robots: Child, epoch: str) -> bool:
     records, verifies = robots.ask("audit")
     assert verifies
     return any(each["event"] == "remote_estop_engaged" and each["payload"]["estop_id"] == epoch for each in records)
+
+
+def test_a_robot_in_reach_is_stopped_while_the_hosts_of_others_are_gone(lab: NetworkLab, tmp_path: Path) -> None:
+    here = f"tcp/{lab.here.address}:7447"
+    near = LinkConfig(mode="peer", listen=(here,), multicast=False)
+    dialling = LinkConfig(mode="peer", connect=(here,), multicast=False)
+    with ExitStack() as stack:
+        for name, link, side in (
+            ("arm-1", near, lab.here),
+            ("arm-2", dialling, lab.there),
+            ("arm-3", dialling, lab.there),
+        ):
+            state = tmp_path / name
+            state.mkdir(mode=0o700)
+            environment = {"STRANDS_STATE_DIR": str(state)}
+            child = stack.enter_context(robots(link, name, environment=environment, within=side.within))
+            eventually(lambda child=child: child.ask("ready"), what="the e-stop link")  # type: ignore[misc]
+        hand = stack.enter_context(controller(dialling, "safety-1", within=lab.here.within))
+        assert hand.ask("up", 30.0)
+        eventually(lambda: hand.ask("stop", ["arm-1", "arm-2", "arm-3"], 5.0)["ok"], what="the first stop")
+        stack.callback(lambda: setattr(lab, "weather", Weather()))
+        lab.weather.parted = True
+        # Links are given up after 4 and 10 s; a thread of Zenoh's that closed one would wait 10 s more.
+        gone = time.monotonic() + GONE_S
+        while time.monotonic() < gone:
+            report = hand.ask("stop", ["arm-1"], 5.0)
+            assert report["ok"], str(report)
 
 
 @pytest.mark.parametrize("parted_s", [0.5, 4.5], ids=["briefly", "beyond the lease"])

@@ -19,6 +19,7 @@ from ctypes import pythonapi
 from typing import Any
 
 from ...utils import missing_extra
+from ...zenoh_sockets import close_in_background
 from .config import LOOPBACK, LinkConfig
 
 try:
@@ -158,7 +159,10 @@ class LinkedSession:
             logger.warning("a Zenoh session did not close in order: %s", problem)
 
     def _on_transport(self, event: Any) -> None:
-        change = self.remotes.add if event.kind == zenoh.SampleKind.PUT else self.remotes.discard
+        up = event.kind == zenoh.SampleKind.PUT
+        if up:
+            close_in_background()
+        change = self.remotes.add if up else self.remotes.discard
         change(str(event.transport.zid))
         self._on_change()
 

@@ -30,6 +30,7 @@ from strands_robots.drivers.reachy.rest import (
 from strands_robots.drivers.reachy.target import Target
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.utils import ValidationError, identifier, missing_extra, shown
+from strands_robots.zenoh_sockets import close_in_background
 
 logger = stop_logger(__name__)
 
@@ -297,6 +298,8 @@ class ClientSession:
         except zenoh.ZError as exc:
             raise DaemonUnreachableError(f"{endpoint} did not open: {exc}.") from exc
         self._zenoh_error = zenoh.ZError
+        linked: Any = zenoh.handlers.Callback(lambda event: close_in_background(), indirect=False)
+        self._links = self._session.info.declare_transport_events_listener(linked, history=True)
 
     def subscribe(self, key: str, on_payload: Callable[[bytes], None], /) -> Callable[[], None]:
         def deliver(sample: Any) -> None:
@@ -317,6 +320,7 @@ class ClientSession:
 
     def close(self) -> None:
         with contextlib.suppress(self._zenoh_error):  # closing twice is fine
+            self._links.undeclare()  # type: ignore[no-untyped-call]  # zenoh's own stub lacks it
             self._session.close()  # type: ignore[no-untyped-call]  # zenoh's own stub lacks it
 
 

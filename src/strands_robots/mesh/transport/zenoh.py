@@ -17,6 +17,7 @@ from strands_robots.mesh import topics, wire
 from strands_robots.mesh.transport import Callback, LivenessCallback, Sample, Transport, TransportError, zenoh_config
 from strands_robots.mesh.transport.zenoh_config import Posture
 from strands_robots.utils import missing_extra
+from strands_robots.zenoh_sockets import close_in_background
 
 logger = logging.getLogger(__name__)
 
@@ -257,6 +258,7 @@ class ZenohTransport(Transport):
     def _watch_links(self, session: Any, *, of_hub: bool) -> None:
         def changed(event: Any) -> None:
             if event.kind == self._zenoh.SampleKind.PUT:
+                close_in_background()
                 if self._links_lost:
                     self._links_lost -= 1
                     self._links_back += 1
@@ -268,6 +270,7 @@ class ZenohTransport(Transport):
 
         direct = self._zenoh.handlers.Callback(changed, indirect=False)
         self._links = session.info.declare_transport_events_listener(direct, history=False)
+        close_in_background()  # the links that came up before
 
     def _rescue(self) -> None:
         """Try to become the hub until our session is linked to one again."""
