@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from strands_robots.kinematics.chain import OBJECT, Chain
+from strands_robots.kinematics import spares
+from strands_robots.kinematics.chain import Chain
 from strands_robots.kinematics.objects import Held, SeenObject
 
 CLEARANCE_M = 0.003
@@ -29,23 +30,24 @@ def beside(chain: Chain, seen: Sequence[SeenObject], held: Held | None = None) -
     # The base of a robot that moves about is not where its model has it.
     if chain.floats or not (obstacles or held):
         return chain
-    spec = chain.spec()
-    for each in obstacles:
-        turned = [float(np.cos(each.yaw / 2)), 0.0, 0.0, float(np.sin(each.yaw / 2))]
-        body = spec.worldbody.add_body(name=OBJECT + each.name, pos=list(each.position), quat=turned)
-        x, y, z = (float(value) / 2 for value in each.size)
-        if each.round:
-            kind, size = mujoco.mjtGeom.mjGEOM_CYLINDER, [max(x, y) + CLEARANCE_M, z, 0.0]
-        else:
-            kind, size = mujoco.mjtGeom.mjGEOM_BOX, [x + CLEARANCE_M, y + CLEARANCE_M, z]
-        body.add_geom(type=kind, size=size, contype=_ALL, conaffinity=_ALL)
+    model = chain.spares.model(len(obstacles))
+    objects = {}
+    for index, each in enumerate(obstacles):
+        body = spares.body_of(model, index)
+        objects[body] = each.name
+        turned = np.array([np.cos(each.yaw / 2), 0.0, 0.0, np.sin(each.yaw / 2)])
+        half = each.size / 2 + np.array([CLEARANCE_M, CLEARANCE_M, 0.0])
+        kind = spares.CYLINDER if each.round else spares.BOX
+        spares.put(model, body, spares.Shape(kind, half, each.position, turned))
     if held is not None and held.radius > 0:
-        chain.add_at_tip(spec, held.offset, held.radius)
-    return chain.recompiled(spec)
-
-
-_ALL = 0x7FFFFFFF
-"""Contact bits that meet every geom which meets any other."""
+        body = spares.held_body(model)
+        objects[body] = held.name
+        rotation = np.zeros(9)
+        mujoco.mju_quat2Mat(rotation, chain.model.site_quat[chain.site])
+        position = chain.model.site_pos[chain.site] + rotation.reshape(3, 3) @ held.offset
+        ball = spares.Shape(spares.BALL, np.full(3, held.radius), position, np.array([1.0, 0.0, 0.0, 0.0]))
+        spares.put(model, body, ball)
+    return chain.beside(objects, model)
 
 
 def _is_table(chain: Chain, each: SeenObject) -> bool:
