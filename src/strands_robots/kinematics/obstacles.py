@@ -24,7 +24,7 @@ def beside(chain: Chain, seen: Sequence[SeenObject], held: Held | None = None) -
     Args:
         chain: it is not changed.
         seen: objects in the base frame. One of them that is held is no obstacle.
-        held: what is between the jaws; a ball within it goes where the tip goes.
+        held: what is between the jaws, which goes where the tip goes.
     """
     obstacles = [each for each in seen if not _is_table(chain, each) and (held is None or each.name != held.name)]
     # The base of a robot that moves about is not where its model has it.
@@ -42,12 +42,21 @@ def beside(chain: Chain, seen: Sequence[SeenObject], held: Held | None = None) -
     if held is not None and held.radius > 0:
         body = spares.held_body(model)
         objects[body] = held.name
-        rotation = np.zeros(9)
-        mujoco.mju_quat2Mat(rotation, chain.model.site_quat[chain.site])
-        position = chain.model.site_pos[chain.site] + rotation.reshape(3, 3) @ held.offset
-        ball = spares.Shape(spares.BALL, np.full(3, held.radius), position, np.array([1.0, 0.0, 0.0, 0.0]))
-        spares.put(model, body, ball)
+        spares.put(model, body, _carried(chain, held))
     return chain.beside(objects, model)
+
+
+def _carried(chain: Chain, held: Held) -> spares.Shape:
+    """Return the shape of the held object in the frame of the body that has the tip."""
+    site, turn = chain.model.site_quat[chain.site], np.zeros(4)
+    rotation, quaternion = np.zeros(9), np.zeros(4)
+    mujoco.mju_quat2Mat(rotation, site)
+    position = chain.model.site_pos[chain.site] + rotation.reshape(3, 3) @ held.offset
+    if not held.half.any():
+        return spares.Shape(spares.BALL, np.full(3, held.radius), position, np.array([1.0, 0.0, 0.0, 0.0]))
+    mujoco.mju_mat2Quat(turn, np.ascontiguousarray(held.turn).ravel())
+    mujoco.mju_mulQuat(quaternion, site, turn)
+    return spares.Shape(spares.CYLINDER if held.round else spares.BOX, held.half, position, quaternion)
 
 
 def _is_table(chain: Chain, each: SeenObject) -> bool:
