@@ -28,6 +28,7 @@ PARTS = {
     "policies": "Trained policies",
     "simulation": "Physics",
     "reach": "Arms that reach and grasp",
+    "motions": "Motions against the truth of the simulator",
     "safety": "From the controller's call to the last write",
     "answers": "Strangers that answer for a robot",
     "roster": "Robots that were away during a stop",

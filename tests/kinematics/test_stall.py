@@ -51,6 +51,31 @@ def test_delay_and_sag_are_no_contact(delay: float, duration: float, sag: float)
     assert first_stall(observed, 1.2, duration) is None
 
 
+@pytest.mark.parametrize("speed", [0.006, 0.02, 0.04])
+@pytest.mark.parametrize("lag", [0.01, 0.05])
+def test_contact_of_a_slow_joint_is_found_once_it_lags_behind(speed: float, lag: float) -> None:
+    watch, met = StallWatch(lag), 3.0
+    stopped = None
+    for step in range(round((met + 3.0 + lag / speed) * HZ)):
+        now = step / HZ
+        told, at = np.array([speed * now]), np.array([speed * min(now, met)])
+        if watch.stalled(now, told, at) == 0:
+            stopped = now
+            break
+    assert stopped is not None
+    assert met < stopped <= met + max(lag / speed, 0.01 / speed + 0.2) + 0.1
+
+
+@pytest.mark.parametrize("speed", [0.006, 0.02, 0.04])
+def test_slow_joint_that_sags_while_another_stretches_the_arm_is_no_contact(speed: float) -> None:
+    watch = StallWatch(0.01)
+    for step in range(6 * HZ):
+        now = step / HZ
+        stretched = setpoint(now, 1.2, 6.0)
+        told = np.array([speed * now, stretched])
+        assert watch.stalled(now, told, np.array([speed * now - 0.08 * stretched / 1.2, stretched])) is None
+
+
 def test_gear_that_sticks_for_two_degrees_is_no_contact_of_a_real_arm() -> None:
     def observed(now: float) -> float:
         return max(0.0, setpoint(now - 0.05, 0.8, 3.0) - 0.035)

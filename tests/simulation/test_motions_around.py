@@ -6,12 +6,24 @@ import threading
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import numpy as np
 import pytest
 
+from strands_robots.kinematics import grasp
+from strands_robots.kinematics.contacts import ContactCheck
+from strands_robots.kinematics.moves import Start
+from strands_robots.kinematics.obstacles import beside
 from strands_robots.simulation import Simulation
 
 SIDE = (0.22, -0.12, 0.05)
 OTHER_SIDE = (0.22, 0.12, 0.05)
+
+
+@pytest.fixture(autouse=True)
+def unhurried(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bound the searches by their tries, for the time that they take depends on the machine."""
+    monkeypatch.setattr("strands_robots.arm_mixin.PLAN_S", 600.0)
+    monkeypatch.setattr("strands_robots.kinematics.rrt.TRIES_MAX", 300)
 
 
 @pytest.fixture
@@ -66,7 +78,6 @@ def test_stop_ends_a_motion_that_is_still_planned(world: Simulation, monkeypatch
 
     monkeypatch.setattr("strands_robots.kinematics.planner._RETREAT_M", ())
     monkeypatch.setattr("strands_robots.kinematics.planner.path_around", endless)
-    monkeypatch.setattr("strands_robots.arm_mixin.PLAN_S", 60.0)
     before = world.body("arm").targets
     moving = threading.Thread(target=lambda: answers.append(world.move_to(*OTHER_SIDE)))
     moving.start()
@@ -106,6 +117,7 @@ class Eyes(Simulation):
     detector: Any = object()
     hangs = False
     asked = 0
+    going_on: threading.Event
 
     def objects(self, robot_name: str = "") -> list[Any]:
         self.asked += 1
@@ -146,3 +158,28 @@ def test_detector_that_hangs_refuses_a_motion_and_names_the_way_without_it(eyes:
         assert "the detector gave no answer" in (reason := eyes.move_by(dz=0.01)["reason"])
         assert "around=false" in reason
     assert eyes.move_by(dz=0.01, around=False, speed=1.0)["status"] == "success"
+
+
+@pytest.mark.parametrize("hover", [0.01, 0.07])
+def test_pick_goes_around_its_own_target_on_the_way_to_it(
+    world: Simulation, monkeypatch: pytest.MonkeyPatch, hover: float
+) -> None:
+    # The lower one is still between the jaws.
+    monkeypatch.setattr(grasp, "HOVER_M", (hover,))
+    body = world.body("arm")
+    world.add_object("bottle", "box", (0.012, 0.012, 0.03), (0.22, 0.0, 0.03))
+    seen = world.objects("arm")
+    start = Start(body.arm, body.arm.state(body.get_joints()), 50, 1.0, seen)
+    motion, _ = grasp.pick(start, seen[0], None)
+    transit = next(segment for segment in motion.segments if segment.name == "hover")
+    path = np.array([body.arm.told(frame) for frame in transit.frames])
+    assert ContactCheck(beside(body.arm.chain, seen), body.arm.jaw_radians(1.0)).along(path, {}) == ""
+
+
+def test_jaws_that_open_push_nothing_that_stands_beside_the_place(world: Simulation) -> None:
+    world.add_object("cube", "box", (0.0125,) * 3, (0.2, -0.12, 0.0125))
+    assert world.pick("cube", speed=1.0)["why"] == "it is done"
+    for index, (x, y) in enumerate(((0.2, 0.17), (0.25, 0.12))):
+        world.add_object(f"glass {index}", "box", (0.0125, 0.0125, 0.03), (x, y, 0.03), mass=0.02)
+    answer = world.place(0.2, 0.12, speed=1.0)
+    assert answer["status"] == "error" or answer["moved"] == {}, answer

@@ -7,7 +7,6 @@ radians of the model. A :class:`Chain` never changes and holds no MuJoCo data, s
 from __future__ import annotations
 
 import copy
-import threading
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
@@ -19,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from strands_robots.kinematics.servos import JointDrive, actuator_kind, drives, is_servo
+from strands_robots.kinematics.spares import Spares
 from strands_robots.kinematics.tip import ARM_JOINTS_MIN, mark_tip
 from strands_robots.utils import ValidationError
 
@@ -29,14 +29,8 @@ MODELS = Path(__file__).parents[1] / "models"
 TABLE = "table"
 """Name of the plane on which the arm stands, in refusals; added to a model without one."""
 
-OBJECT = "object:"
-"""What the name of an object's body begins with in the model of a chain beside objects."""
-
 _AXIAL_M = 1e-3
 """Greatest distance of the tip from the axis of the last joint that makes this joint a roll."""
-
-_COPYING = threading.Lock()
-"""Held while a model's description is copied, which other threads may plan with."""
 
 _HINGE, _SLIDE, _FREE = (
     mujoco.mjtJoint.mjJNT_HINGE.value,
@@ -119,7 +113,6 @@ class Chain:
             # Without a name, which the model may have given to a part of its own.
             spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[2, 2, 0.05], pos=[0, 0, table_z])
         name = mark_tip(spec, tip)
-        self._spec, self._tip = spec, name
         try:
             self.model = model = spec.compile()
         except (ValueError, mujoco.FatalError) as exc:
@@ -133,6 +126,8 @@ class Chain:
             raise ValidationError(f"{label} has no joint that could be moved to a position{_actuators(model)}.")
         self._models_body = True
         self.floats = bool((model.jnt_type == _FREE).any())
+        self.spares = Spares(spec, name)
+        self.objects: Mapping[int, str] = {}
         self._home = _home(model)
         data = self.data(self.rest)
         self.axis, self.roll = self._approach(data)
@@ -167,24 +162,11 @@ class Chain:
         """Indices of the joints that place the tip: all but a roll."""
         return np.array([i for i in range(len(self.joints)) if i != self.roll])
 
-    def spec(self) -> Any:
-        """Return a copy of the model's ``MjSpec``."""
-        with _COPYING:
-            return self._spec.copy()
-
-    def add_at_tip(self, spec: Any, offset: Floats, radius: float) -> None:
-        """Put a ball into a copy of the model, at an offset in the frame of the tip (m)."""
-        site = next(each for each in spec.sites if each.name == self._tip)
-        rotation = np.zeros(9)
-        mujoco.mju_quat2Mat(rotation, self.model.site_quat[self.site])
-        position = self.model.site_pos[self.site] + rotation.reshape(3, 3) @ offset
-        site.parent.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius, 0, 0], pos=list(position), mass=0)
-
-    def recompiled(self, spec: Any) -> Chain:
-        """Return this chain with the model of a copy to which fixed parts were added."""
-        with_parts = copy.copy(self)
-        with_parts._spec, with_parts.model = spec, spec.compile()
-        return with_parts
+    def beside(self, objects: Mapping[int, str], model: Any) -> Chain:
+        """Return this chain with a model of its spares, and the objects by body."""
+        crowded = copy.copy(self)
+        crowded.model, crowded.objects = model, objects
+        return crowded
 
     def whole(self) -> Chain:
         """Return this chain with every actuated joint but the gripper's."""

@@ -9,7 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from strands_robots.kinematics.chain import OBJECT, TABLE, Chain, Floats
+from strands_robots.kinematics.chain import TABLE, Chain, Floats
 
 STEP_RAD = 0.02
 """Largest step of a joint between two checked poses (rad or m)."""
@@ -33,8 +33,7 @@ class ContactCheck:
         self._chain = chain
         self._gripper = gripper
         self._data: Any = chain.data(chain.rest, gripper)
-        bodies = (str(chain.model.body(index).name) for index in range(chain.model.nbody))
-        self.objects = frozenset(each.removeprefix(OBJECT) for each in bodies if each.startswith(OBJECT))
+        self.objects = frozenset(chain.objects.values())
         """Names of the objects in the model."""
 
     def at(self, joints: Floats) -> dict[tuple[str, str], float]:
@@ -66,10 +65,9 @@ class ContactCheck:
     def _part(self, geom: int) -> str:
         model = self._chain.model
         body = int(model.geom_bodyid[geom])
-        name = str(model.body(body).name)
-        if name.startswith(OBJECT):
-            return name.removeprefix(OBJECT)
-        return TABLE if body == 0 else name.replace("_", " ")
+        if body in self._chain.objects:
+            return self._chain.objects[body]
+        return TABLE if body == 0 else str(model.body(body).name).replace("_", " ")
 
 
 def new_contact(contacts: Contacts, allowed: Contacts) -> str:

@@ -24,6 +24,9 @@ from strands_robots.utils import ValidationError
 HOVER_M = (0.07, 0.05, 0.03)
 """Heights above the grasp from which the gripper goes straight down; the first that is reachable."""
 
+CLEAR_M = (0.03, 0.06, 0.1)
+"""Distances beyond that by which the gripper gets clear of a tall object; the first that is enough."""
+
 PAD_GAP_M = 0.004
 """Distance between the object and the jaw that stands still, before the other closes."""
 
@@ -67,8 +70,9 @@ def pick(start: Start, target: SeenObject, approach: float | None) -> tuple[Moti
             continue
         way, tip = found
         try:
-            # Past the object itself, but where the gripper is over it already.
-            legs = past.path(way[-1]) if past.free(way[-1]) else planner.path(way[-1])
+            # Only the last part of the way, between the jaws, may touch the object.
+            way = _cleared(planner, past, way)
+            legs = past.path(way[-1])
         except ValidationError:
             continue
         segments = [
@@ -86,6 +90,9 @@ def pick(start: Start, target: SeenObject, approach: float | None) -> tuple[Moti
             grip.width,
             pose.approach_deg,
             float(min(target.size[0], target.size[1])) / 2,
+            target.size / 2,
+            pose.rotation.T @ _turned(target.yaw),
+            target.round,
         )
         goal = start.arm.chain.forward(way[-1]).position
         asked = {"object": target.name, **_point(target.position), "approach": degrees}
@@ -111,9 +118,11 @@ def place(start: Start, position: Floats, approach: float | None, held: Held, on
     centre = position + np.array([0.0, 0.0, held.below + RELEASE_M])
     wanted = [approach] if approach is not None else sorted(_approaches(None), key=lambda d: abs(d - held.approach_deg))
     release = _share_of(chain, held.width + OPEN_MORE_M)
+    opened = start.planner(release, besides=(on,), carries=False)
     for degrees in wanted:
         way = _lowering(planner, centre, degrees, held)
-        if way is None:
+        # The jaws open beside what stands around the place.
+        if way is None or any(opened.meets_object(joints) for joints in way):
             continue
         try:
             legs = carrying.path(way[-1])
@@ -243,6 +252,31 @@ def _upwards(planner: Planner, joints: Floats, tip: Floats) -> Floats | None:
         except ValidationError:
             continue
     return None
+
+
+def _cleared(planner: Planner, past: Planner, way: Floats) -> Floats:
+    """Return a way from the grasp to where the gripper is clear of the object.
+
+    Raises:
+        ValidationError: neither higher nor back along the approach is clear of it.
+    """
+    if past.free(way[-1]):
+        return way
+    pose = planner.chain.forward(way[-1])
+    for distance in CLEAR_M:
+        for direction in (np.array([0.0, 0.0, 1.0]), -pose.approach):
+            try:
+                further = planner.line(pose.position + distance * direction, way[-1], pose.approach)
+            except ValidationError:
+                continue
+            if past.free(further[-1]):
+                return np.concatenate([way, further[1:]])
+    raise ValidationError("no pose before the grasp is clear of the object.")
+
+
+def _turned(yaw: float) -> Floats:
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
 
 def _point(position: Floats) -> dict[str, float]:

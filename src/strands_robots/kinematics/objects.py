@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+import numpy as np
 
 from strands_robots.kinematics.chain import Floats, TipPose
 
@@ -32,6 +34,9 @@ class Held:
         width: between the jaws (m).
         approach_deg: at which it was grasped, so that it stands upright.
         radius: of the circle within its outline from above (m).
+        half: its half extents (m); zeros where only the radius is known.
+        turn: rotation of its axes in the frame of the tip, by columns.
+        round: as of :class:`SeenObject`.
     """
 
     name: str
@@ -40,6 +45,9 @@ class Held:
     width: float
     approach_deg: float
     radius: float = 0.0
+    half: Floats = field(default_factory=lambda: np.zeros(3))
+    turn: Floats = field(default_factory=lambda: np.eye(3))
+    round: bool = False
 
     def centre(self, pose: TipPose) -> Floats:
         """Return the place of its centre for a pose of the tip (m)."""

@@ -115,6 +115,12 @@ class Planner:
         """True for joints that bring no new contact."""
         return not new_contact(self._check.at(joints), self._touching)
 
+    def meets_object(self, joints: Floats) -> bool:
+        """True for joints that bring a new contact with an object."""
+        objects = self._check.objects
+        contacts = {pair: depth for pair, depth in self._check.at(joints).items() if objects & set(pair)}
+        return bool(new_contact(contacts, self._touching))
+
     def _free_of_itself(self, joints: Floats) -> bool:
         """Return True for joints whose only new contacts are with objects."""
         contacts = {

@@ -6,7 +6,7 @@ an arm under its payload counts: a joint that sags follows its setpoints, at a d
 
 from __future__ import annotations
 
-from collections import deque
+from bisect import bisect_right
 
 import numpy as np
 
@@ -14,6 +14,12 @@ from strands_robots.kinematics.chain import Floats
 
 WINDOWS_S = (0.12, 0.22)
 """Times over which a joint is compared with its setpoints; the longer one is for slow motions."""
+
+SLOW_WINDOWS_S = (0.45, 0.9, 1.8)
+"""Such times for joints that go less than :data:`TOLD` in the others, down to 0.0045 rad/s."""
+
+SLOW_SHARE = 0.1
+"""Least way of a slow joint by that of the fastest: the sag of an arm that others stretch out is no contact."""
 
 DELAY_S = 0.12
 """Greatest delay of a servo behind its setpoints."""
@@ -40,7 +46,7 @@ class StallWatch:
 
     def __init__(self, lag: float) -> None:
         self._lag = lag
-        self._seen: deque[tuple[float, Floats, Floats]] = deque()
+        self._seen: list[tuple[float, Floats, Floats]] = []
         self._counts: Floats = np.zeros(0)
 
     def stalled(self, now: float, told: Floats, joints: Floats) -> int | None:
@@ -55,12 +61,12 @@ class StallWatch:
             return None
         self._seen.append((now, told, joints))
         # The first look stays, for the distance at the start.
-        while len(self._seen) > 2 and self._seen[1][0] < now - DELAY_S - WINDOWS_S[-1] - 0.1:
+        while len(self._seen) > 2 and self._seen[1][0] < now - DELAY_S - SLOW_WINDOWS_S[-1] - 0.1:
             del self._seen[1]
         if not len(self._counts):
             self._counts = np.zeros(len(joints))
         still = np.zeros(len(joints), dtype=bool)
-        for window in WINDOWS_S:
+        for window in (*WINDOWS_S, *SLOW_WINDOWS_S):
             still |= self._still(now, window)
         self._counts = np.where(still, self._counts + 1, 0)
         worst = int(np.argmax(np.where(self._counts >= CONFIRMED, np.abs(told - joints), -1.0)))
@@ -75,6 +81,8 @@ class StallWatch:
         way = np.where(told * told_before > 0, np.sign(told) * np.minimum(np.abs(told), np.abs(told_before)), 0.0)
         gone = (last[2] - before[2]) * np.sign(way)
         lag = ((last[1] - last[2]) - (first[1] - first[2])) * np.sign(way)
+        if window in SLOW_WINDOWS_S:
+            way = np.where(np.abs(way) >= SLOW_SHARE * np.abs(told).max(), way, 0.0)
         result: np.ndarray[tuple[int], np.dtype[np.bool_]] = (
             (np.abs(way) >= TOLD) & (gone <= np.minimum(FOLLOWED * np.abs(way), STILL)) & (lag >= self._lag)
         )
@@ -82,4 +90,4 @@ class StallWatch:
 
     def _at(self, when: float) -> tuple[float, Floats, Floats]:
         """Return the last look at or before a time, else the first."""
-        return next((look for look in reversed(self._seen) if look[0] <= when), self._seen[0])
+        return self._seen[max(0, bisect_right(self._seen, when, key=lambda look: look[0]) - 1)]
