@@ -22,8 +22,8 @@ from strands_robots.safety import ed25519, missed_stops
 from strands_robots.safety.answer_slots import SWEPT_ABOVE, AnswerSlots
 from strands_robots.safety.clearance import clear_here
 from strands_robots.safety.controller import SafetyController
-from strands_robots.safety.estop_listener import ESTOP, notification
-from strands_robots.safety.lockout import RESUMED_MAX, LockoutLatch
+from strands_robots.safety.estop_listener import ESTOP, VERDICT, notification
+from strands_robots.safety.lockout import MAX_EPOCHS, RESUMED_MAX, LockoutLatch
 from strands_robots.safety.missed_stops import (
     ANSWER,
     ANSWER_MAX_BYTES,
@@ -97,6 +97,12 @@ def asks(bus: StopBus) -> int:
 
 def given(bus: StopBus) -> list[dict[str, Any]]:
     return [params_of(payload) for _, payload in bus.of(ANSWER)]
+
+
+def told(bus: StopBus) -> set[Any]:
+    """Return the ids of the stops in all answers."""
+    stops = [each for answer in given(bus) for each in answer["stops"]]
+    return {params_of(ed25519.decode_up_to(each["event"], ORIGINAL_MAX_BYTES) or b"").get("estop_id") for each in stops}
 
 
 def answered(bus: StopBus, before: int = 0) -> None:
@@ -298,6 +304,39 @@ def test_stops_cannot_evict_a_resumed_epoch_and_resumes_evict_the_oldest() -> No
     latch.forgo(new_epoch() for _ in range(RESUMED_MAX))
     assert len(latch.resumed) == RESUMED_MAX
     assert first not in latch.resumed
+
+
+@pytest.mark.parametrize("running", [True, False], ids=["running", "not running"])
+def test_robot_that_was_cleared_of_a_flood_locks_by_none_of_its_stops_again(
+    bus: StopBus, join: Join, state_directory: Path, running: bool
+) -> None:
+    robot = join("arm-1", folder=state_directory)
+    latch = robot.entries[0].latch
+    for _ in range(MAX_EPOCHS + 1):
+        latch.engage(new_epoch(), "stranger", "")
+    there = join("there")
+    # One halt answers for all stops of a quarter of a second, and only the first of them is noted.
+    flood = [bus.stop(f"safety-{number}") for number in range(10)]
+    eventually(lambda: len(there.epochs()) == len(flood))
+    eventually(lambda: {params_of(sent)["estop_id"] for name, sent in bus.of(VERDICT) if name == "arm-1"} >= {*flood})
+    forgotten = next(each for each in flood if not latch.knows(each))
+    eventually(lambda: not robot.entries[0].unsaved)
+    if running:
+        robot.plane.clear_local("the operator")
+    robot.close()
+    if not running:
+        assert clear_here("the operator", ["arm-1"], 0.1) == {"arm-1": "cleared on disk"}
+    back = join("arm-1", folder=state_directory, was_here=True)
+    assert back.epochs() == ()
+    back.link.change(False)
+    fresh = join("fresh")
+    later = bus.stop()
+    eventually(fresh.epochs)
+    back.link.change(True)
+    eventually(lambda: forgotten in told(bus) and later in told(bus), what="both answers")
+    eventually(back.epochs)
+    time.sleep(SETTLED_S)
+    assert back.epochs() == (later,)
 
 
 def test_answerer_that_was_restarted_still_answers(bus: StopBus, join: Join, tmp_path: Path) -> None:

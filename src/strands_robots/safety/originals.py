@@ -42,9 +42,9 @@ class Original:
 
     def record(self) -> dict[str, Any]:
         """Return the original as it stands in a file."""
-        at = {"boot": boot(), "up": self.received, "wall": time.time() - (uptime() - self.received)}
         event = ed25519.encode(self.payload)
-        return {"epoch": self.epoch, "source": self.source, "event": event, "network": self.network, **at}
+        stated = {"epoch": self.epoch, "source": self.source, "event": event, "network": self.network}
+        return {**stated, **moment(self.received)}
 
     @classmethod
     def of(cls, record: Mapping[str, Any]) -> Original:
@@ -58,6 +58,11 @@ class Original:
         if payload is None or not all(isinstance(each, str) for each in texts):
             raise ValueError("an original without its bytes or its names")
         return cls(texts[0], texts[1], payload, texts[2], since_boot(record))
+
+
+def moment(up: float) -> dict[str, Any]:
+    """Return a moment in seconds since boot as it stands in a file."""
+    return {"boot": boot(), "up": up, "wall": time.time() - (uptime() - up)}
 
 
 def since_boot(record: Mapping[str, Any]) -> float:
