@@ -108,6 +108,17 @@ def test_robot_that_was_cut_off_is_locked_by_the_original_and_no_stop_is_publish
     assert base64.urlsafe_b64decode(event + "=" * (-len(event) % 4)) == sent[0]
 
 
+@pytest.mark.parametrize("stayed", [False, True], ids=["its only link", "one of several"])
+def test_return_of_a_link_holds_motions_where_none_was_left(peers: Fleet, stayed: bool) -> None:
+    first, away = stopped_without(peers, "arm-2")
+    assert away.robot is not None
+    gate = away.robot.gate
+    before = gate.holds
+    peers.bus.partition(peers.transports["arm-2"], cut=False, stayed=stayed)
+    eventually(lambda: away.lockout_epoch == first.lockout_epoch, what="the lock of the robot that is back")
+    assert (gate.holds > before) is not stayed
+
+
 def test_robot_that_did_not_run_asks(peers: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
     mesh, asked = peers.join(Arm("arm-1"), "arm-1"), received(peers, "strands/arm-1/missed/ask")
     assert mesh.robot is not None

@@ -130,13 +130,13 @@ class LockoutLatch:
         resumed: Iterable[str] = (),
         *,
         cleared: tuple[Span, ...] = (),
-        crowded_since: float = LONG_AGO,
+        crowded: float = LONG_AGO,
     ) -> None:
         self.robot_id = robot_id
         self._state = state or LockoutState()
         self._seen: dict[str, None] = dict.fromkeys([*seen, *self._state.resumable])
         self._resumed = dict.fromkeys(resumed)
-        self._cleared, self._crowded_since = cleared, crowded_since
+        self._cleared, self._crowded_since = cleared, crowded
         self._clock = clock
         self._writing = threading.Lock()
 
@@ -158,7 +158,7 @@ class LockoutLatch:
 
     @property
     def cleared(self) -> tuple[Span, ...]:
-        """Spans of stops without a name here that it was cleared of; replaced when one is new."""
+        """Spans of floods that it was cleared of; replaced when one is new."""
         return self._cleared
 
     @property
@@ -224,7 +224,7 @@ class LockoutLatch:
 
 
 def with_cleared(cleared: tuple[Span, ...], state: LockoutState, since: float) -> tuple[Span, ...]:
-    """Return the spans with that of an overflow that is cleared now; the same without one."""
+    """Return the spans with that of an overflow that is cleared now, if there is one."""
     if state.overflow is None:
         return cleared
     spans = (*cleared, (since, uptime()))

@@ -68,7 +68,7 @@ class ResumedEpochs:
     cleared: tuple[Span, ...] = ()
 
     def holds(self, epochs: Mapping[str, None], cleared: tuple[Span, ...]) -> bool:
-        """Return True where it is the record of these, which are replaced when they change."""
+        """Return True where it is the record of these very objects."""
         return self.epochs is epochs and self.cleared is cleared
 
 

@@ -83,12 +83,7 @@ class Registered:
         self.gates: tuple[MotionGate, ...] = (robot.gate,)
         resumed = kept.resumed or ResumedEpochs()
         self.latch = LockoutLatch(
-            wire_id,
-            kept.state,
-            kept.seen,
-            resumed=resumed.epochs,
-            cleared=resumed.cleared,
-            crowded_since=kept.crowded_since,
+            wire_id, kept.state, kept.seen, resumed=resumed.epochs, cleared=resumed.cleared, crowded=kept.crowded_since
         )
         self.on_disk = kept.state
         self.registered_before = kept.resumed is not None
@@ -200,7 +195,7 @@ class Registered:
         return True
 
     def _missed(self, received: float) -> bool:
-        """Return False for a stop from before its time, or of a flood that it was cleared of."""
+        """Return False for a stop of before its time, or of a flood it was cleared of."""
         return received >= self._here_since and not self.latch.cleared_of(received)
 
     @property
@@ -551,6 +546,10 @@ class SafetyPlane:
         """Return the stops of ``network`` that lock robots here, as they arrived."""
         return self._originals.of(self._held(), network)
 
+    def stated_again(self, network: str, epoch: str, payload: bytes, age_s: float) -> None:
+        """Take the age of a missed stop that locks robots here from a further answer."""
+        self._originals.younger(network, epoch, payload, uptime() - age_s)
+
     def hold(self, seconds: float) -> None:
         """Hold the motions of every robot for so long; return at once."""
         for entry in self._robots.values():
@@ -580,7 +579,8 @@ class SafetyPlane:
     def _note_original(self, order: StopOrder) -> None:
         if order.original is not None:
             received = uptime() - (time.monotonic() - order.received) - order.age_s
-            self._originals.add(Original(order.epoch, order.source, order.original, order.network, received))
+            learnt = order.path == MISSED
+            self._originals.add(Original(order.epoch, order.source, order.original, order.network, received, learnt))
 
     def _keep(self, entries: Iterable[Registered]) -> None:
         # One at a time, so that no older state is written over a newer one.
