@@ -19,7 +19,9 @@ from strands_robots.mesh.core import Mesh
 from strands_robots.safety import ed25519
 from strands_robots.safety.awake import AWAKE, PAUSE_S
 from strands_robots.safety.missed_stops import LISTEN_S
+from strands_robots.safety.orders import signed_stop
 from strands_robots.safety.scope import Scope
+from strands_robots.safety.statements import Purpose
 
 
 @pytest.fixture(autouse=True)
@@ -106,6 +108,17 @@ def test_robot_that_was_cut_off_is_locked_by_the_original_and_no_stop_is_publish
     assert len(sent) == before
     event = answers[0]["stops"][0]["event"]
     assert base64.urlsafe_b64decode(event + "=" * (-len(event) % 4)) == sent[0]
+
+
+@pytest.mark.parametrize("stayed", [False, True], ids=["its only link", "one of several"])
+def test_return_of_a_link_holds_motions_where_none_was_left(peers: Fleet, stayed: bool) -> None:
+    first, away = stopped_without(peers, "arm-2")
+    assert away.robot is not None
+    gate = away.robot.gate
+    before = gate.holds
+    peers.bus.partition(peers.transports["arm-2"], cut=False, stayed=stayed)
+    eventually(lambda: away.lockout_epoch == first.lockout_epoch, what="the lock of the robot that is back")
+    assert (gate.holds > before) is not stayed
 
 
 def test_robot_that_did_not_run_asks(peers: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -260,6 +273,35 @@ def test_stop_of_one_cell_locks_no_robot_of_another_that_asks(peers: Fleet) -> N
     back(peers, "arm-2")
     settled(asked)
     assert away.lockout_epoch is None
+
+
+def test_stop_of_robots_by_name_locks_one_of_them_that_was_away_and_no_other(peers: Fleet) -> None:
+    first, named, other = (peers.join(Arm(name), name) for name in ("arm-1", "arm-2", "arm-3"))
+    console = peers.join(None, "console")
+    for each in ("arm-2", "arm-3"):
+        cut(peers, each)
+    console.emergency_stop(scope=Scope.named(["arm-1", "arm-2"]))
+    console.close()
+    eventually(lambda: first.lockout_epoch)
+    asked = received(peers, "strands/arm-3/missed/ask")
+    for each in ("arm-2", "arm-3"):
+        back(peers, each)
+    eventually(lambda: named.lockout_epoch == first.lockout_epoch, what="the lock of the named robot that is back")
+    settled(asked)
+    assert other.lockout_epoch is None
+
+
+def test_unproven_scope_of_a_missed_stop_is_every_robot_where_signatures_are_demanded(
+    peers: Fleet, signing_key: Any
+) -> None:
+    body = {**envelope_of(peers, "console", "a" * 32), "nonce": "2" * 32}
+    signed = signed_stop(signing_key, Purpose.EMERGENCY_STOP, "console", body)
+    scoped = {**signed, "scope": {"only": ["arm-9"]}}
+    away = peers.join(Arm("arm-1"), "arm-1")
+    answered_by_a_stranger(peers, "arm-1", [{**row("console", scoped), "age_s": 0.0}])
+    cut(peers, "arm-1")
+    back(peers, "arm-1")
+    eventually(lambda: away.lockout_epoch == "a" * 32, what="the lock by a stop whose scope nobody signed")
 
 
 def test_peer_of_an_older_release_gets_the_stop_again_when_it_is_back(peers: Fleet, tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
-from fixtures.stop_bus import BusLink, BusMachine, StopBus, stop_message
+from fixtures.stop_bus import NETWORK, BusLink, BusMachine, StopBus, stop_message
 from fixtures.waiting import eventually
 
 from strands_robots.audit import flush_audit, read_audit_log
@@ -22,8 +22,8 @@ from strands_robots.safety import ed25519, missed_stops
 from strands_robots.safety.answer_slots import SWEPT_ABOVE, AnswerSlots
 from strands_robots.safety.clearance import clear_here
 from strands_robots.safety.controller import SafetyController
-from strands_robots.safety.estop_listener import ESTOP, notification
-from strands_robots.safety.lockout import RESUMED_MAX, LockoutLatch
+from strands_robots.safety.estop_listener import ESTOP, VERDICT, notification
+from strands_robots.safety.lockout import MAX_EPOCHS
 from strands_robots.safety.missed_stops import (
     ANSWER,
     ANSWER_MAX_BYTES,
@@ -97,6 +97,12 @@ def asks(bus: StopBus) -> int:
 
 def given(bus: StopBus) -> list[dict[str, Any]]:
     return [params_of(payload) for _, payload in bus.of(ANSWER)]
+
+
+def told(bus: StopBus) -> set[Any]:
+    """Return the ids of the stops in all answers."""
+    stops = [each for answer in given(bus) for each in answer["stops"]]
+    return {params_of(ed25519.decode_up_to(each["event"], ORIGINAL_MAX_BYTES) or b"").get("estop_id") for each in stops}
 
 
 def answered(bus: StopBus, before: int = 0) -> None:
@@ -208,6 +214,21 @@ def test_robot_that_learnt_a_stop_answers_the_next_one_with_its_true_age(bus: St
     assert third.epochs() == (epoch,)
 
 
+def test_stranger_s_false_age_of_a_stop_is_not_passed_on_once_a_true_one_came(
+    bus: StopBus, join: Join, tmp_path: Path
+) -> None:
+    LockoutStore(tmp_path).save_resumed({"simulation:away": ResumedEpochs({}, uptime() - 3600)})
+    there, away = join("there"), join("away", folder=tmp_path, was_here=True)
+    away.link.change(False)
+    epoch, payload = stop_message("safety-1")
+    bus.send("safety-1", ESTOP, payload)
+    eventually(there.epochs)
+    answer_first(bus, forged([row("safety-1", payload, 3000.0)]))
+    away.link.change(True)
+    eventually(lambda: away.epochs() == (epoch,))
+    eventually(lambda: uptime() - away.plane.originals(NETWORK.text)[0].received < 60.0, what="the true age")
+
+
 def test_newcomer_does_not_ask_and_is_not_locked(bus: StopBus, join: Join) -> None:
     there = join("there")
     bus.stop()
@@ -277,27 +298,37 @@ def test_robot_never_locks_again_by_an_epoch_that_it_was_resumed_from(
     assert back.epochs() == ()
 
 
-def test_epochs_that_an_overflow_stood_for_count_as_resumed_once_it_was_cleared() -> None:
-    latch = LockoutLatch("arm-1")
-    epochs = [new_epoch() for _ in range(100)]
-    for each in epochs:
-        latch.engage(each, "safety-1", "")
-    latch.clear()
-    assert set(epochs) <= set(latch.resumed)
-    assert not any(latch.engage(each, "safety-1", "") for each in epochs)
-
-
-def test_stops_cannot_evict_a_resumed_epoch_and_resumes_evict_the_oldest() -> None:
-    latch = LockoutLatch("arm-1")
-    first = new_epoch()
-    latch.engage(first, "safety-1", "")
-    latch.resume(first)
-    for _ in range(2000):
+@pytest.mark.parametrize("running", [True, False], ids=["running", "not running"])
+def test_robot_that_was_cleared_of_a_flood_locks_by_none_of_its_stops_again(
+    bus: StopBus, join: Join, state_directory: Path, running: bool
+) -> None:
+    robot = join("arm-1", folder=state_directory)
+    latch = robot.entries[0].latch
+    for _ in range(MAX_EPOCHS + 1):
         latch.engage(new_epoch(), "stranger", "")
-    assert not latch.engage(first, "safety-1", "")
-    latch.forgo(new_epoch() for _ in range(RESUMED_MAX))
-    assert len(latch.resumed) == RESUMED_MAX
-    assert first not in latch.resumed
+    there = join("there")
+    # One halt answers for all stops of a quarter of a second, and only the first of them is noted.
+    flood = [bus.stop(f"safety-{number}") for number in range(10)]
+    eventually(lambda: len(there.epochs()) == len(flood))
+    eventually(lambda: {params_of(sent)["estop_id"] for name, sent in bus.of(VERDICT) if name == "arm-1"} >= {*flood})
+    forgotten = next(each for each in flood if not latch.knows(each))
+    eventually(lambda: not robot.entries[0].unsaved)
+    if running:
+        robot.plane.clear_local("the operator")
+    robot.close()
+    if not running:
+        assert clear_here("the operator", ["arm-1"], 0.1) == {"arm-1": "cleared on disk"}
+    back = join("arm-1", folder=state_directory, was_here=True)
+    assert back.epochs() == ()
+    back.link.change(False)
+    fresh = join("fresh")
+    later = bus.stop()
+    eventually(fresh.epochs)
+    back.link.change(True)
+    eventually(lambda: forgotten in told(bus) and later in told(bus), what="both answers")
+    eventually(back.epochs)
+    time.sleep(SETTLED_S)
+    assert back.epochs() == (later,)
 
 
 def test_answerer_that_was_restarted_still_answers(bus: StopBus, join: Join, tmp_path: Path) -> None:
@@ -310,25 +341,6 @@ def test_answerer_that_was_restarted_still_answers(bus: StopBus, join: Join, tmp
     away.link.change(True)
     eventually(away.epochs)
     assert away.epochs() == (epoch,)
-
-
-def test_lockout_file_of_yesterday_loads_and_its_robot_has_no_original(tmp_path: Path) -> None:
-    store = LockoutStore(tmp_path)
-    store.save({})
-    epoch = new_epoch()
-    hold = {"epoch": epoch, "source": "safety-1", "reason": "", "at": 1.0}
-    record = {"v": 2, "key": "k", "name": "arm-1", "holds": [hold], "overflow": None, "seen": [epoch]}
-    store.file("k").write_text(json.dumps(record))
-    kept = store.load("k")
-    assert kept.state.epochs == (epoch,)
-    assert (kept.originals, kept.resumed) == ((), None)
-
-
-def test_unreadable_record_of_resumed_epochs_locks_as_an_unreadable_lockout_does(tmp_path: Path) -> None:
-    store = LockoutStore(tmp_path)
-    store.save_resumed({"k": ResumedEpochs({new_epoch(): None})})
-    store.resumed_file("k").write_text("{")
-    assert store.load("k").state.locked
 
 
 def test_local_clearance_of_a_robot_that_does_not_run_keeps_its_epochs_resumed(

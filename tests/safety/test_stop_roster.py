@@ -233,9 +233,23 @@ def test_presence_that_contradicts_the_memory_takes_no_enrolled_robot_out_of_a_s
     assert awaited_in_cell("arm-1", "cell-2")
 
 
-def test_enrolled_robot_of_another_cell_need_not_answer_the_stop_of_one() -> None:
-    enroll(NETWORK, "arm-1", "arm-2")
+def test_enrolled_robot_is_in_the_cell_of_its_enrolment_and_a_presence_only_adds_to_it() -> None:
+    for name, cells in (("arm-1", {"arm-1": "cell-2"}), ("arm-2", None), ("arm-3", {"arm-3": "cell-1"})):
+        EnrolledKeys().enroll({name: name.encode() * 6 + b"xx"}, network=NETWORK, cells=cells)
+    assert not awaited_in_cell("arm-1", "cell-2")
+    assert awaited_in_cell("arm-1", "cell-1")
+    assert awaited_in_cell("arm-1", "")
+    # Enrolled by an earlier release: what it states is not signed.
+    assert awaited_in_cell("arm-2", "cell-2")
+    assert awaited_in_cell("arm-3", "cell-2")
     sightings().note(NETWORK, "arm-1", cell="cell-2")
     assert not awaited_in_cell("arm-1", "cell-2")
-    # Not heard for ten minutes: its presence is all that is known.
-    assert not awaited_in_cell("arm-2", "cell-2")
+    EnrolledKeys().enroll({"arm-1": b"arm-1" * 6 + b"xx"}, network=NETWORK)
+    assert EnrolledKeys().robots()["arm-1"].cell == "cell-2"
+
+
+def test_silent_enrolled_robot_of_another_cell_is_not_expected() -> None:
+    EnrolledKeys().enroll({"arm-1": b"1" * 32}, network=NETWORK, cells={"arm-1": "cell-2"})
+    roster = StopRoster(NETWORK, scope=CELL_1)
+    roster.read()
+    assert not roster.awaited()

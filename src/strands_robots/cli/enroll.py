@@ -18,6 +18,7 @@ from strands_robots.safety import ed25519
 from strands_robots.safety.consoles import enrolled_consoles
 from strands_robots.safety.identity import DEFAULT_TENANT, EnrolledKeys, KeyFileError, fingerprint, local_name
 from strands_robots.safety.network_key import NetworkKey
+from strands_robots.safety.roster_report import CELL_MAX
 from strands_robots.safety.statements import Purpose, own_key
 from strands_robots.utils import device_id, number, shown
 
@@ -76,6 +77,8 @@ def _enroll_robots(
         known = file.load()
         outcome: dict[str, tuple[str, str]] = {}
         fresh: dict[str, bytes] = {}
+        stated = {local_name(tenant, each.name): each.facts.get("cell") for each in reports}
+        cells = {name: cell for name, cell in stated.items() if isinstance(cell, str) and len(cell) <= CELL_MAX}
         for name, public in keys.items():
             local = local_name(tenant, name)
             if public is None:
@@ -88,7 +91,7 @@ def _enroll_robots(
             else:
                 outcome[name] = "known" if known.get(local) == public else "enrolled", ""
                 fresh[local] = public
-        undone = file.enroll(fresh, replace=replace, network=key)
+        undone = file.enroll(fresh, replace=replace, network=key, cells=cells)
     except (KeyFileError, OSError) as exc:
         raise CliError(f"Nothing was enrolled: {exc}") from exc
     for local, exempt in undone.items():

@@ -13,10 +13,10 @@ from strands_robots.mesh.context import Context
 from strands_robots.mesh.safety_adapter import SafetyAdapter
 from strands_robots.mesh.transport import Declaration, Sample, Transport, TransportError, undeclare
 from strands_robots.safety.awake import AWAKE
-from strands_robots.safety.missed_stops import ANSWER, ANSWER_MAX_BYTES, QUESTION, MissedStops
+from strands_robots.safety.missed_stops import ANSWER, ANSWER_MAX_BYTES, PEER_BACK, QUESTION, MissedStops
 from strands_robots.safety.orders import MISSED, StopOrder, StopRefused, derived_epoch
 from strands_robots.safety.plane import SafetyPlane
-from strands_robots.safety.question_ports import Member, RobotsPort
+from strands_robots.safety.question_ports import Member, RobotsPort, Stated
 from strands_robots.safety.statements import Purpose
 
 TOPICS = {QUESTION: topics.missed_ask, ANSWER: topics.missed_answer}
@@ -64,7 +64,9 @@ class MeshPort(RobotsPort):
         epoch = epoch_of(notice, body)
         if notice.peer_id != source or self._rules.source_refusal(source) is not None:
             return False
-        return self.lock(epoch, lambda: self._decide(notice, epoch, body, payload, age_s), answerer)
+        return self.lock(
+            epoch, lambda: self._decide(notice, epoch, body, payload, age_s), Stated(payload, age_s, answerer)
+        )
 
     def _decide(
         self, notice: wire.EstopNotice, epoch: str, body: Mapping[str, Any], payload: bytes, age_s: float
@@ -99,7 +101,7 @@ class MeshMissedStops:
     def __init__(self, transport: Transport, adapter: SafetyAdapter) -> None:
         self._transport = transport
         self._peers: dict[str, SafetyAdapter] = {}
-        self._links_back, self._refused = transport.links_back(), False
+        self._links_back, self._rejoined, self._refused = transport.links_back(), transport.rejoined(), False
         self._missed = MissedStops(MeshPort(adapter, lambda: self._peers, transport), parse=_fields_of)
         self._declared: list[Declaration] = []
         self._end_watch: Callable[[], None] = lambda: None
@@ -135,13 +137,20 @@ class MeshMissedStops:
         self._missed.close()
 
     def look(self, context: Context) -> None:
-        """Ask where a link came back or stops can be received again, for our first peer."""
+        """Ask where a link came back or stops can be received again, for our first peer.
+
+        Motions hold where no link was left. Where others stayed, the one that came back may be that of a stranger.
+        """
         if context.peer_id != next(iter(self._peers), None):
             return
-        back, refused = self._transport.links_back(), topics.estop() in self._transport.refusals()
-        if back != self._links_back or (self._refused and not refused):
+        # Read first: a link that comes back between the two asks again.
+        rejoined, back = self._transport.rejoined(), self._transport.links_back()
+        refused = topics.estop() in self._transport.refusals()
+        if rejoined != self._rejoined or (self._refused and not refused):
             self._missed.back()
-        self._links_back, self._refused = back, refused
+        elif back != self._links_back:
+            self._missed.back(PEER_BACK)
+        self._links_back, self._rejoined, self._refused = back, rejoined, refused
 
     def _open(self) -> None:
         for event, topic in TOPICS.items():

@@ -8,6 +8,7 @@ peers that missed it.
 from __future__ import annotations
 
 import contextlib
+import json
 import logging
 import secrets
 import time
@@ -390,9 +391,22 @@ class FleetSafety:
         if peer_id in scope.only:
             # A robot of a world is locked with it.
             scope = replace(scope, only=scope.only | {context.peer_id})
-        pressed = wire.finite(body.get("pressed_at"))
+        original = json.dumps(body).encode()
         self._adapter.begin(
-            StopOrder(notice.estop_id, sender, "fleet e-stop", "mesh", True, notice.t, received, pressed, scope=scope)
+            StopOrder(
+                notice.estop_id,
+                sender,
+                "fleet e-stop",
+                "mesh",
+                True,
+                notice.t,
+                received,
+                wire.finite(body.get("pressed_at")),
+                scope=scope,
+                # Others that it names may have missed theirs.
+                original=original if len(original) <= topics.BY_NAME["estop"].max_bytes else None,
+                network=self.network,
+            )
         )
         return notice.estop_id
 

@@ -13,14 +13,12 @@ import os
 import secrets
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from strands_robots.audit import log_safety_event
 from strands_robots.safety.approval import state_dir
-from strands_robots.safety.lockout import LockoutState
-from strands_robots.safety.persistence import LockoutStore, ResumedEpochs
+from strands_robots.safety.persistence import LockoutStore
 from strands_robots.safety.state_files import (
     StateFileError,
     boot,
@@ -123,17 +121,7 @@ def _clear_on_disk(who: str, name: str) -> bool:
     locked = {key: kept for key, kept in store.load_all().items() if kept.name == name and kept.state.locked}
     if not locked:
         return False
-    store.save(
-        {
-            key: replace(
-                kept,
-                state=LockoutState(),
-                originals=(),
-                resumed=(kept.resumed or ResumedEpochs()).more([*kept.seen, *kept.state.resumable]),
-            )
-            for key, kept in locked.items()
-        }
-    )
+    store.save({key: kept.freed() for key, kept in locked.items()})
     for kept in locked.values():
         log_safety_event("resume_local", name, {"who": who, "epochs": list(kept.state.epochs), "persisted": True})
     return True

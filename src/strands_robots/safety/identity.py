@@ -217,11 +217,13 @@ class EnrolledRobot:
         networks: where it was enrolled, the latest last; empty in a record of an earlier release, which counts on
             every network until the robot has answered signed.
         exemption: None while it must answer.
+        cell: that it stated as it was enrolled, "" for none; None where that is unknown.
     """
 
     key: bytes
     networks: tuple[NetworkKey, ...] = ()
     exemption: Exemption | None = None
+    cell: str | None = None
 
     def at(self, network: NetworkKey) -> EnrolledRobot:
         """Return the record with this network besides those it has."""
@@ -270,7 +272,12 @@ class EnrolledKeys:
         return known
 
     def enroll(
-        self, found: Mapping[str, bytes], *, replace: bool = False, network: NetworkKey | None = None
+        self,
+        found: Mapping[str, bytes],
+        *,
+        replace: bool = False,
+        network: NetworkKey | None = None,
+        cells: Mapping[str, str] | None = None,
     ) -> dict[str, Exemption]:
         """Keep these public keys beside those already there; return exemptions undone.
 
@@ -278,6 +285,7 @@ class EnrolledKeys:
             found: keys of robots that were heard with them.
             replace: a robot's changed key is taken, and it is expected on this network alone of its kind.
             network: where they were heard.
+            cells: that they state now; of the others what was known stays.
 
         Raises:
             KeyChangedError: a robot has another key here, and ``replace`` is false; nothing was kept.
@@ -298,7 +306,8 @@ class EnrolledKeys:
                 networks = robot.networks if robot is not None else ()
                 if replace and network is not None:
                     networks = tuple(each for each in networks if each.kind != network.kind)
-                record = EnrolledRobot(public, networks)
+                cell = (cells or {}).get(name, robot.cell if robot is not None else None)
+                record = EnrolledRobot(public, networks, cell=cell)
                 known[name] = record if network is None else record.at(network)
         return undone
 
@@ -380,19 +389,22 @@ def _robot(record: Mapping[str, Any]) -> EnrolledRobot | None:
     if key is None:
         return None
     networks = tuple(NetworkKey.parse(each) for each in record.get("networks", ()))
-    exempt = record.get("exempt")
+    exempt, cell = record.get("exempt"), record.get("cell")
+    cell = None if cell is None else str(cell)
     if exempt is None:
-        return EnrolledRobot(key, networks)
+        return EnrolledRobot(key, networks, cell=cell)
     if exempt["state"] not in EXEMPT_STATES:
         raise ValueError(f"no state of an exempt robot: {exempt['state']!r}")
     stated = Exemption(exempt["state"], str(exempt["by"]), str(exempt["reason"]), float(exempt["at"]))
-    return EnrolledRobot(key, networks, stated)
+    return EnrolledRobot(key, networks, stated, cell)
 
 
 def _record(robot: EnrolledRobot) -> dict[str, Any]:
     record: dict[str, Any] = {"key": ed25519.encode(robot.key)}
     if robot.networks:
         record["networks"] = [each.text for each in robot.networks]
+    if robot.cell is not None:
+        record["cell"] = robot.cell
     if robot.exemption is not None:
         record["exempt"] = field_values(robot.exemption)
     return record

@@ -15,6 +15,7 @@ from typing import Any
 
 from strands_robots.envelope import Envelope, error
 from strands_robots.safety.scope import EVERY_ROBOT, SCOPE, Scope
+from strands_robots.safety.state_files import uptime
 from strands_robots.utils import shown
 
 MAX_EPOCHS = 64
@@ -26,8 +27,20 @@ SEEN_MAX = 256
 RESUMED_MAX = 4096
 """Epochs that a robot was resumed from, and never locks by again. Only a resume adds one; the oldest go first."""
 
+CLEARED_MAX = 8
+"""Spans of stops that a robot could not tell apart and was cleared of. Beyond it the two oldest become one."""
+
+SKEW_S = 1.0
+"""Seconds by which another process may have received a stop earlier."""
+
+LONG_AGO = -1e12
+"""Seconds since boot of a moment that nobody knows, before all others."""
+
 OVERFLOW = "overflow"
 """Name of the epoch that stands for every stop beyond the first 64; no 32-hex id equals it."""
+
+Span = tuple[float, float]
+"""Two moments in seconds since boot."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,11 +128,15 @@ class LockoutLatch:
         seen: Iterable[str] = (),
         clock: Callable[[], float] = time.time,
         resumed: Iterable[str] = (),
+        *,
+        cleared: tuple[Span, ...] = (),
+        crowded: float = LONG_AGO,
     ) -> None:
         self.robot_id = robot_id
         self._state = state or LockoutState()
         self._seen: dict[str, None] = dict.fromkeys([*seen, *self._state.resumable])
         self._resumed = dict.fromkeys(resumed)
+        self._cleared, self._crowded_since = cleared, crowded
         self._clock = clock
         self._writing = threading.Lock()
 
@@ -139,6 +156,20 @@ class LockoutLatch:
         """Epochs that it was resumed from, oldest first; replaced when one is new."""
         return self._resumed
 
+    @property
+    def cleared(self) -> tuple[Span, ...]:
+        """Spans of floods that it was cleared of; replaced when one is new."""
+        return self._cleared
+
+    @property
+    def crowded_since(self) -> float:
+        """Seconds since boot from which on the overflow stands for stops."""
+        return self._crowded_since
+
+    def cleared_of(self, received: float) -> bool:
+        """Return True for a stop of this moment that may be one it was cleared of."""
+        return any(since <= received <= until for since, until in self._cleared)
+
     def knows(self, epoch: str) -> bool:
         """Return True for a stop that no longer engages."""
         return epoch in self._seen or epoch in self._resumed
@@ -153,7 +184,11 @@ class LockoutLatch:
             if self.knows(epoch):
                 return False
             self._seen[epoch] = None
+            crowded = self._state.overflow is not None
             self._state = self._state.engage(Lockout(epoch, source, reason, self._clock(), scope))
+            if self._state.overflow is not None and not crowded:
+                # An overflow that is taken over stands for stops of which no time is known.
+                self._crowded_since = LONG_AGO if epoch == OVERFLOW else uptime() - SKEW_S
             self._forget()
             return True
 
@@ -166,15 +201,16 @@ class LockoutLatch:
     def clear(self) -> tuple[Lockout, ...]:
         """Clear every lockout, for an operator at this machine; return them."""
         with self._writing:
+            self._cleared = with_cleared(self._cleared, self._state, self._crowded_since)
             cleared, self._state = self._state.all, LockoutState()
-            # Those that the overflow stood for are among the seen.
             self._add_resumed(self._seen)
             return cleared
 
-    def forgo(self, epochs: Iterable[str]) -> None:
+    def forgo(self, epochs: Iterable[str], cleared: tuple[Span, ...] = ()) -> None:
         """Never lock by these again, as after their resume."""
         with self._writing:
             self._add_resumed(epochs)
+            self._cleared = (*cleared, *self._cleared)[-CLEARED_MAX:] if cleared else self._cleared
 
     def _add_resumed(self, epochs: Iterable[str]) -> None:
         self._resumed = with_resumed(self._resumed, epochs)
@@ -185,6 +221,14 @@ class LockoutLatch:
         active = set(self._state.resumable)
         oldest = next(epoch for epoch in self._seen if epoch not in active)
         del self._seen[oldest]
+
+
+def with_cleared(cleared: tuple[Span, ...], state: LockoutState, since: float) -> tuple[Span, ...]:
+    """Return the spans with that of an overflow that is cleared now, if there is one."""
+    if state.overflow is None:
+        return cleared
+    spans = (*cleared, (since, uptime()))
+    return spans if len(spans) <= CLEARED_MAX else ((spans[0][0], spans[1][1]), *spans[2:])
 
 
 def with_resumed(resumed: dict[str, None], epochs: Iterable[str]) -> dict[str, None]:

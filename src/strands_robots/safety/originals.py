@@ -6,7 +6,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from strands_robots.safety import ed25519
@@ -32,6 +32,7 @@ class Original:
         payload: the message.
         network: where it was received; it is passed on nowhere else.
         received: seconds since boot of its first receipt, see :func:`~.state_files.uptime`.
+        learnt: that moment is one that an answer to this process stated.
     """
 
     epoch: str
@@ -39,12 +40,13 @@ class Original:
     payload: bytes
     network: str
     received: float
+    learnt: bool = False
 
     def record(self) -> dict[str, Any]:
         """Return the original as it stands in a file."""
-        at = {"boot": boot(), "up": self.received, "wall": time.time() - (uptime() - self.received)}
         event = ed25519.encode(self.payload)
-        return {"epoch": self.epoch, "source": self.source, "event": event, "network": self.network, **at}
+        stated = {"epoch": self.epoch, "source": self.source, "event": event, "network": self.network}
+        return {**stated, **moment(self.received), **({"learnt": True} if self.learnt else {})}
 
     @classmethod
     def of(cls, record: Mapping[str, Any]) -> Original:
@@ -57,7 +59,12 @@ class Original:
         texts = [record[name] for name in ("epoch", "source", "network")]
         if payload is None or not all(isinstance(each, str) for each in texts):
             raise ValueError("an original without its bytes or its names")
-        return cls(texts[0], texts[1], payload, texts[2], since_boot(record))
+        return cls(texts[0], texts[1], payload, texts[2], since_boot(record), record.get("learnt") is True)
+
+
+def moment(up: float) -> dict[str, Any]:
+    """Return a moment in seconds since boot as it stands in a file."""
+    return {"boot": boot(), "up": up, "wall": time.time() - (uptime() - up)}
 
 
 def since_boot(record: Mapping[str, Any]) -> float:
@@ -104,6 +111,20 @@ class Originals:
         The latest may be for more robots than the first.
         """
         self._new.append(original)
+
+    def younger(self, network: str, epoch: str, payload: bytes, received: float) -> None:
+        """Correct the moment of an original that was learnt, if it was received later.
+
+        Whoever states too high an age must not have others take a stop for one from before their time.
+        """
+        with self._lock:
+            self._sort_in()
+            rows = self._stored.get((network, epoch), ())
+            if any(each.learnt and each.payload == payload and each.received < received for each in rows):
+                self._stored[network, epoch] = tuple(
+                    replace(each, received=received) if each.learnt and each.payload == payload else each
+                    for each in rows
+                )
 
     def has(self, epoch: str, network: str) -> bool:
         """Return True where this stop is kept, or is about to be."""

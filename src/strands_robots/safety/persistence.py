@@ -14,15 +14,24 @@ import os
 import re
 import threading
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from strands_robots.safety.approval import state_dir
-from strands_robots.safety.lockout import MAX_EPOCHS, OVERFLOW, Lockout, LockoutState, with_resumed
-from strands_robots.safety.originals import STORED_MAX_BYTES, Original, newest_within, since_boot
+from strands_robots.safety.lockout import (
+    LONG_AGO,
+    MAX_EPOCHS,
+    OVERFLOW,
+    Lockout,
+    LockoutState,
+    Span,
+    with_cleared,
+    with_resumed,
+)
+from strands_robots.safety.originals import STORED_MAX_BYTES, Original, moment, newest_within, since_boot
 from strands_robots.safety.resume import is_epoch
 from strands_robots.safety.scope import SCOPE, Scope
 from strands_robots.safety.state_files import (
@@ -41,7 +50,6 @@ logger = stop_logger(__name__)
 
 VERSION = 2
 RESUMED_VERSION = 1
-LONG_AGO = -1e12
 VERSION_OF_ALL = 1
 """Version of ``lockouts.json``, in which earlier releases kept all robots of a machine."""
 
@@ -52,14 +60,16 @@ class ResumedEpochs:
 
     Attributes:
         since: seconds since boot at which the robot was first registered on this state directory.
+        cleared: moments between which it was locked by more stops than it tells apart, until it was cleared.
     """
 
     epochs: Mapping[str, None] = field(default_factory=dict)
     since: float = field(default_factory=uptime)
+    cleared: tuple[Span, ...] = ()
 
-    def more(self, epochs: Iterable[str]) -> ResumedEpochs:
-        """Return the record with these."""
-        return replace(self, epochs=with_resumed(dict(self.epochs), epochs))
+    def holds(self, epochs: Mapping[str, None], cleared: tuple[Span, ...]) -> bool:
+        """Return True where it is the record of these very objects."""
+        return self.epochs is epochs and self.cleared is cleared
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +79,7 @@ class StoredLockout:
     Attributes:
         originals: the stops that lock it, as they arrived.
         resumed: None where there is no record yet; a lockout that is saved without leaves it as it is.
+        crowded_since: seconds since boot from which on the overflow stands for stops.
     """
 
     state: LockoutState = field(default_factory=LockoutState)
@@ -76,6 +87,15 @@ class StoredLockout:
     name: str = ""
     originals: tuple[Original, ...] = ()
     resumed: ResumedEpochs | None = None
+    crowded_since: float = LONG_AGO
+
+    def freed(self) -> StoredLockout:
+        """Return the record after an operator cleared the robot."""
+        state, resumed = self.state, self.resumed or ResumedEpochs()
+        epochs = with_resumed(dict(resumed.epochs), [*self.seen, *state.resumable])
+        spans = with_cleared(resumed.cleared, state, self.crowded_since)
+        freed = replace(resumed, epochs=epochs, cleared=spans)
+        return replace(self, state=LockoutState(), originals=(), resumed=freed)
 
 
 def hardware_key(kind: str, stable_id: str) -> str:
@@ -176,11 +196,11 @@ class LockoutStore:
         """
         if not resumed:
             return
-        up, wall = uptime(), time.time()
         records = {}
         for key, each in resumed.items():
-            since = {"boot": boot(), "up": each.since, "wall": wall - (up - each.since)}
-            records[self.resumed_file(key)] = {"v": RESUMED_VERSION, "key": key, **since, "epochs": list(each.epochs)}
+            spans = [[moment(at) for at in span] for span in each.cleared]
+            stated = {"v": RESUMED_VERSION, "key": key, **moment(each.since), "epochs": list(each.epochs)}
+            records[self.resumed_file(key)] = {**stated, **({"cleared": spans} if spans else {})}
         self._save(self.resumed_directory, records)
 
     def _save(self, directory: Path, records: Mapping[Path, dict[str, Any]]) -> None:
@@ -234,11 +254,12 @@ class LockoutStore:
             # A clock that was set back since tells no age: every stop may be of its time.
             set_back = record["boot"] != boot() and time.time() < float(record["wall"])
             since = LONG_AGO if set_back else since_boot(record)
-        except (KeyError, TypeError) as exc:
+            cleared = tuple((since_boot(first), since_boot(last)) for first, last in record.get("cleared", ()))
+        except (KeyError, TypeError, ValueError) as exc:
             raise ValueError(f"{path.name} is no record of resumed epochs: {exc!r}") from exc
         if record.get("key") != key:
             raise ValueError(f"{path.name} is of another robot")
-        return ResumedEpochs(epochs, since)
+        return ResumedEpochs(epochs, since, cleared)
 
     @property
     def _aside(self) -> Path:
@@ -287,6 +308,7 @@ def _record(kept: StoredLockout) -> dict[str, Any]:
         "name": kept.name,
         "holds": [_fields(each) for each in kept.state.lockouts],
         "overflow": _fields(kept.state.overflow) if kept.state.overflow else None,
+        **({"crowded": moment(kept.crowded_since)} if kept.state.overflow else {}),
         "seen": list(kept.seen),
         **({"originals": [each.record() for each in _fitting(kept.originals)]} if kept.originals else {}),
     }
@@ -315,7 +337,9 @@ def _stored(record: Mapping[str, Any]) -> StoredLockout:
         raise ValueError("more epochs than a robot tells apart, or one of them twice")
     seen = tuple(each for each in record["seen"] if is_epoch(each))
     originals = tuple(Original.of(each) for each in record.get("originals", ()))
-    return StoredLockout(LockoutState(lockouts, overflow), seen, str(record.get("name", "")), originals)
+    crowded = since_boot(record["crowded"]) if "crowded" in record else LONG_AGO
+    state, name = LockoutState(lockouts, overflow), str(record.get("name", ""))
+    return StoredLockout(state, seen, name, originals, crowded_since=crowded)
 
 
 def _lockout(data: Mapping[str, Any]) -> Lockout:

@@ -19,7 +19,7 @@ from strands_robots.safety.checkin import CheckIn
 from strands_robots.safety.clearance import CLEARED, LEFT, NOT_KEPT, NOT_LOCKED, ClearanceInbox
 from strands_robots.safety.gate import MotionGate
 from strands_robots.safety.lockout import Lockout, LockoutLatch, LockoutState
-from strands_robots.safety.orders import LISTENER, RobotReport, StopOrder, new_epoch
+from strands_robots.safety.orders import LISTENER, MISSED, RobotReport, StopOrder, new_epoch
 from strands_robots.safety.originals import Original, Originals
 from strands_robots.safety.persistence import LockoutStore, ResumedEpochs, StoredLockout
 from strands_robots.safety.reporting import UNPACED, OnReport, Reporter, StopRun
@@ -82,11 +82,13 @@ class Registered:
         self.users = 1
         self.gates: tuple[MotionGate, ...] = (robot.gate,)
         resumed = kept.resumed or ResumedEpochs()
-        self.latch = LockoutLatch(wire_id, kept.state, kept.seen, resumed=resumed.epochs)
+        self.latch = LockoutLatch(
+            wire_id, kept.state, kept.seen, resumed=resumed.epochs, cleared=resumed.cleared, crowded=kept.crowded_since
+        )
         self.on_disk = kept.state
         self.registered_before = kept.resumed is not None
-        self.resumed_on_disk = self.latch.resumed if self.registered_before else None
         self._recorded_since, self._here_since = resumed.since, uptime()
+        self.resumed_on_disk = None if kept.resumed is None else self.resumed
         self.keep_again = False
         self.verdict = StopVerdict(unknown={robot_id: "its halt has not answered yet"})
         self._halted_at = float("-inf")
@@ -110,15 +112,18 @@ class Registered:
     @property
     def resumed(self) -> ResumedEpochs:
         """The record of the epochs that it was resumed from."""
-        return ResumedEpochs(self.latch.resumed, self._recorded_since)
+        return ResumedEpochs(self.latch.resumed, self._recorded_since, self.latch.cleared)
+
+    @property
+    def resumed_unsaved(self) -> bool:
+        """True while the disk lacks an epoch that it was resumed from."""
+        epochs, cleared, stored = self.latch.resumed, self.latch.cleared, self.resumed_on_disk
+        return bool(epochs or cleared) and not (stored and stored.holds(epochs, cleared))
 
     @property
     def unsaved(self) -> bool:
         """True while the disk has an older state or none."""
-        resumed = self.latch.resumed
-        return bool(self.key) and (
-            self.latch.state is not self.on_disk or (bool(resumed) and resumed is not self.resumed_on_disk)
-        )
+        return bool(self.key) and (self.latch.state is not self.on_disk or self.resumed_unsaved)
 
     @property
     def unrecorded(self) -> bool:
@@ -143,7 +148,7 @@ class Registered:
         self.key = key
         if kept.resumed is not None:
             self.registered_before, self._recorded_since = True, kept.resumed.since
-            self.latch.forgo(kept.resumed.epochs)
+            self.latch.forgo(kept.resumed.epochs, kept.resumed.cleared)
         self.inherit(kept.state)
 
     def inherit(self, state: LockoutState) -> None:
@@ -179,7 +184,7 @@ class Registered:
         A stop is known, or one of a flood that locks nothing more: the latest halt answers for it. A missed one may be
         from before its time.
         """
-        if order.age_s > uptime() - self._here_since:
+        if order.path == MISSED and not self._missed(uptime() - order.age_s - (time.monotonic() - order.received)):
             return False
         lock = functools.partial(self.latch.engage, order.epoch, order.source, order.reason, order.scope)
         if not self.crowded:
@@ -188,6 +193,10 @@ class Registered:
             return False
         self._halted_at = order.received
         return True
+
+    def _missed(self, received: float) -> bool:
+        """Return False for a stop of before its time, or of a flood it was cleared of."""
+        return received >= self._here_since and not self.latch.cleared_of(received)
 
     @property
     def crowded(self) -> bool:
@@ -537,6 +546,10 @@ class SafetyPlane:
         """Return the stops of ``network`` that lock robots here, as they arrived."""
         return self._originals.of(self._held(), network)
 
+    def stated_again(self, network: str, epoch: str, payload: bytes, age_s: float) -> None:
+        """Take the age of a missed stop that locks robots here from a further answer."""
+        self._originals.younger(network, epoch, payload, uptime() - age_s)
+
     def hold(self, seconds: float) -> None:
         """Hold the motions of every robot for so long; return at once."""
         for entry in self._robots.values():
@@ -566,7 +579,8 @@ class SafetyPlane:
     def _note_original(self, order: StopOrder) -> None:
         if order.original is not None:
             received = uptime() - (time.monotonic() - order.received) - order.age_s
-            self._originals.add(Original(order.epoch, order.source, order.original, order.network, received))
+            learnt = order.path == MISSED
+            self._originals.add(Original(order.epoch, order.source, order.original, order.network, received, learnt))
 
     def _keep(self, entries: Iterable[Registered]) -> None:
         # One at a time, so that no older state is written over a newer one.
@@ -584,21 +598,22 @@ class SafetyPlane:
             for entry, record in kept.items():
                 entry.on_disk = record.state
                 if record.resumed is not None:
-                    entry.resumed_on_disk = record.resumed.epochs
+                    entry.resumed_on_disk = record.resumed
                 if entry.keep_again:
                     entry.keep_again = False
                     logger.warning("The lockout file of %s is written now.", entry.robot_id)
                     queue_safety_event("lockout_kept", entry.robot_id, {"epochs": list(record.state.epochs)})
 
     def _record_of(self, entry: Registered) -> StoredLockout:
-        latch, resumed = entry.latch, entry.resumed
+        latch = entry.latch
         state = latch.state
         return StoredLockout(
             state,
             latch.seen,
             entry.wire_id,
             tuple(self._originals.of(frozenset(state.resumable))),
-            resumed if resumed.epochs and resumed.epochs is not entry.resumed_on_disk else None,
+            entry.resumed if entry.resumed_unsaved else None,
+            latch.crowded_since,
         )
 
     def _held(self, leaving: Iterable[Registered] = ()) -> frozenset[str]:
@@ -627,7 +642,7 @@ class SafetyPlane:
         with self._keeping:
             self.store.save_resumed({entry.key: each for entry, each in resumed.items() if entry.key})
             for entry, each in resumed.items():
-                entry.resumed_on_disk = each.epochs
+                entry.resumed_on_disk = each
 
     def _record(self, run: StopRun) -> None:
         order = run.order

@@ -49,6 +49,15 @@ class Member:
     was_here: bool = False
 
 
+@dataclass(frozen=True, slots=True)
+class Stated:
+    """A missed stop as an answer has it: its bytes, its age in s and who answered."""
+
+    payload: bytes
+    age_s: float
+    answerer: str
+
+
 class KnownKeys:
     """Keys of this machine's robots, of enrolled ones, and of those who may stop."""
 
@@ -143,21 +152,22 @@ class RobotsPort:
         return self.lock(
             epoch,
             lambda: self._rules.order(source, params, MISSED, payload, network=self._network, age_s=age_s),
-            answerer,
+            Stated(payload, age_s, answerer),
         )
 
-    def lock(self, epoch: str, decide: Callable[[], StopOrder | StopRefused], answerer: str) -> bool:
+    def lock(self, epoch: str, decide: Callable[[], StopOrder | StopRefused], stated: Stated) -> bool:
         """Lock by a missed stop unless all know it; False when it does not count."""
         if all(each.latch.knows(epoch) for each in self._plane.robots.values()):
+            self._plane.stated_again(self._network, epoch, stated.payload, stated.age_s)
             return True
         order = decide()
         if isinstance(order, StopRefused):
             return False
-        source, age_s = order.source, order.age_s
         run = self._plane.begin(order, self._on_report)
         for robot_id in run.robot_ids if run is not None else ():
             logger.warning("%s is locked by emergency stop %s, which it had missed.", robot_id, epoch)
-            facts = {"epoch": epoch, "source": source[:256], "answerer": answerer[:256], "age_s": round(age_s, 3)}
+            sender, answerer = order.source[:256], stated.answerer[:256]
+            facts = {"epoch": epoch, "source": sender, "answerer": answerer, "age_s": round(stated.age_s, 3)}
             queue_safety_event("missed_stop_learnt", robot_id, facts)
         return True
 

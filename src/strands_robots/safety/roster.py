@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety.identity import EnrolledKeys, EnrolledRobot, Exemption, of_tenant
 from strands_robots.safety.network_key import NetworkKey
+from strands_robots.safety.scope import Scope
 from strands_robots.safety.sighting_file import CROWDED
 from strands_robots.safety.sightings import Known, Sighting, Sightings, sightings, this_moment
 from strands_robots.safety.state_files import uptime
@@ -38,6 +39,7 @@ class RosterRow:
         processes: run id and pid of every living process of this machine that serves it; each must answer.
         exemption: of rows of :attr:`Roster.exempt`.
         reported_by: the controller that reported it, "" where this machine heard it.
+        enrolled_cell: of its enrolment, "" for none; None where that is unknown.
     """
 
     name: str
@@ -53,6 +55,35 @@ class RosterRow:
     processes: tuple[tuple[str, int], ...] = ()
     exemption: Exemption | None = None
     reported_by: str = ""
+    enrolled_cell: str | None = None
+
+    @property
+    def last_cell(self) -> str:
+        """The cell in which it was heard last, else that of its enrolment; "" for none."""
+        return self.cell or self.enrolled_cell or ""
+
+    def within(self, scope: Scope, stated: str | None) -> bool:
+        """Return False for a robot of another cell than that of a scope.
+
+        Anyone may forge a presence. It takes no enrolled robot out of the count, and of one that has shown a key it
+        does not contradict what is remembered.
+
+        Args:
+            stated: the cell that it was heard in last, "" for none; None where it reads no scope.
+        """
+        if scope.everything or scope.only or stated is None:
+            return stated is None or scope.covers(self.name, ())
+        if self.processes:
+            cells = [self.cell]
+        elif self.known is Known.ENROLLED:
+            if self.enrolled_cell is None:
+                return True
+            cells = [self.enrolled_cell, stated, *([self.cell] if self.cell else [])]
+        elif stated and stated != self.cell and self.age_s is not None and self.known is not Known.HEARD:
+            cells = [""]
+        else:
+            cells = [stated]
+        return any(scope.covers(self.name, {cell} - {""}) for cell in cells)
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,7 +180,8 @@ class Roster:
         here = {name: robot for name, robot in enrolled.items() if not robot.networks or memory.at(robot.networks)}
         exempt: list[RosterRow] = []
         for name, robot in here.items():
-            known = replace(rows.get(name, RosterRow(name, Known.ENROLLED)), exemption=robot.exemption)
+            row = rows.get(name, RosterRow(name, Known.ENROLLED))
+            known = replace(row, exemption=robot.exemption, enrolled_cell=robot.cell)
             if robot.exemption is not None and not known.alive:
                 exempt.append(known)
                 rows.pop(name, None)

@@ -227,7 +227,7 @@ class StandingRoster:
         marked = {row.name for row in roster.exempt}
         rows |= {name: RosterRow(name, Known.HEARD) for name in self._also() if name not in rows and name not in marked}
         scope = followed.scope
-        rows = {name: row for name, row in rows.items() if scope.covers(name, {row.cell} - {""})}
+        rows = {name: row for name, row in rows.items() if row.within(scope, row.last_cell)}
         if self._unanswered is not None:
             return [rows[name] for name in self._unanswered(followed.estop_id, rows)]
         graded = Answers(keys, required=False, pressed_at=0.0)

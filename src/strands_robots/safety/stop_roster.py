@@ -352,16 +352,8 @@ class StopRoster:
         return proofs
 
     def _covers(self, row: RosterRow) -> bool:
-        """Return False for a robot of another cell.
-
-        Anyone may forge a presence: of a robot that has shown a key it does not contradict what is remembered.
-        """
-        cell = self._cells.get(row.name, row.cell)
-        if row.processes:
-            cell = row.cell
-        elif cell and cell != row.cell and row.age_s is not None and row.known is not Known.HEARD:
-            cell = ""
-        return self.scope.everything or cell is None or self.scope.covers(row.name, {cell} - {""})
+        """Return False for a robot of another cell."""
+        return row.within(self.scope, self._cells.get(row.name, row.last_cell))
 
     def _elsewhere(self, silent: Collection[str]) -> dict[str, tuple[NetworkKey, float]]:
         """Return where else robots of these names were heard last, and seconds since."""

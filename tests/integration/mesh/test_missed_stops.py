@@ -15,8 +15,11 @@ import zenoh
 from fixtures.mesh_peer import MeshPeer
 from fixtures.roster_robots import RosterRobots
 from fixtures.tcp_proxy import TcpProxy
-from fixtures.waiting import eventually
+from fixtures.waiting import eventually, free_port
 from tests.integration.mesh.conftest import Join
+
+from strands_robots.mesh.transport.zenoh import ZenohTransport
+from strands_robots.mesh.transport.zenoh_config import Posture
 
 LEASE_S = 4.0
 STRANGERS = 10_000
@@ -168,3 +171,27 @@ def test_answers_of_strangers_hide_no_stop_and_lock_nothing_of_their_own(join: J
         # Zenoh's session cannot be closed while a thread publishes.
         for each in floods:
             each.join(60)
+
+
+def test_session_tells_the_return_of_its_only_link_from_that_of_one_of_several() -> None:
+    listen = f"tcp/127.0.0.1:{free_port()}"
+    own = ZenohTransport(Posture("strands", (), (listen,), None, None, None, False, 16))
+    others = [ZenohTransport(Posture("strands", (listen,), (), None, None, None, False, 16)) for _ in range(2)]
+    try:
+        own.connect()
+        for each in others:
+            each.connect()
+        eventually(lambda: own.links_up == 2)
+        others[0].close()
+        eventually(lambda: own.links_up == 1)
+        others[0].connect()
+        eventually(lambda: own.links_back() == 1, what="one of two links is back")
+        assert own.rejoined() == 0
+        for each in others:
+            each.close()
+        eventually(lambda: own.links_up == 0)
+        others[0].connect()
+        eventually(lambda: own.rejoined() == 1, what="the first of no links is back")
+    finally:
+        for each in (own, *others):
+            each.close()

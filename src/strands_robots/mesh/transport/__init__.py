@@ -167,6 +167,10 @@ class Transport(ABC):
         """Return how often a link came up after one had been lost."""
         return 0
 
+    def rejoined(self) -> int:
+        """Return how often a link came up where none was left."""
+        return self.links_back()
+
     def lost_link_at(self) -> float | None:
         """Return the time of the last loss of the hub, monotonic s, or None."""
         return None

@@ -234,6 +234,10 @@ class BridgeTransport(Transport):
     def anchored(self) -> bool:
         return self._local.anchored()
 
+    def rejoined(self) -> int:
+        # Each side has peers that the other one does not reach.
+        return self._local.rejoined() + self._cloud.rejoined()
+
     def links_back(self) -> int:
         return self._local.links_back() + self._cloud.links_back()
 

@@ -67,10 +67,15 @@ class MemoryBus:
         with self._lock:
             return [each for each in self._declared if each.owner is owner]
 
-    def partition(self, transport: MemoryTransport, cut: bool = True) -> None:
-        """Lose every message from and to a session; ``cut=False`` heals it."""
+    def partition(self, transport: MemoryTransport, cut: bool = True, *, stayed: bool = False) -> None:
+        """Lose every message from and to a session; ``cut=False`` heals it.
+
+        Args:
+            stayed: it is told that others of its links were up all the time.
+        """
         with self._lock:
             if not cut and transport in self._cut:
+                transport.stayed += stayed
                 transport.healed += 1
             (self._cut.add if cut else self._cut.discard)(transport)
 
@@ -119,7 +124,8 @@ class MemoryTransport(Transport):
         self._id = session or secrets.token_hex(16)
         self._sessionless = sessionless
         self._open = False
-        self.healed = 0
+        self.healed, self.stayed = 0, 0
+        """Number of times that its links came back, and of those at which others had stayed."""
 
     @property
     def session_id(self) -> str | None:
@@ -137,6 +143,9 @@ class MemoryTransport(Transport):
 
     def links_back(self) -> int:
         return self.healed
+
+    def rejoined(self) -> int:
+        return self.healed - self.stayed
 
     def put(self, key: str, payload: bytes | Mapping[str, Any]) -> None:
         self._require_open()

@@ -48,7 +48,10 @@ class ZenohTransport(Transport):
         self._links: Any = None
         self._hub = False
         self._lost_link_at = -math.inf
+        self.links_up = 0
+        """Number of links to other sessions."""
         self._links_lost = self._links_back = 0
+        self._cut, self._rejoined = False, 0
         self._numbers = count()
         self._publishers: dict[str, tuple[Any, Any]] = {}
         self._closing = threading.Event()
@@ -80,7 +83,7 @@ class ZenohTransport(Transport):
             self._zenoh = zenoh
             posture = self._posture = self._posture or Posture.from_settings()
             self._closing.clear()
-            self._hub, self._links_lost = False, 0
+            self._hub, self.links_up, self._links_lost, self._cut = False, 0, 0, False
             if posture.hub is None:
                 self._session = self._open(zenoh_config.explicit(posture, self._id))
             else:
@@ -131,6 +134,9 @@ class ZenohTransport(Transport):
 
     def links_back(self) -> int:
         return self._links_back
+
+    def rejoined(self) -> int:
+        return self._rejoined
 
     def put(self, key: str, payload: bytes | Mapping[str, Any]) -> None:
         topic = topics.topic_of(key)
@@ -259,18 +265,20 @@ class ZenohTransport(Transport):
         def changed(event: Any) -> None:
             if event.kind == self._zenoh.SampleKind.PUT:
                 close_in_background()
+                self.links_up += 1
+                self._rejoined, self._cut = self._rejoined + self._cut, False
                 if self._links_lost:
                     self._links_lost -= 1
                     self._links_back += 1
                 return
-            self._links_lost += 1
+            self.links_up, self._links_lost = self.links_up - 1, self._links_lost + 1
+            self._cut = self._cut or self.links_up <= 0
             if of_hub and not self._closing.is_set():
                 self._lost_link_at = time.monotonic()
                 threading.Thread(target=self._rescue, name="mesh-rescue", daemon=True).start()
 
         direct = self._zenoh.handlers.Callback(changed, indirect=False)
-        self._links = session.info.declare_transport_events_listener(direct, history=False)
-        close_in_background()  # the links that came up before
+        self._links = session.info.declare_transport_events_listener(direct, history=True)
 
     def _rescue(self) -> None:
         """Try to become the hub until our session is linked to one again."""
