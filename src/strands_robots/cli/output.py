@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from enum import IntEnum
 from typing import Any
@@ -27,6 +28,9 @@ from strands_robots.errors import StrandsRobotsError
 LENGTH_MAX = 400
 """Characters of one network text that are shown."""
 
+COPYABLE_MAX = 10_000
+"""Characters of a line to paste elsewhere: one that is cut would do something else."""
+
 WIDE = 4096
 """Columns of what is not a terminal."""
 
@@ -35,6 +39,12 @@ PANEL_WIDTH = 100
 
 LATE_S = 2.0
 """Age in seconds of a robot's last sign of life that is shown in red: our robots give one a second."""
+
+SIGNED = frozenset({"statement", "assertion", "sig", "signature"})
+"""Fields of an answer that prove it, and say nothing to a person."""
+
+_ENCODED = re.compile(r"(?<![A-Za-z0-9+/_-])[A-Za-z0-9+/_-]{40,}={0,2}")
+"""Text that may be base64 of a key, a signature or a picture."""
 
 LOG_LINES = 5
 POLL_S = 0.05
@@ -72,6 +82,26 @@ def label(value: object, style: str = "") -> Text:
     return Text(plain(value), style=style)
 
 
+def readable(value: Any) -> Any:
+    """Return an answer's value for people: without signatures, and with encoded bytes as their number.
+
+    ``--json`` has all of it.
+    """
+    if isinstance(value, Mapping):
+        return {name: readable(each) for name, each in value.items() if name not in SIGNED}
+    if isinstance(value, list | tuple):
+        return [readable(each) for each in value]
+    return _ENCODED.sub(_length, value) if isinstance(value, str) else value
+
+
+def _length(encoded: re.Match[str]) -> str:
+    text = encoded[0]
+    # A long name or path has no capitals, small letters and digits at once.
+    if not all(any(kind(char) for char in text) for kind in (str.isupper, str.islower, str.isdigit)):
+        return text
+    return f"<{len(text)} characters, shown by --json>"
+
+
 def first_line(description: object) -> str:
     """Return the first line of a function's description."""
     return str(description or "").strip().partition("\n")[0]
@@ -103,7 +133,7 @@ class Screen:
     def copyable(self, text: str, style: str = "") -> None:
         """Print a line to paste elsewhere, never broken at the terminal's width."""
         if not self.machine:
-            self.out.print(label(text), style=style, soft_wrap=True)
+            self.out.print(Text(plain(text, COPYABLE_MAX)), style=style, soft_wrap=True)
 
     def show(self, thing: RenderableType) -> None:
         """Print a table or panel for people."""

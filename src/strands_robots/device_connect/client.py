@@ -37,6 +37,9 @@ T = TypeVar("T")
 COLLECT_MARGIN_S = 3.0
 """Seconds that a discovery may last beyond its own deadline, on a loaded machine."""
 
+CONNECT_MARGIN_S = 3.0
+"""Seconds beyond a link's own deadline, in which it finds out why nobody answered."""
+
 PURPOSES = {"getStatus": Purpose.LOCKOUT_STATE, "resume": Purpose.RESUME_ANSWER}
 """Functions whose answer has a signed part, with its purpose."""
 
@@ -95,7 +98,7 @@ class FleetClient:
     def __enter__(self) -> Self:
         self._thread.start()
         try:
-            self._messaging = self.run(open_client(self.link), self.link.connect_timeout_s + 1.0)
+            self._messaging = self.run(open_client(self.link), self.link.connect_timeout_s + CONNECT_MARGIN_S)
             self._discovery = Discovery(self._messaging)
             self.run(self._discovery.start(), 5.0)
         except BaseException:
