@@ -1,4 +1,4 @@
-"""Banner of ``serve``: who can reach the robot, and commands for another terminal."""
+"""Banner of ``serve``: its network, and commands for another terminal."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class ServedRobot:
 
 
 def show_banner(screen: Screen, served: ServedRobot, lacking: Sequence[str]) -> None:
-    """Print the network, commands that work as pasted, and the robot's key: ten lines.
+    """Print ten lines: the network, commands to paste, the robot's key.
 
     Args:
         screen: where it is printed.
@@ -81,7 +81,10 @@ def commands(served: ServedRobot) -> Iterator[str]:
 
 
 def flags_elsewhere(link: LinkConfig) -> str:
-    """Return the flags with which a terminal without our environment reaches the link; no secrets."""
+    """Return the flags that reach the link from another terminal.
+
+    It may lack our environment and folder; passwords are left out.
+    """
     words: list[str] = []
     if link.transport == "nats":
         words += [word for url in link.connect for word in ("--nats", redacted(url))]
@@ -113,7 +116,7 @@ def _may_try(served: ServedRobot, motion: str) -> bool:
 
 
 def _state() -> str:
-    """Return what names the directory of grants, where another terminal would not know it."""
+    """Return the assignment that names the directory of grants, or empty."""
     stated = settings.verbatim("STRANDS_STATE_DIR")
     return f"STRANDS_STATE_DIR={shlex.quote(str(Path(stated).expanduser().absolute()))} " if stated else ""
 

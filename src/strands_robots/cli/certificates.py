@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def certificate_problem(link: LinkConfig, now: datetime | None = None) -> str:
-    """Return what is wrong with the certificates of ``link``, naming the file, or empty."""
+    """Return the problem of a link's certificates by its file, or empty."""
     moment = now or datetime.now(UTC)
     try:
         authorities, chain = _certificates(link.ca), _certificates(link.cert)

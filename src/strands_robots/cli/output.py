@@ -83,9 +83,9 @@ def label(value: object, style: str = "") -> Text:
 
 
 def readable(value: Any) -> Any:
-    """Return an answer's value for people: without signatures, and with encoded bytes as their number.
+    """Return an answer's value for people.
 
-    ``--json`` has all of it.
+    It comes without signatures, and with encoded bytes as their number; ``--json`` has all of it.
     """
     if isinstance(value, Mapping):
         return {name: readable(each) for name, each in value.items() if name not in SIGNED}

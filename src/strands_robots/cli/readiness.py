@@ -158,7 +158,7 @@ def dial_problem(link: LinkConfig, endpoint: str) -> str:
 
 
 def listen_problem(endpoint: str) -> str:
-    """Return why nobody can listen on an endpoint, or empty; what is no TCP is not tried."""
+    """Return why nobody can listen on a TCP endpoint, or empty."""
     from strands_robots.device_connect.backends.config import host_of  # noqa: PLC0415 - as above
     from strands_robots.device_connect.backends.reasons import reason_of  # noqa: PLC0415 - as above
 

@@ -30,7 +30,7 @@ from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety.sightings import sightings
 from strands_robots.safety.statements import Purpose
 from strands_robots.safety.stopping import Outcome, explain, grade
-from strands_robots.utils import ValidationError, device_id, shown, text
+from strands_robots.utils import ValidationError, device_id, finite, shown, text
 
 T = TypeVar("T")
 
@@ -157,6 +157,7 @@ class FleetClient:
         """Call a function of a device; return its answer.
 
         Raises:
+            ValidationError: ``params`` holds NaN or infinity, at any depth, or what JSON cannot carry.
             NoSuchDeviceError: no device has the id ``device``.
             DeviceTimeoutError: it is there and did not answer within ``timeout`` seconds.
             CallRefusedError: it refused the call as such: an unknown function, a malformed message.
@@ -301,13 +302,18 @@ class FleetClient:
 
     async def _call(self, device: str, function: str, params: dict[str, Any], within: float) -> Envelope:
         name, verb = device_id("device", device), text("function", function, longest=100)
+        for each, value in params.items():
+            finite(each, value)
         request = {
             "jsonrpc": "2.0",
             "id": uuid.uuid4().hex,
             "method": verb,
             "params": {**params, "_dc_meta": {"source_device": self.source, "source_type": "client"}},
         }
-        encoded = json.dumps(request, allow_nan=False).encode()
+        try:
+            encoded = json.dumps(request, allow_nan=False).encode()
+        except (TypeError, ValueError, RecursionError) as exc:
+            raise ValidationError(f"params must be values that JSON can carry: {exc}.") from exc
         try:
             data = await self._messaging.request(self._subject(f"{name}.cmd"), encoded, timeout=within)
         except MessagingError as exc:

@@ -1,4 +1,4 @@
-"""Dial of one endpoint by TCP and TLS: why nobody answers there, in words that a transport does not give."""
+"""Dial of one endpoint by TCP and TLS, to name why nobody answers."""
 
 from __future__ import annotations
 
