@@ -153,6 +153,9 @@ def _exit_code(screen: Screen, body: Callable[[], None]) -> Exit:
     except (MissingExtraError, ConnectionError) as missing:
         screen.fail(CliError(str(missing)))
         return Exit.REFUSED
+    except OSError as failed:
+        screen.fail(CliError(str(failed)))
+        return Exit.REFUSED
     except KeyboardInterrupt:
         return Exit.INTERRUPTED
     return Exit.OK

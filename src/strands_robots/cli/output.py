@@ -6,6 +6,7 @@ through :func:`plain` and goes to Rich as :class:`rich.text.Text`.
 
 from __future__ import annotations
 
+import errno
 import json
 import logging
 import re
@@ -46,6 +47,22 @@ SIGNED = frozenset({"statement", "assertion", "sig", "signature"})
 _ENCODED = re.compile(r"(?<![A-Za-z0-9+/_-])[A-Za-z0-9+/_-]{40,}={0,2}")
 """Text that may be base64 of a key, a signature or a picture."""
 
+_SYSTEM_ERROR = re.compile(r"\[Errno (\d+)\] ([^:'\"\n]+)(?:: ['\"]([^'\"\n]*)['\"](?: -> ['\"][^'\"\n]*['\"])?)?")
+"""A system's error as Python writes it: number, text and file."""
+
+_ERRORS = {
+    errno.ENOENT: "there is no such file or directory; check the path",
+    errno.EEXIST: "something of that name is there already; name another one, or remove it",
+    errno.ENOTDIR: "a part of that path is a file, where a directory has to be; name another one",
+    errno.EISDIR: "it is a directory, where a file has to be; name a file",
+    errno.EACCES: "this user may not use it; change its permissions, or name another one",
+    errno.EPERM: "this user may not use it; change its permissions, or name another one",
+    errno.EROFS: "its file system cannot be written; name another one",
+    errno.ENOSPC: "the disk is full; free some of it",
+    errno.EADDRINUSE: "another program holds the port; end it, or choose another port",
+    errno.ECONNREFUSED: "nothing listens there; start what should",
+}
+
 LOG_LINES = 5
 POLL_S = 0.05
 
@@ -75,6 +92,16 @@ def plain(value: object, longest: int = LENGTH_MAX) -> str:
     text = value if isinstance(value, str) else _compact(value)
     visible = "".join(_visible(char) for char in text[:longest])
     return visible if len(text) <= longest else f"{visible}... ({len(text)} characters)"
+
+
+def in_words(reason: str) -> str:
+    """Return a reason with the system's errors in words, and what to do about them."""
+    return _SYSTEM_ERROR.sub(lambda found: _words(int(found[1]), found[2], found[3] or ""), reason)
+
+
+def _words(number: int, text: str, file: str) -> str:
+    about = f"{file}: " if file else ""
+    return f"{about}{_ERRORS.get(number, text.strip())}"
 
 
 def label(value: object, style: str = "") -> Text:
@@ -148,10 +175,11 @@ class Screen:
 
     def fail(self, failure: CliError) -> None:
         """Report why a command ends without success."""
+        reason = in_words(failure.reason)
         if self.machine:
-            self.data({"status": "error", "reason": failure.reason, "exit": int(failure.code), **failure.fields})
+            self.data({"status": "error", "reason": reason, "exit": int(failure.code), **failure.fields})
         else:
-            self.err.print(label(failure.reason, "red"), soft_wrap=True)
+            self.err.print(label(reason, "red"), soft_wrap=True)
 
 
 def table(title: str, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> Table:

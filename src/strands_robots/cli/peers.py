@@ -15,7 +15,7 @@ from strands_robots.cli.network import SOURCE, Network, call_device, describe
 from strands_robots.cli.output import LATE_S, CliError, Exit, Screen, first_line, label, plain, readable, table
 from strands_robots.cli.readiness import other_user
 from strands_robots.envelope import is_error, text_of
-from strands_robots.utils import WAIT_S, number
+from strands_robots.utils import WAIT_S, device_id, number
 
 if TYPE_CHECKING:
     from strands_robots.device_connect.discovery import Peer
@@ -46,10 +46,11 @@ def peers(
         network.use_mesh()
         list_peers(screen, number("--timeout", timeout, above=0, high=60))
         return
+    wanted = None if device is None else device_id("DEVICE", device)
     with network.fleet() as fleet:
         found = fleet.peers(number("--timeout", timeout, above=0, high=60))
     if device is not None:
-        found = [peer for peer in found if peer.id == device]
+        found = [peer for peer in found if peer.id == wanted]
     if not found:
         who = "No robot" if device is None else f"No {device!r}"
         said = f"{who} answered. {describe(fleet.link)} {other_user(fleet.link)}".rstrip()

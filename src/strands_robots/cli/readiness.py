@@ -38,7 +38,7 @@ _LISTEN = "0A"
 
 def shortcomings(driver: DeviceDriver, link: LinkConfig) -> list[str]:
     """Return one sentence for each reason why a served robot is not ready."""
-    found = [driver_problem(driver), meeting_problem(link), state_problem()]
+    found = [driver_problem(driver), meeting_problem(link), link_certificate_problem(link), state_problem()]
     return [each for each in found if each]
 
 
@@ -48,6 +48,18 @@ def driver_problem(driver: DeviceDriver) -> str:
     if status.availability != "unavailable":
         return ""
     return f"The robot is unavailable: {(status.error_state or 'no reason is known').rstrip('.')}. It is tried again."
+
+
+def link_certificate_problem(link: LinkConfig) -> str:
+    """Return why the other side will refuse our certificates, or empty."""
+    if not link.ca:
+        return ""
+    from strands_robots.cli.certificates import certificate_problem  # noqa: PLC0415 - needs [device-connect]
+
+    problem = certificate_problem(link)
+    return (
+        f"{problem[:1].upper()}{problem[1:]}. Others will not reach the robot; give matching files." if problem else ""
+    )
 
 
 def state_problem() -> str:

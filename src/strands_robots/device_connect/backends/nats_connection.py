@@ -152,10 +152,10 @@ class NatsConnection:
         if link.jwt:
             options["user_jwt_cb"] = lambda: bytearray(link.jwt.encode())
             options["signature_cb"] = self._sign or partial(_signed, link.nkey_seed)
-        if link.encrypted:
-            options["tls"] = client_context(link)
         where = ", ".join(link.connect) or DEFAULT_URL
         try:
+            if link.encrypted:
+                options["tls"] = client_context(link)
             async with asyncio.timeout(link.connect_timeout_s):
                 await self.client.connect(**options)
         except (TimeoutError, OSError, nats.errors.Error) as error:

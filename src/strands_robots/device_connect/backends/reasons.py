@@ -26,6 +26,8 @@ def reason_of(error: BaseException) -> str:
         alert = (error.reason or str(error)).replace("_", " ").lower()
         if "key values mismatch" in alert:
             return "our key is not that of our certificate"
+        if error.library in ("X509", "PEM") or "pem" in alert.split():
+            return "our certificates are no PEM files that fit; doctor, with the same flags, names the file"
         _, refused, why = alert.partition("alert ")
         if refused:
             return f"it refuses our certificate: {why}"
