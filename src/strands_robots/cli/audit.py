@@ -76,7 +76,7 @@ def show(
     what: Annotated[str | None, typer.Argument(help="An emergency stop's id, a robot or an event.")] = None,
     since: Annotated[float | None, typer.Option("--last", help="Only the last that many seconds.")] = None,
 ) -> None:
-    """Print every record that contains WHAT, without signatures; --json has those too. Without WHAT every record."""
+    """Print every record that contains WHAT, without signatures; else all."""
     after = None if since is None else time.time() - number("--last", since, above=0, high=1e10)
     found = [each for each in _records(after) if what is None or _contains(each, what)]
     if not found:
