@@ -231,6 +231,9 @@ def _construct(factory: Callable[..., Any], *args: Any, **options: Any) -> Any:
     try:
         return factory(*args, **options)
     except TypeError as exc:
+        unknown = re.search(r"unexpected keyword argument '(\w+)'", str(exc))
+        if unknown and unknown[1] in options:
+            raise ValidationError(f"This robot has no option {unknown[1]}.") from exc
         raise ValidationError(f"Robot cannot be made with {', '.join(options)}: {exc}.") from exc
 
 

@@ -307,6 +307,11 @@ def integer(name: str) -> int:
     return int(value)
 
 
+def default(name: str) -> str:
+    """Return the declared default of a variable."""
+    return _TABLE[name].default
+
+
 def items(name: str) -> tuple[str, ...]:
     """Return the parts of a comma list without blanks; empty when unset."""
     return tuple(part.strip() for part in raw(name).split(",") if part.strip())

@@ -10,7 +10,7 @@ from __future__ import annotations
 import ipaddress
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -140,6 +140,22 @@ def number(
             return result
     # The text of the domain is made for a refusal only, because every command of every robot passes this check.
     raise ValidationError(f"{name} must be {_domain('a finite number', low, high, above)}, not {shown(value)}.")
+
+
+def finite(name: str, value: object) -> None:
+    """Refuse NaN and infinity in a JSON value, at any depth.
+
+    Raises:
+        ValidationError: naming the place, such as ``joints.pan`` or ``path[2]``.
+    """
+    if isinstance(value, Mapping):
+        for key, each in value.items():
+            finite(f"{name}.{key}", each)
+    elif isinstance(value, list | tuple):
+        for index, each in enumerate(value):
+            finite(f"{name}[{index}]", each)
+    elif isinstance(value, float) and not math.isfinite(value):
+        raise ValidationError(f"{name} must be finite, not {value}.")
 
 
 def whole(name: str, value: object, *, low: int | None = None, high: int | None = None) -> int:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import socket
 import sys
@@ -9,13 +10,16 @@ from pathlib import Path
 
 import pytest
 from click.testing import Result
-from fixtures.certificates import Authority
+from fixtures.certificates import Authority, Identity
+from fixtures.waiting import free_port
 from tests.cli.conftest import Run
 
 from strands_robots import __version__
-from strands_robots.cli import doctor
-from strands_robots.cli.doctor import Finding, certificate_error
+from strands_robots.cli import doctor, readiness
+from strands_robots.cli.certificates import certificate_problem
+from strands_robots.cli.doctor import Finding
 from strands_robots.cli.owners import other_owners
+from strands_robots.device_connect.backends import LinkConfig
 
 
 @pytest.fixture(autouse=True)
@@ -63,12 +67,14 @@ def test_unusable_network_is_broken_with_a_remedy(run: Run) -> None:
     assert "--insecure" in checked(result)["network"]["remedy"]
 
 
-def test_taken_port_is_noted_with_its_number(run: Run) -> None:
+def test_port_that_another_program_holds_is_broken_by_its_name(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(readiness, "DIAL_S", 0.5)
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        found = checked(run("doctor", "--json", "--port", str(port)))["port"]
-    assert str(port) in found["said"]
-    assert found["mark"] == "note"
+        result = run("doctor", "--json", "--port", str(port))
+    found = checked(result)["port"]
+    assert (result.exit_code, found["mark"]) == (1, "broken")
+    assert f"127.0.0.1:{port}: another program holds the port (pid {os.getpid()} " in found["said"]
 
 
 def test_credentials_that_others_can_read_are_a_warning(
@@ -83,15 +89,48 @@ def test_credentials_that_others_can_read_are_a_warning(
     assert "chmod 600" in found["remedy"]
 
 
-def test_certificate_is_checked_against_its_key_and_dates(tmp_path: Path) -> None:
+def linked(identity: Identity, **other: Path) -> LinkConfig:
+    """A link with the identity's files, and others in the place of some."""
+    files = {"ca": identity.ca, "cert": identity.cert, "key": identity.key} | other
+    return LinkConfig(connect=("tls/localhost:7447",), **{part: str(file) for part, file in files.items()})
+
+
+def test_certificate_is_checked_against_its_key_its_authority_and_its_dates(tmp_path: Path) -> None:
     authority = Authority(tmp_path)
-    arm, other = authority.issue("arm"), authority.issue("other")
-    assert certificate_error(str(arm.ca), str(arm.cert), str(arm.key))[0] == ""
-    assert "not the certificate's" in certificate_error(str(arm.ca), str(arm.cert), str(other.key))[0]
+    arm, other, foreign = authority.issue("arm"), authority.issue("other"), Authority(tmp_path / "b", "elsewhere")
+    assert certificate_problem(linked(arm)) == ""
+    assert certificate_problem(linked(arm, key=other.key)) == f"{other.key} is not the key of {arm.cert}"
+    assert f"{arm.cert} was not issued by {foreign.ca}" in certificate_problem(linked(arm, ca=foreign.ca))
     later = datetime.now(UTC) + timedelta(days=9)
-    assert "only" in certificate_error(str(arm.ca), str(arm.cert), str(arm.key), later)[0]
-    assert "cannot be read" in certificate_error(str(arm.ca), str(tmp_path / "absent"), str(arm.key))[0]
-    assert "no usable PEM" in certificate_error(str(arm.key), str(arm.cert), str(arm.key))[0]
+    assert "has expired: it was valid until" in certificate_problem(linked(arm), later)
+    assert "is not valid yet" in certificate_problem(linked(arm), later - timedelta(days=20))
+    assert f"{tmp_path / 'absent'} cannot be read" in certificate_problem(linked(arm, cert=tmp_path / "absent"))
+    assert certificate_problem(linked(arm, ca=arm.key)) == f"{arm.key} holds no PEM certificate"
+    assert f"{arm.cert} holds no PEM private key" in certificate_problem(linked(arm, key=arm.cert))
+    assert f"{tmp_path} cannot be read" in certificate_problem(linked(arm, cert=tmp_path))
+
+
+@pytest.mark.parametrize("given", ["flags", "environment"])
+def test_expired_certificate_is_named_however_it_is_given(
+    given: str, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(readiness, "DIAL_S", 0.5)
+    old = Authority(tmp_path).issue("old", lasts=timedelta(minutes=-1))
+    files = {"ca": old.ca, "cert": old.cert, "key": old.key}
+    flags = [word for part, file in files.items() for word in (f"--tls-{part}", str(file))]
+    if given == "environment":
+        flags = []
+        for part, file in files.items():
+            monkeypatch.setenv(f"MESSAGING_TLS_{part.upper()}_FILE", str(file))
+        monkeypatch.setenv("MESSAGING_URLS", f"tls/127.0.0.1:{free_port()}")
+        monkeypatch.setenv("MESSAGING_BACKEND", "zenoh")
+    else:
+        flags += ["--connect", f"tls/127.0.0.1:{free_port()}"]
+    result = run("doctor", "--json", *flags)
+    found = checked(result)
+    assert result.exit_code == 1
+    assert f"{old.cert} has expired" in found["certificates"]["said"]
+    assert found["dial"]["mark"] == "broken" and "nothing listens there" in found["dial"]["said"]
 
 
 def test_table_ends_with_a_verdict(run: Run) -> None:

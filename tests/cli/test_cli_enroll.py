@@ -261,7 +261,7 @@ def test_key_of_a_console_elsewhere_is_trusted_for_motions(run: Run, stranger: S
 
 def test_text_that_is_no_key_enrolls_no_console(run: Run) -> None:
     result = run("enroll", "--console", "laptop")
-    assert result.exit_code == 1
+    assert result.exit_code == 2
     assert "keys console" in result.stderr and "laptop" in result.stderr
     assert enrolled_consoles().load() == {}
 

@@ -1,16 +1,22 @@
 from __future__ import annotations
 
+import io
 import json
 import re
 import time
+from base64 import b64encode
 from dataclasses import replace
 
 import pytest
-from tests.cli.conftest import FakeFleet, Run
+from rich.console import Console
+from tests.cli.conftest import FakeFleet, Run, connect
 
+from strands_robots.cli.network import Network
+from strands_robots.cli.output import Screen
+from strands_robots.cli.peers import peers
 from strands_robots.device_connect.client import CallRefusedError, DeviceTimeoutError, NoSuchDeviceError
 from strands_robots.device_connect.discovery import Peer
-from strands_robots.envelope import Envelope, error
+from strands_robots.envelope import Envelope, error, success
 
 
 def arm(name: str = "arm-1") -> Peer:
@@ -98,8 +104,46 @@ def test_unknown_device_and_function_name_the_near_ones(run: Run, fleet: FakeFle
     assert "There are: execute, stop." in run("call", "arm-1", "zzz").stderr
 
 
-def test_piped_table_is_not_broken_at_80_columns(run: Run, fleet: FakeFleet) -> None:
-    names = tuple({"name": f"functionNumber{n}"} for n in range(20))
-    fleet.found = [Peer("arm-1", "strands_sim", "so100", {"availability": "idle"}, names)]
-    [row] = [line for line in run("peers").stdout.splitlines() if "arm-1" in line]
-    assert "functionNumber0" in row and "functionNumber19" in row
+def test_a_robot_of_many_functions_takes_one_line_of_80_columns(monkeypatch: pytest.MonkeyPatch) -> None:
+    names = tuple({"name": f"functionNumber{n}"} for n in range(40))
+    found = [Peer(f"so101-arm-{n}", "strands_sim", "so101", {"availability": "idle"}, names) for n in range(5)]
+    drawn = on_80_columns(monkeypatch, found)
+    assert all(len(line) <= 80 for line in drawn)
+    assert sum("strands_sim" in line for line in drawn) == 5
+    assert len([line for line in drawn if line.strip()]) == 2 + 5 + 1
+
+
+def test_long_names_are_whole_on_two_lines_of_80_columns(monkeypatch: pytest.MonkeyPatch) -> None:
+    long = Peer("reachy-mini-kitchen-ab12cd34", "strands_reachy_mini", "reachy_mini", {"availability": "unavailable"})
+    drawn = on_80_columns(monkeypatch, [long])
+    body = drawn[next(n for n, line in enumerate(drawn) if "───" in line) + 1 :]
+    assert len([line for line in body if line.strip() and "DEVICE" not in line]) == 2
+    assert "".join(line.split(" ")[1] for line in body[:2]) == long.id
+
+
+def on_80_columns(monkeypatch: pytest.MonkeyPatch, found: list[Peer]) -> list[str]:
+    """Return the lines of ``peers`` on a terminal of 80 columns."""
+    fake, drawn = FakeFleet(), io.StringIO()
+    fake.found = found
+    connect(monkeypatch, fake)
+    peers(Screen(console=Console(file=drawn, width=80, force_terminal=True, color_system=None)), Network())
+    return drawn.getvalue().splitlines()
+
+
+def test_signatures_and_encoded_bytes_are_for_programs_alone(run: Run, fleet: FakeFleet) -> None:
+    signature, picture = f"{b64encode(bytes(range(64))).decode()}", b64encode(bytes(range(256)) * 40).decode()
+    fleet.answer = success(
+        f"Locked; signed {signature}.",
+        statement={"key": "k", "sig": signature},
+        shots=[{"jpeg": picture, "camera": "front", "proof": {"sig": signature}}],
+        path="a/long/path/of_a_file_whose_name_is_no_signature_though_it_is_long",
+    )
+    said = run("call", "arm-1", "getStatus").stdout
+    assert (
+        signature not in said
+        and picture[:60] not in said
+        and "sig" not in said.replace("signed", "").replace("signature", "")
+    )
+    assert f"<{len(picture)} characters, shown by --json>" in said
+    assert "of_a_file_whose_name_is_no_signature_though_it_is_long" in said
+    assert json.loads(run("call", "arm-1", "getStatus", "--json").stdout) == fleet.answer

@@ -18,7 +18,7 @@ from strands_robots.audit import (
 )
 from strands_robots.audit.verification import FACTS_REPLACED, SIGNATURES
 from strands_robots.cli.command import command
-from strands_robots.cli.output import CliError, Screen, plain, table
+from strands_robots.cli.output import CliError, Screen, plain, readable, table
 from strands_robots.safety.lockout import utc
 from strands_robots.utils import number, whole
 
@@ -76,7 +76,7 @@ def show(
     what: Annotated[str | None, typer.Argument(help="An emergency stop's id, a robot or an event.")] = None,
     since: Annotated[float | None, typer.Option("--last", help="Only the last that many seconds.")] = None,
 ) -> None:
-    """Print in full every record that contains WHAT; without it every record."""
+    """Print every record that contains WHAT, without signatures; else all."""
     after = None if since is None else time.time() - number("--last", since, above=0, high=1e10)
     found = [each for each in _records(after) if what is None or _contains(each, what)]
     if not found:
@@ -86,7 +86,7 @@ def show(
     for each in found:
         screen.data(each)
         screen.say(f"{_when(each)}  {each['peer_id']}  {each.get('event')}  number {each['seq']}", "bold")
-        payload = each.get("payload")
+        payload = readable(each.get("payload"))
         for name, value in payload.items() if isinstance(payload, Mapping) else (("", payload),):
             screen.say(f"  {plain(name)}: {plain(value, 2000)}")
 
@@ -152,7 +152,7 @@ def _print(screen: Screen, records: Iterable[dict[str, Any]]) -> None:
 
 def _line(record: Mapping[str, Any]) -> str:
     """Return a record as one line, without the technical fields of ``show``."""
-    payload = record.get("payload")
+    payload = readable(record.get("payload"))
     facts = dict(payload) if isinstance(payload, Mapping) else {"payload": payload}
     first = [name for name in FIRST_FIELDS if name in facts]
     last = [name for name in facts if name not in FIRST_FIELDS and name not in HIDDEN_FIELDS]

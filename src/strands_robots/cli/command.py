@@ -127,12 +127,21 @@ def _value(key: str, text: str) -> Any:
     return value
 
 
+def _log_to_stderr() -> None:
+    """Log our warnings and everybody's errors to stderr.
+
+    What a library warns of, such as asyncio's ``eof_received()`` of each TLS connection that ends, a user of ours can
+    neither judge nor mend.
+    """
+    logging.captureWarnings(True)
+    handler = logging.StreamHandler()
+    handler.addFilter(lambda record: record.levelno >= logging.ERROR or record.name.startswith("strands_robots"))
+    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s", handlers=[handler])
+
+
 def _exit_code(screen: Screen, body: Callable[[], None]) -> Exit:
     """Run ``body``, report its failure on the screen, and return the exit code."""
-    # Routine events of the libraries stay off the terminal; warnings get through. The framework also warns of
-    # extras that nothing here uses.
-    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
-    logging.getLogger("device_connect_edge").setLevel(logging.ERROR)
+    _log_to_stderr()
     try:
         body()
     except CliError as failure:
@@ -143,6 +152,9 @@ def _exit_code(screen: Screen, body: Callable[[], None]) -> Exit:
         return Exit.USAGE
     except (MissingExtraError, ConnectionError) as missing:
         screen.fail(CliError(str(missing)))
+        return Exit.REFUSED
+    except OSError as failed:
+        screen.fail(CliError(str(failed)))
         return Exit.REFUSED
     except KeyboardInterrupt:
         return Exit.INTERRUPTED

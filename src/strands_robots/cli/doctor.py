@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import os
 import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
+from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from importlib import metadata
 from pathlib import Path
 from tempfile import TemporaryFile
+from typing import TYPE_CHECKING
 
 import typer
 
@@ -20,10 +21,14 @@ from strands_robots.cli.command import command
 from strands_robots.cli.network import Network, describe
 from strands_robots.cli.output import CliError, Screen, label, table
 from strands_robots.cli.owners import IMPORT_PACKAGE, other_owners, owner_remedy
+from strands_robots.cli.readiness import LOOPBACK, dial_problem, listen_problem, port_holder
 from strands_robots.safety.approval import state_dir
 from strands_robots.safety.identity import robots_here
 from strands_robots.safety.orders import ALLOW, REQUIRE_SIGNED, StopRules
-from strands_robots.utils import DISTRIBUTION, MissingExtraError, ValidationError, install_line
+from strands_robots.utils import DISTRIBUTION, MissingExtraError, ValidationError, install_line, redacted
+
+if TYPE_CHECKING:
+    from strands_robots.device_connect.backends import LinkConfig
 
 FRAMEWORK = "0.2.5"
 """Release of device-connect-edge that the backends are written for."""
@@ -114,20 +119,16 @@ def doctor(screen: Screen, network: Network) -> None:
 
 def examine(network: Network) -> list[Finding]:
     """Run every check, in the order of the report."""
-    checks: tuple[Callable[[], Iterator[Finding]], ...] = (
-        _installation,
-        _packages,
-        lambda: _network(network),
-        lambda: _meeting_port(network),
-        _multicast,
-        _certificates,
-        _credentials,
-        _stop_senders,
-        _rendering,
-        _state,
-        _robot_keys,
-    )
-    return [finding for check in checks for finding in check()]
+    link, found = _link_of(network)
+    of_link = (_meeting_port, _listened, _dialled, _certificates)
+    before: tuple[Callable[[], Iterator[Finding]], ...] = (_installation, _packages)
+    after = (_multicast, _credentials, _stop_senders, _rendering, _state, _robot_keys)
+    return [
+        *(finding for check in before for finding in check()),
+        *found,
+        *(finding for check in of_link if link is not None for finding in check(link)),
+        *(finding for check in after for finding in check()),
+    ]
 
 
 def _installation() -> Iterator[Finding]:
@@ -159,26 +160,64 @@ def _packages() -> Iterator[Finding]:
             yield Finding(f"extra {extra}", Mark.OK, versions)
 
 
-def _network(network: Network) -> Iterator[Finding]:
+def _link_of(network: Network) -> tuple[LinkConfig | None, list[Finding]]:
+    """Return the link that every command would use, and what is found of it."""
     try:
         link = network.link()
     except (CliError, ValidationError, MissingExtraError) as exc:
-        yield Finding("network", Mark.BROKEN, "no usable network in the flags and the environment", str(exc))
+        said = "no usable network in the flags and the environment"
+        return None, [Finding("network", Mark.BROKEN, said, str(exc))]
+    proven = link.authenticated or link.loopback_only
+    remedy = "" if proven else "give certificates or credentials; without them everybody there can drive the robots"
+    return link, [Finding("network", Mark.OK if proven else Mark.WARN, describe(link), remedy)]
+
+
+def _dialled(link: LinkConfig) -> Iterator[Finding]:
+    """Connect to each endpoint of the link, as a robot or a client of it does."""
+    for endpoint in link.connect:
+        problem = dial_problem(link, endpoint)
+        where, remedy = redacted(endpoint), "start what should answer there, or name what does with --connect or --nats"
+        if problem:
+            yield Finding("dial", Mark.BROKEN, f"{where}: {problem}", remedy)
+        else:
+            yield Finding("dial", Mark.OK, f"{where} answers")
+
+
+def _listened(link: LinkConfig) -> Iterator[Finding]:
+    """Try the ports on which a robot would listen."""
+    for endpoint in link.listen:
+        if not (problem := listen_problem(endpoint)):
+            yield Finding("listen", Mark.OK, f"{endpoint} is free")
+        elif dial_problem(link, endpoint.replace("0.0.0.0", LOOPBACK).replace("[::]", "[::1]")):
+            remedy = "end that program, or choose another port with --listen"
+            yield Finding("listen", Mark.BROKEN, f"{endpoint}: {problem}{_holder(endpoint)}", remedy)
+        else:
+            remedy = "nothing, if you serve a robot there; a second one needs another port"
+            yield Finding("listen", Mark.NOTE, f"{endpoint}: a robot process answers there{_holder(endpoint)}", remedy)
+
+
+def _holder(endpoint: str) -> str:
+    number = endpoint.rpartition(":")[2]
+    uid, who = port_holder(int(number)) if number.isdecimal() else (None, "")
+    return "" if uid is None else f", {who}"
+
+
+def _meeting_port(link: LinkConfig) -> Iterator[Finding]:
+    if link.meet_port is None or link.meeting_point is None:
         return
-    yield Finding("network", Mark.OK if link.authenticated or link.loopback_only else Mark.WARN, describe(link))
-
-
-def _meeting_port(network: Network) -> Iterator[Finding]:
-    port = network.port or settings.integer("STRANDS_DC_PORT")
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind(("127.0.0.1", port))
-        except OSError as exc:
-            remedy = "nothing, if a robot is served there; else choose another with --port or STRANDS_DC_PORT"
-            yield Finding("port", Mark.NOTE, f"127.0.0.1:{port} is taken ({exc.strerror})", remedy)
-            return
-    yield Finding("port", Mark.OK, f"127.0.0.1:{port} is free")
+    where = f"{LOOPBACK}:{link.meet_port}"
+    if not (problem := listen_problem(link.meeting_point)):
+        yield Finding("port", Mark.OK, f"{where} is free")
+        return
+    uid, who = port_holder(link.meet_port)
+    holder = "" if uid is None else f" ({who})"
+    if dial_problem(link, link.meeting_point):
+        remedy = "end that program, or choose another port with --port or STRANDS_DC_PORT"
+        said = f"{where}: {problem}{holder}, and it is no robot process: robots are not found"
+        yield Finding("port", Mark.BROKEN, said, remedy)
+    else:
+        remedy = "" if uid in (None, os.getuid()) else "choose another port with --port or STRANDS_DC_PORT"
+        yield Finding("port", Mark.NOTE if remedy else Mark.OK, f"{where}: robots are served there{holder}", remedy)
 
 
 def _multicast() -> Iterator[Finding]:
@@ -211,41 +250,24 @@ def multicast_error(within: float = 0.5) -> str | None:
     return None
 
 
-def _certificates() -> Iterator[Finding]:
-    names = {part: settings.raw(f"MESSAGING_TLS_{part}_FILE") for part in ("CA", "CERT", "KEY")}
-    if not any(names.values()):
+def _certificates(link: LinkConfig) -> Iterator[Finding]:
+    """Check the certificates of the flags, else those of the environment."""
+    ca, cert, key = (settings.raw(f"MESSAGING_TLS_{part}_FILE") for part in ("CA", "CERT", "KEY"))
+    used = link if link.ca else replace(link, ca=ca, cert=cert, key=key)
+    if not used.ca:
         yield Finding("certificates", Mark.OK, "none configured; a network inside this machine needs none")
         return
-    failed, until = certificate_error(names["CA"], names["CERT"], names["KEY"])
-    if failed:
-        remedy = "set MESSAGING_TLS_CA_FILE, MESSAGING_TLS_CERT_FILE and MESSAGING_TLS_KEY_FILE to matching PEM files"
-        yield Finding("certificates", Mark.BROKEN, failed, remedy)
+    from strands_robots.cli.certificates import (  # noqa: PLC0415 - needs the [device-connect] extra
+        certificate_problem,
+        valid_until,
+    )
+
+    if problem := certificate_problem(used):
+        remedy = "give matching PEM files by --tls-ca, --tls-cert and --tls-key, or by MESSAGING_TLS_CA_FILE and so on"
+        yield Finding("certificates", Mark.BROKEN, problem, remedy)
     else:
-        yield Finding("certificates", Mark.OK, f"the certificate fits its key and is valid until {until}")
-
-
-def certificate_error(ca: str, cert: str, key: str, now: datetime | None = None) -> tuple[str, str]:
-    """Return the problem of three PEM files, or empty, and the last valid day."""
-    try:
-        from cryptography import x509  # noqa: PLC0415 - comes with the [device-connect] extra
-        from cryptography.hazmat.primitives.serialization import load_pem_private_key  # noqa: PLC0415
-    except ModuleNotFoundError:
-        return "the cryptography package is missing", ""
-    moment = now or datetime.now(UTC)
-    try:
-        x509.load_pem_x509_certificate(Path(ca).read_bytes())
-        certificate = x509.load_pem_x509_certificate(Path(cert).read_bytes())
-        private = load_pem_private_key(Path(key).read_bytes(), None)
-    except OSError as exc:
-        return f"{exc.filename or 'a file without a name'} cannot be read: {exc.strerror}", ""
-    except (ValueError, TypeError) as exc:
-        return f"no usable PEM: {exc}", ""
-    until = certificate.not_valid_after_utc.date().isoformat()
-    if not certificate.not_valid_before_utc <= moment <= certificate.not_valid_after_utc:
-        return f"the certificate is valid from {certificate.not_valid_before_utc.date()} to {until} only", until
-    if certificate.public_key() != private.public_key():
-        return "the key is not the certificate's", until
-    return "", until
+        said = "the certificate fits its key and authority" if used.cert else "the authority can be used"
+        yield Finding("certificates", Mark.OK, f"{said}, until {valid_until(used)}")
 
 
 def _credentials() -> Iterator[Finding]:

@@ -125,7 +125,9 @@ def _enroll_console(screen: Screen, text: str) -> None:
     """Keep the key of a console on another machine, for the robots of this one."""
     public = ed25519.decode(text, 32)
     if public is None:
-        raise CliError(f"--console must be the key that `strands-robots keys console` prints there, not {shown(text)}.")
+        raise CliError(
+            f"--console must be the key that `strands-robots keys console` prints there, not {shown(text)}.", Exit.USAGE
+        )
     mark = fingerprint(public)
     try:
         enrolled_consoles().enroll({f"console-{mark}": public})

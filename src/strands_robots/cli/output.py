@@ -6,12 +6,14 @@ through :func:`plain` and goes to Rich as :class:`rich.text.Text`.
 
 from __future__ import annotations
 
+import errno
 import json
 import logging
+import re
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from enum import IntEnum
 from typing import Any
@@ -27,6 +29,9 @@ from strands_robots.errors import StrandsRobotsError
 LENGTH_MAX = 400
 """Characters of one network text that are shown."""
 
+COPYABLE_MAX = 10_000
+"""Characters of a line to paste elsewhere: one that is cut would do something else."""
+
 WIDE = 4096
 """Columns of what is not a terminal."""
 
@@ -35,6 +40,28 @@ PANEL_WIDTH = 100
 
 LATE_S = 2.0
 """Age in seconds of a robot's last sign of life that is shown in red: our robots give one a second."""
+
+SIGNED = frozenset({"statement", "assertion", "sig", "signature"})
+"""Fields of an answer that prove it, and say nothing to a person."""
+
+_ENCODED = re.compile(r"(?<![A-Za-z0-9+/_-])[A-Za-z0-9+/_-]{40,}={0,2}")
+"""Text that may be base64 of a key, a signature or a picture."""
+
+_SYSTEM_ERROR = re.compile(r"\[Errno (\d+)\] ([^:'\"\n]+)(?:: ['\"]([^'\"\n]*)['\"](?: -> ['\"][^'\"\n]*['\"])?)?")
+"""A system's error as Python writes it: number, text and file."""
+
+_ERRORS = {
+    errno.ENOENT: "there is no such file or directory; check the path",
+    errno.EEXIST: "something of that name is there already; name another one, or remove it",
+    errno.ENOTDIR: "a part of that path is a file, where a directory has to be; name another one",
+    errno.EISDIR: "it is a directory, where a file has to be; name a file",
+    errno.EACCES: "this user may not use it; change its permissions, or name another one",
+    errno.EPERM: "this user may not use it; change its permissions, or name another one",
+    errno.EROFS: "its file system cannot be written; name another one",
+    errno.ENOSPC: "the disk is full; free some of it",
+    errno.EADDRINUSE: "another program holds the port; end it, or choose another port",
+    errno.ECONNREFUSED: "nothing listens there; start what should",
+}
 
 LOG_LINES = 5
 POLL_S = 0.05
@@ -67,9 +94,39 @@ def plain(value: object, longest: int = LENGTH_MAX) -> str:
     return visible if len(text) <= longest else f"{visible}... ({len(text)} characters)"
 
 
+def in_words(reason: str) -> str:
+    """Return a reason with the system's errors in words, and what to do about them."""
+    return _SYSTEM_ERROR.sub(lambda found: _words(int(found[1]), found[2], found[3] or ""), reason)
+
+
+def _words(number: int, text: str, file: str) -> str:
+    about = f"{file}: " if file else ""
+    return f"{about}{_ERRORS.get(number, text.strip())}"
+
+
 def label(value: object, style: str = "") -> Text:
     """Return ``value`` for Rich, without markup."""
     return Text(plain(value), style=style)
+
+
+def readable(value: Any) -> Any:
+    """Return an answer's value for people.
+
+    It comes without signatures, and with encoded bytes as their number; ``--json`` has all of it.
+    """
+    if isinstance(value, Mapping):
+        return {name: readable(each) for name, each in value.items() if name not in SIGNED}
+    if isinstance(value, list | tuple):
+        return [readable(each) for each in value]
+    return _ENCODED.sub(_length, value) if isinstance(value, str) else value
+
+
+def _length(encoded: re.Match[str]) -> str:
+    text = encoded[0]
+    # A long name or path has no capitals, small letters and digits at once.
+    if not all(any(kind(char) for char in text) for kind in (str.isupper, str.islower, str.isdigit)):
+        return text
+    return f"<{len(text)} characters, shown by --json>"
 
 
 def first_line(description: object) -> str:
@@ -103,7 +160,7 @@ class Screen:
     def copyable(self, text: str, style: str = "") -> None:
         """Print a line to paste elsewhere, never broken at the terminal's width."""
         if not self.machine:
-            self.out.print(label(text), style=style, soft_wrap=True)
+            self.out.print(Text(plain(text, COPYABLE_MAX)), style=style, soft_wrap=True)
 
     def show(self, thing: RenderableType) -> None:
         """Print a table or panel for people."""
@@ -118,10 +175,11 @@ class Screen:
 
     def fail(self, failure: CliError) -> None:
         """Report why a command ends without success."""
+        reason = in_words(failure.reason)
         if self.machine:
-            self.data({"status": "error", "reason": failure.reason, "exit": int(failure.code), **failure.fields})
+            self.data({"status": "error", "reason": reason, "exit": int(failure.code), **failure.fields})
         else:
-            self.err.print(label(failure.reason, "red"), soft_wrap=True)
+            self.err.print(label(reason, "red"), soft_wrap=True)
 
 
 def table(title: str, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> Table:

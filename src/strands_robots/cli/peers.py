@@ -12,10 +12,10 @@ from rich.text import Text
 
 from strands_robots.cli.command import OnMesh, Timeout, assignments, command
 from strands_robots.cli.network import SOURCE, Network, call_device, describe
-from strands_robots.cli.output import LATE_S, CliError, Exit, Screen, first_line, label, plain, table
+from strands_robots.cli.output import LATE_S, CliError, Exit, Screen, first_line, label, plain, readable, table
 from strands_robots.cli.readiness import other_user
 from strands_robots.envelope import is_error, text_of
-from strands_robots.utils import WAIT_S, number
+from strands_robots.utils import WAIT_S, device_id, number
 
 if TYPE_CHECKING:
     from strands_robots.device_connect.discovery import Peer
@@ -46,10 +46,11 @@ def peers(
         network.use_mesh()
         list_peers(screen, number("--timeout", timeout, above=0, high=60))
         return
+    wanted = None if device is None else device_id("DEVICE", device)
     with network.fleet() as fleet:
         found = fleet.peers(number("--timeout", timeout, above=0, high=60))
     if device is not None:
-        found = [peer for peer in found if peer.id == device]
+        found = [peer for peer in found if peer.id == wanted]
     if not found:
         who = "No robot" if device is None else f"No {device!r}"
         said = f"{who} answered. {describe(fleet.link)} {other_user(fleet.link)}".rstrip()
@@ -61,18 +62,9 @@ def peers(
     if device is not None:
         _show_functions(screen, found[0])
         return
-    rows = (
-        (
-            peer.id,
-            peer.type,
-            peer.model,
-            peer.status.get("availability", ""),
-            _age(peer),
-            ", ".join(_function_names(peer)),
-        )
-        for peer in found
-    )
-    screen.show(table("", ("device", "type", "model", "status", "last heard", "functions"), rows))
+    rows = ((each.id, each.type, each.model, each.status.get("availability", ""), _age(each)) for each in found)
+    screen.show(table("", ("device", "type", "model", "status", "last heard"), rows))
+    screen.say("peers DEVICE, with the same flags, lists what it can do.")
 
 
 def call(
@@ -109,8 +101,8 @@ def call(
         said = f"{text_of(answer) or f'{device} refused {function}.'} {whose}".rstrip()
         raise CliError(plain(said, 2000), Exit.REFUSED, answer=answer)
     screen.data(answer)
-    screen.say(text_of(answer) or f"{device} answered {function}.", "green")
-    for key, value in answer.items():
+    screen.say(readable(text_of(answer)) or f"{device} answered {function}.", "green")
+    for key, value in readable(answer).items():
         if key not in ("status", "content", "reason"):
             screen.say(f"  {key}: {value if isinstance(value, str) else json.dumps(value, default=str)}")
 
@@ -136,10 +128,6 @@ def _age(peer: Peer) -> Text:
     if age is None:
         return label("only listed", "yellow")
     return label(f"{age:.1f} s", "bold red" if age > LATE_S else "")
-
-
-def _function_names(peer: Peer) -> list[str]:
-    return [str(each.get("name", "")) for each in peer.functions]
 
 
 def _show_functions(screen: Screen, peer: Peer) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import pwd
 import socket
@@ -9,12 +10,14 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import TYPE_CHECKING
 
 from strands_robots import settings
 from strands_robots.safety.approval import state_dir
+from strands_robots.utils import redacted
 
 if TYPE_CHECKING:
     from device_connect_edge.drivers import DeviceDriver
@@ -24,13 +27,18 @@ if TYPE_CHECKING:
 MEET_S = 1.0
 """Seconds in which the process that has the meeting port links with this one."""
 
+DIAL_S = 3.0
+"""Seconds in which an endpoint has to answer."""
+
+LOOPBACK = "127.0.0.1"
+
 _LISTEN = "0A"
 """State of a listening socket in ``/proc/net/tcp``."""
 
 
 def shortcomings(driver: DeviceDriver, link: LinkConfig) -> list[str]:
     """Return one sentence for each reason why a served robot is not ready."""
-    found = [driver_problem(driver), meeting_problem(link), state_problem()]
+    found = [driver_problem(driver), meeting_problem(link), link_certificate_problem(link), state_problem()]
     return [each for each in found if each]
 
 
@@ -40,6 +48,18 @@ def driver_problem(driver: DeviceDriver) -> str:
     if status.availability != "unavailable":
         return ""
     return f"The robot is unavailable: {(status.error_state or 'no reason is known').rstrip('.')}. It is tried again."
+
+
+def link_certificate_problem(link: LinkConfig) -> str:
+    """Return why the other side will refuse our certificates, or empty."""
+    if not link.ca:
+        return ""
+    from strands_robots.cli.certificates import certificate_problem  # noqa: PLC0415 - needs [device-connect]
+
+    problem = certificate_problem(link)
+    return (
+        f"{problem[:1].upper()}{problem[1:]}. Others will not reach the robot; give matching files." if problem else ""
+    )
 
 
 def state_problem() -> str:
@@ -120,6 +140,48 @@ def meeting_user(link: LinkConfig) -> str:
     """Return the name of another user at the meeting port, or empty."""
     uid = None if link.meet_port is None else port_holder(link.meet_port)[0]
     return "" if uid is None or uid == os.getuid() else _user(uid)
+
+
+def dial_problem(link: LinkConfig, endpoint: str) -> str:
+    """Return why a client of ``link`` gets no connection to one endpoint, or empty.
+
+    It connects as a robot does, with the same certificates and credentials.
+    """
+    from device_connect_edge.messaging import MessagingError  # noqa: PLC0415 - loaded when a network is used
+
+    from strands_robots.device_connect.backends import open_client  # noqa: PLC0415 - as above
+    from strands_robots.device_connect.backends.reasons import reason_of  # noqa: PLC0415 - as above
+
+    alone = replace(link, mode="client" if link.transport == "zenoh" else "auto", connect=(endpoint,), listen=())
+    alone = replace(alone, meet_port=None, multicast=None, connect_timeout_s=DIAL_S)
+
+    async def dial() -> None:
+        client = await open_client(alone)
+        await client.close()
+
+    try:
+        asyncio.run(dial())
+    except MessagingError as exc:
+        said = redacted(str(exc))
+        return said.partition(f"{redacted(endpoint)}: ")[2] or said
+    except OSError as exc:  # a certificate that cannot be used
+        return reason_of(exc)
+    return ""
+
+
+def listen_problem(endpoint: str) -> str:
+    """Return why nobody can listen on a TCP endpoint, or empty."""
+    from strands_robots.device_connect.backends.config import host_of  # noqa: PLC0415 - as above
+    from strands_robots.device_connect.backends.reasons import reason_of  # noqa: PLC0415 - as above
+
+    host, number = host_of(endpoint), endpoint.rpartition(":")[2]
+    if not endpoint.startswith(("tcp/", "tls/")) or not number.isdecimal():
+        return ""
+    try:
+        with socket.create_server((host, int(number)), family=socket.AF_INET6 if ":" in host else socket.AF_INET):
+            return ""
+    except OSError as exc:
+        return reason_of(exc)
 
 
 def port_holder(port: int) -> tuple[int | None, str]:

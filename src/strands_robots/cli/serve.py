@@ -7,7 +7,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import replace
 from importlib import import_module
@@ -15,13 +15,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Group
-from rich.panel import Panel
 
 from strands_robots import settings
+from strands_robots.cli.banner import ServedRobot, show_banner
 from strands_robots.cli.command import OnMesh, assignments, command, parse_ports
 from strands_robots.cli.network import Network, describe, mesh_peer
-from strands_robots.cli.output import CliError, Screen, first_line, label, plain, table
+from strands_robots.cli.output import CliError, Screen
 from strands_robots.cli.readiness import mesh_port_problem, mesh_problems, shortcomings
 from strands_robots.cli.record import record_robot
 from strands_robots.contract import adapt, put_away
@@ -29,7 +28,7 @@ from strands_robots.envelope import text_of
 from strands_robots.policies import warm_profiles
 from strands_robots.policies.base import SPEED_MAX
 from strands_robots.policies.profiles import load_profiles
-from strands_robots.utils import ValidationError, identifier, number, own_device_id, redacted, shown, text
+from strands_robots.utils import ValidationError, identifier, number, own_device_id, shown, text
 
 if TYPE_CHECKING:
     from device_connect_edge.drivers import DeviceDriver
@@ -43,8 +42,6 @@ PAGE_VERBS = ("acquireControl", "moveJoints", "moveBy", "setGripper")
 
 EMULATED = ("so100", "so101")
 """Arms whose servos can be emulated."""
-
-EVERY_PROGRAM_HERE = "Every program of this machine can drive and read the robot, no other machine can."
 
 _POLL_S = 0.2
 
@@ -184,7 +181,7 @@ def serve(
             stack.callback(cleanup)
         stack.enter_context(record_robot(screen, body, peer_id or str(body.tool_name_str), record, record_cameras))
         if link is None:
-            served = _on_mesh(screen, body, peer_id, mode)
+            served = _on_mesh(screen, network, body, peer_id, mode)
         else:
             served = _on_device_connect(screen, network, link, body, peer_id)
         _serve(screen, body, served, piped=until_stdin_closes)
@@ -236,7 +233,7 @@ def _serve(screen: Screen, body: Any, served: AbstractContextManager[str], *, pi
 
 
 @contextmanager
-def _on_mesh(screen: Screen, body: Any, peer_id: str | None, mode: str) -> Iterator[str]:
+def _on_mesh(screen: Screen, network: Network, body: Any, peer_id: str | None, mode: str) -> Iterator[str]:
     with ExitStack() as joined:
         try:
             mesh = joined.enter_context(mesh_peer(body, peer_id, mode))
@@ -247,7 +244,8 @@ def _on_mesh(screen: Screen, body: Any, peer_id: str | None, mode: str) -> Itera
         screen.data({"event": "serving", **facts})
         for each in lacking:
             screen.say(f"NOT READY. {each}", "bold red")
-        screen.say(f"{mesh.peer_id} is on the mesh. From another terminal: strands-robots peers --mesh", "green")
+        port = f" --port {network.port}" if network.port else ""
+        screen.say(f"{mesh.peer_id} is on the mesh. From another terminal: strands-robots peers --mesh{port}", "green")
         screen.say("Ctrl-C stops the robot, then takes it off the mesh.")
         yield mesh.peer_id
 
@@ -267,13 +265,13 @@ def _on_device_connect(
     except (device_connect.DuplicateDeviceError, TimeoutError, OSError) as exc:
         raise CliError(f"The robot is not on the network: {exc}") from exc
     try:
-        _announce(screen, str(runtime.device_id), link, driver, network)
+        _announce(screen, str(runtime.device_id), link, driver)
         yield str(runtime.device_id)
     finally:
         device_connect.stop_device_connect(runtime)
 
 
-def _announce(screen: Screen, peer_id: str, link: LinkConfig, driver: DeviceDriver, network: Network) -> None:
+def _announce(screen: Screen, peer_id: str, link: LinkConfig, driver: DeviceDriver) -> None:
     functions = {each.name: str(each.description).strip() for each in driver.capabilities.functions}
     identity = getattr(getattr(driver, "registration", None), "identity", None)
     key = identity.fingerprint if identity is not None else ""
@@ -290,50 +288,9 @@ def _announce(screen: Screen, peer_id: str, link: LinkConfig, driver: DeviceDriv
             "not_ready": lacking,
         }
     )
-    if screen.machine:
-        return
-    flags = _network_flags(link, network)
-    lines: list[Any] = [
-        *(label(f"NOT READY. {each}", "bold red") for each in lacking),
-        label(describe(link)),
-        *([label(EVERY_PROGRAM_HERE)] if link.loopback_only and not link.authenticated else []),
-        *([label(f"Tenant {link.tenant}.")] if link.tenant != "default" else []),
-        *([label(f"Cell {cell}.")] if (cell := settings.raw("STRANDS_CELL")) else []),
-        table("", ("function", "what it does"), ((name, first_line(text)) for name, text in functions.items())),
-        label("From another terminal:", "bold"),
-        label(f"  strands-robots peers{flags}"),
-        label(f"  strands-robots call {peer_id} {_example(functions)}{flags}"),
-        label(f"  strands-robots stop {peer_id}{flags}"),
-        label(f"  strands-robots estop{flags}"),
-        *([label(f"Its key, for strands-robots enroll: {key}")] if key else []),
-        label(""),
-        label("Ctrl-C stops the robot, then takes it off the network."),
-    ]
-    screen.show(
-        Panel(
-            Group(*lines), title=label(peer_id, "bold"), title_align="left", border_style="red" if lacking else "green"
-        )
-    )
-
-
-def _network_flags(link: LinkConfig, network: Network) -> str:
-    """Return the flags for another terminal of the same network, without secrets."""
-    flags = []
-    for url in network.nats or []:
-        flags += ["--nats", redacted(url)]
-    for endpoint in network.connect or network.listen or []:
-        flags += ["--connect", endpoint.replace("0.0.0.0", "HOST").replace("[::]", "HOST")]
-    flags += ["--multicast"] if network.multicast else []
-    flags += ["--port", str(link.meet_port)] if network.port else []
-    flags += ["--tenant", link.tenant] if network.tenant else []
-    flags += ["--insecure"] if network.insecure else []
-    return "".join(f" {plain(flag)}" for flag in flags)
-
-
-def _example(functions: Mapping[str, str]) -> str:
-    if "execute" in functions:
-        return "execute instruction='wave' duration=5"
-    return next((name for name in ("wakeUp", "getStatus") if name in functions), next(iter(functions), "FUNCTION"))
+    if not screen.machine:
+        hardware = bool(getattr(driver, "hardware", True))
+        show_banner(screen, ServedRobot(peer_id, link, functions, hardware, key), lacking)
 
 
 def _halt(screen: Screen, body: Any) -> bool:

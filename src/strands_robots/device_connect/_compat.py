@@ -170,6 +170,7 @@ class Runtime(DeviceRuntime):  # type: ignore[misc]  # the framework has no type
         self._loop: asyncio.AbstractEventLoop | None = None
         self._running: asyncio.Task[Any] | None = None
         self._lost_at: float | None = None
+        self._dropping = False
         self.lives: Callable[[], bool] = lambda: True
         """Says whether the robot behind the device can be read; the beat leaves it out while it cannot."""
 
@@ -341,8 +342,11 @@ class Runtime(DeviceRuntime):  # type: ignore[misc]  # the framework has no type
             else:
                 await self._wait_for_link()
             await self.messaging.publish(subject, data)
+            self._dropping = False
         except NotConnectedError:
-            _log.warning("dropped an event on %s: the link is lost", subject)
+            if not self._dropping:
+                _log.warning("The link is lost: events of %s are dropped until it is back.", self.device_id)
+            self._dropping = True
         except MessagingError as error:
             _log.error("dropped an event: %s", error)
 

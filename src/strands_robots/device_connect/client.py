@@ -30,12 +30,15 @@ from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety.sightings import sightings
 from strands_robots.safety.statements import Purpose
 from strands_robots.safety.stopping import Outcome, explain, grade
-from strands_robots.utils import ValidationError, device_id, shown, text
+from strands_robots.utils import ValidationError, device_id, finite, shown, text
 
 T = TypeVar("T")
 
 COLLECT_MARGIN_S = 3.0
 """Seconds that a discovery may last beyond its own deadline, on a loaded machine."""
+
+CONNECT_MARGIN_S = 3.0
+"""Seconds beyond a link's own deadline, in which it finds out why nobody answered."""
 
 PURPOSES = {"getStatus": Purpose.LOCKOUT_STATE, "resume": Purpose.RESUME_ANSWER}
 """Functions whose answer has a signed part, with its purpose."""
@@ -95,7 +98,7 @@ class FleetClient:
     def __enter__(self) -> Self:
         self._thread.start()
         try:
-            self._messaging = self.run(open_client(self.link), self.link.connect_timeout_s + 1.0)
+            self._messaging = self.run(open_client(self.link), self.link.connect_timeout_s + CONNECT_MARGIN_S)
             self._discovery = Discovery(self._messaging)
             self.run(self._discovery.start(), 5.0)
         except BaseException:
@@ -154,6 +157,7 @@ class FleetClient:
         """Call a function of a device; return its answer.
 
         Raises:
+            ValidationError: ``params`` holds NaN or infinity, at any depth, or what JSON cannot carry.
             NoSuchDeviceError: no device has the id ``device``.
             DeviceTimeoutError: it is there and did not answer within ``timeout`` seconds.
             CallRefusedError: it refused the call as such: an unknown function, a malformed message.
@@ -298,13 +302,18 @@ class FleetClient:
 
     async def _call(self, device: str, function: str, params: dict[str, Any], within: float) -> Envelope:
         name, verb = device_id("device", device), text("function", function, longest=100)
+        for each, value in params.items():
+            finite(each, value)
         request = {
             "jsonrpc": "2.0",
             "id": uuid.uuid4().hex,
             "method": verb,
             "params": {**params, "_dc_meta": {"source_device": self.source, "source_type": "client"}},
         }
-        encoded = json.dumps(request, allow_nan=False).encode()
+        try:
+            encoded = json.dumps(request, allow_nan=False).encode()
+        except (TypeError, ValueError, RecursionError) as exc:
+            raise ValidationError(f"params must be values that JSON can carry: {exc}.") from exc
         try:
             data = await self._messaging.request(self._subject(f"{name}.cmd"), encoded, timeout=within)
         except MessagingError as exc:

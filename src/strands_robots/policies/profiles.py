@@ -145,7 +145,8 @@ def load_profiles(path: Path) -> dict[str, Profile]:
     try:
         tables = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as exc:
-        raise ValidationError(f"the policies file {path} cannot be read: {exc}.") from exc
+        why = exc.strerror if isinstance(exc, OSError) else exc
+        raise ValidationError(f"the policies file {path} cannot be read: {why}.") from exc
     return {identifier(f"{path.name}: a profile's name", name): _profile(name, table) for name, table in tables.items()}
 
 

@@ -29,7 +29,7 @@ from strands_robots.safety.stop_roster import StopRoster, robots_known_at
 from strands_robots.safety.stopping import explain, grade
 from strands_robots.tools.mesh_roster import MeshReports, mesh_network
 from strands_robots.tools.roster_verdict import combined_verdict, measured, roster_verdict
-from strands_robots.utils import MissingExtraError, ValidationError
+from strands_robots.utils import MissingExtraError, ValidationError, finite
 
 if TYPE_CHECKING:
     from strands_robots.device_connect import FleetClient
@@ -179,6 +179,8 @@ class NativeMesh:
 
     def _request(self, target: str, seconds: float = ANSWER_S, **command: Any) -> Envelope:
         def requested(mesh: Mesh) -> Envelope:
+            for name, value in command.items():
+                finite(name, value)
             reply = _reply(mesh, target, command, seconds)
             if reply.get("status") == "timeout":
                 return error(f"{target} did not answer.")

@@ -51,6 +51,24 @@ def test_panel_of_a_robot_on_this_machine_comes_without_a_warning(machine: Machi
     assert warned == ""
 
 
+def test_foreign_model_is_served_with_its_tip_named(machine: Machine, tmp_path: Path) -> None:
+    model = tmp_path / "crane.xml"
+    model.write_text(
+        "<mujoco><compiler angle='radian'/><worldbody><body><joint name='pan' axis='0 0 1' range='-2 2' damping='1'/>"
+        "<geom type='capsule' fromto='0 0 0 .2 0 0' size='.02'/><site name='nozzle' pos='.23 0 0'/></body></worldbody>"
+        "<actuator><position joint='pan' kp='50' ctrlrange='-2 2'/></actuator></mujoco>"
+    )
+    refused = machine.run("serve", str(model), "--set", "tip=hook")
+    assert refused.returncode == 2 and "tip must be a site or a body of the model (nozzle" in refused.stderr
+    served = machine.start("serve", str(model), "--peer-id", "crane-1", "--set", "tip=nozzle", "--json")
+    try:
+        assert served.stdout is not None and json.loads(served.stdout.readline())["event"] == "serving"
+        assert machine.json("call", "crane-1", "getPose")[1]["x"] == pytest.approx(0.23, abs=0.005)
+    finally:
+        served.terminate()
+        served.communicate(timeout=WITHIN_S)
+
+
 def test_peers_lists_the_arm_and_its_functions(machine: Machine, arm: dict[str, Any]) -> None:
     code, said = machine.json("peers", "--timeout", "20")
     assert code == 0

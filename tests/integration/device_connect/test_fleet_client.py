@@ -120,6 +120,25 @@ def test_id_out_of_domain_is_refused_before_it_is_sent(fleet: FleetClient, devic
         fleet.call(device, "getStatus")
 
 
+@pytest.mark.parametrize(
+    ("params", "named"),
+    [
+        ({"duration": float("nan")}, "duration must be finite, not nan"),
+        ({"x": float("-inf")}, "x must be finite, not -inf"),
+        ({"joints": {"pan": 0.5, "lift": float("nan")}}, "joints.lift must be finite"),
+        ({"path": [[0.0, 1.0], (0.0, float("inf"))]}, r"path\[1\]\[1\] must be finite"),
+        ({"joints": {"pan": object()}}, "params must be values that JSON can carry"),
+    ],
+)
+def test_argument_that_json_cannot_carry_is_refused_by_its_name(
+    fleet: FleetClient, params: dict[str, Any], named: str
+) -> None:
+    with pytest.raises(ValidationError, match=named):
+        fleet.call("arm-1", "execute", params)
+    (answer, _) = fleet.call_each({"arm-1": params}, "execute")["arm-1"]
+    assert isinstance(answer, ValidationError)
+
+
 def test_subscription_delivers_events_in_order_until_it_closes(fleet: FleetClient, worlds: dict[str, ToyWorld]) -> None:
     received: list[DeviceEvent] = []
     with fleet.subscription("arm-2", received.append):

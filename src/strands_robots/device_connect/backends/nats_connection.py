@@ -10,11 +10,8 @@ import asyncio
 import base64
 import contextlib
 import logging
-import ssl
-import tempfile
 from collections.abc import Awaitable, Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import nats.errors
@@ -27,6 +24,8 @@ from ...utils import redacted
 from ._compat import EncryptedClient, direct_parser
 from .config import DEFAULT_URL, LinkConfig
 from .dispatch import Throttled
+from .reasons import reason_of
+from .tls import client_context
 
 logger = logging.getLogger(__name__)
 
@@ -133,10 +132,13 @@ class NatsConnection:
         link, problems = self.link, list[str]()
 
         async def on_error(error: Exception) -> None:
-            problems.append(str(error))
+            problems.append(reason_of(error))
             del problems[:-PROBLEMS_KEPT]
             self._note_denied(str(error))
-            self._log.warning("NATS: %s", error)
+            # Why no connection comes about is told by our exception, and a lost one by _report_link.
+            unlinked = isinstance(error, (OSError, TimeoutError, nats.errors.UnexpectedEOF))
+            log = logger.debug if unlinked else self._log.warning
+            log("NATS: %s", problems[-1])
 
         options: dict[str, Any] = {
             "servers": list(link.connect) or [DEFAULT_URL],
@@ -150,17 +152,17 @@ class NatsConnection:
         if link.jwt:
             options["user_jwt_cb"] = lambda: bytearray(link.jwt.encode())
             options["signature_cb"] = self._sign or partial(_signed, link.nkey_seed)
-        if link.encrypted:
-            options["tls"] = _tls_context(link)
         where = ", ".join(link.connect) or DEFAULT_URL
         try:
+            if link.encrypted:
+                options["tls"] = client_context(link)
             async with asyncio.timeout(link.connect_timeout_s):
                 await self.client.connect(**options)
         except (TimeoutError, OSError, nats.errors.Error) as error:
             await self._abandon()
             refused = [each for each in problems if "authorization" in each.lower()]
             reasons = refused or problems
-            reason = reasons[-1] if reasons else str(error) or f"no answer within {link.connect_timeout_s:g} s"
+            reason = reasons[-1] if reasons else reason_of(error) or f"no answer within {link.connect_timeout_s:g} s"
             kind = AuthenticationError if "authorization" in reason.lower() else MessagingConnectionError
             raise kind(redacted(f"no NATS connection to {where}: {reason}")) from error
         except asyncio.CancelledError:
@@ -183,7 +185,11 @@ class NatsConnection:
     async def _report_link(self, back: bool) -> None:
         if self._closing:
             return
-        logger.log(*(_BACK if back else _LOST))
+        where = redacted(", ".join(self.link.connect) or DEFAULT_URL)
+        if back:
+            logger.warning("The NATS server at %s is back.", where)
+        else:
+            logger.warning("The NATS server at %s is gone. It is tried again every %g s.", where, RECONNECT_WAIT_S)
         for on_link in tuple(self._users.values()):
             await on_link(back)
 
@@ -211,9 +217,6 @@ SUBJECT_MAX = 300
 PROBLEMS_KEPT = 8
 """Errors of a connection that are kept, to name the last one where it cannot be made."""
 
-_BACK = (logging.INFO, "NATS connection is back")
-_LOST = (logging.WARNING, "NATS connection lost")
-
 _CONNECTIONS: dict[tuple[asyncio.AbstractEventLoop, LinkConfig], NatsConnection] = {}
 
 
@@ -233,25 +236,3 @@ def _signed(seed: str, nonce: str | bytes) -> bytes:
 
     challenge = nonce.encode() if isinstance(nonce, str) else nonce
     return base64.b64encode(nkeys.from_seed(seed.encode()).sign(challenge))
-
-
-def _tls_context(link: LinkConfig) -> ssl.SSLContext:
-    """Return a context that trusts the stated authority alone, else the system's."""
-    stated = {"cadata" if link.ca.lstrip().startswith("-----BEGIN") else "cafile": link.ca} if link.ca else {}
-    context = ssl.create_default_context(**stated)  # type: ignore[arg-type]  # both keys take text
-    context.check_hostname = link.verify_hostname
-    if link.cert:
-        _load_identity(context, link.cert, link.key)
-    return context
-
-
-def _load_identity(context: ssl.SSLContext, cert: str, key: str) -> None:
-    """Load certificate and key, which the standard library reads from files only."""
-    if not cert.lstrip().startswith("-----BEGIN"):
-        context.load_cert_chain(cert, key)
-        return
-    with tempfile.TemporaryDirectory(prefix="strands-") as folder:
-        both = Path(folder, "identity.pem")
-        both.touch(mode=0o600)
-        both.write_text(f"{cert}\n{key}\n")
-        context.load_cert_chain(both)

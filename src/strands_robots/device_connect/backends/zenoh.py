@@ -28,9 +28,13 @@ from ...utils import redacted
 from . import jsonrpc, zenoh_session
 from .base import Backend, NoResponderError, Undo, UnreadableReplyError, too_long
 from .config import LinkConfig
+from .dial import why_silent, words_of
 from .dispatch import REPLY_SUBJECT, Backlog, CommandServer, OrderedFeed, on_a_thread
 
 logger = logging.getLogger(__name__)
+
+NO_ZENOH = "what answers there speaks no Zenoh, or asks for TLS"
+"""Why a client that reaches an endpoint has no link all the same."""
 
 REPLY_TTL_S = 60.0
 """Seconds a query outside a command waits for its reply before it is given up."""
@@ -100,8 +104,9 @@ class ZenohBackend(Backend):
             self._shared = await on_a_thread(partial(zenoh_session.acquire, link), undo=zenoh_session.release)
         except zenoh.ZError as error:
             where = ", ".join(link.connect or link.listeners)
-            # Zenoh adds the place in its own sources to the reason.
-            reason = str(error).partition(" at /")[0].strip()
+            # Zenoh tells of a listener why it fails, and of a connection only that none came about in time.
+            silent = await on_a_thread(partial(why_silent, link))
+            reason = silent or (NO_ZENOH if link.connect and not link.is_peer else words_of(str(error)))
             raise MessagingConnectionError(redacted(f"no Zenoh link at {where}: {reason}")) from error
         self._closed = False
         self._query = _QUERY_OF_A_PEER if link.is_peer else _QUERY
@@ -307,7 +312,11 @@ class ZenohBackend(Backend):
         self._call_soon(partial(self._report_link, linked))
 
     def _report_link(self, linked: bool) -> None:
-        logger.log(logging.INFO if linked else logging.WARNING, "Zenoh link %s", "is back" if linked else "lost")
+        where = ", ".join(self._link.connect)
+        if linked:
+            logger.warning("The Zenoh link to %s is back.", where)
+        else:
+            logger.warning("The Zenoh link to %s is lost. It is tried again.", where)
         callback = self._callbacks[linked]
         if callback is not None and not self._closed:
             task = asyncio.ensure_future(callback())

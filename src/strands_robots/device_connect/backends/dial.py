@@ -1,0 +1,95 @@
+"""Dial of one endpoint by TCP and TLS, to name why nobody answers."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+import socket
+import ssl
+from urllib.parse import urlsplit
+
+from .config import ZENOH_PORT, LinkConfig, host_of
+from .reasons import reason_of
+from .tls import client_context
+
+DIAL_S = 0.5
+"""Seconds for each step of a dial, after the transport itself has tried for longer."""
+
+NATS_PORT = 4222
+
+_SYSTEM_ERROR = re.compile(r"\(os error (\d+)\)")
+
+
+def why_silent(link: LinkConfig, within: float = DIAL_S) -> str:
+    """Return why the endpoints that a link connects to do not answer, or empty.
+
+    Args:
+        link: whose transport could not connect.
+        within: seconds for each step.
+    """
+    problems = [endpoint_problem(link, each, within) for each in link.connect[:3]]
+    return "; ".join(dict.fromkeys(filter(None, problems)))
+
+
+def endpoint_problem(link: LinkConfig, endpoint: str, within: float = DIAL_S) -> str:
+    """Return why an endpoint does not answer as TCP, TLS and NATS ask for, or empty.
+
+    What is no TCP is not dialled.
+    """
+    scheme = re.split(r"://|/", endpoint, maxsplit=1)[0] if re.search(r"://|/", endpoint) else "nats"
+    if scheme not in ("tcp", "tls", "nats"):
+        return ""
+    try:
+        with socket.create_connection((host_of(endpoint), _port_of(link, endpoint)), within) as raw:
+            if link.transport == "nats" and (refusal := _greeting_problem(raw, link)):
+                return refusal
+            if scheme == "tls" or (link.transport == "nats" and link.encrypted):
+                _shake_hands(raw, link, host_of(endpoint))
+    except OSError as error:
+        return reason_of(error)
+    return ""
+
+
+def words_of(text: str) -> str:
+    """Return the reason in a text of Zenoh, without the place in its own sources."""
+    known = _SYSTEM_ERROR.search(text)
+    if known:
+        return reason_of(OSError(int(known[1]), text))
+    return text.partition(" at /")[0].strip()
+
+
+def _port_of(link: LinkConfig, endpoint: str) -> int:
+    if link.transport == "nats":
+        return urlsplit(endpoint if "://" in endpoint else f"nats://{endpoint}").port or NATS_PORT
+    digits = re.split(r"[?#]", endpoint, maxsplit=1)[0].rpartition(":")[2]
+    return int(digits) if digits.isdigit() else ZENOH_PORT
+
+
+def _greeting_problem(raw: socket.socket, link: LinkConfig) -> str:
+    """Read what a NATS server says first; return what is wrong with it."""
+    said = b""
+    with contextlib.suppress(TimeoutError):
+        while b"\r\n" not in said and len(said) < 2**16 and (more := raw.recv(4096)):
+            said += more
+    if not said.startswith(b"INFO "):
+        return "what listens there is no NATS server"
+    try:
+        server = json.loads(said[5:].partition(b"\r\n")[0])
+    except ValueError:
+        return "what listens there is no NATS server"
+    wanted = bool(server.get("tls_required"))
+    if link.encrypted and not (wanted or server.get("tls_available")):
+        return "that server has no TLS; nats:// without certificates reaches it"
+    return "that server asks for TLS; give tls:// and certificates" if wanted and not link.encrypted else ""
+
+
+def _shake_hands(raw: socket.socket, link: LinkConfig, host: str) -> None:
+    """Do a TLS handshake; with TLS 1.3 a server refuses a certificate only after it.
+
+    Raises:
+        OSError: it failed.
+    """
+    with client_context(link).wrap_socket(raw, server_hostname=host) as secured, contextlib.suppress(TimeoutError):
+        if not secured.recv(1):
+            raise ssl.SSLError(1, "[SSL] the server ended the connection after the handshake")
