@@ -15,7 +15,7 @@ CLOSE_S = 5.0
 
 
 class StandingController:
-    """Safety controller of a server process, which reports whom it misses when another one stops robots.
+    """Safety controller of a server: reports whom it misses when others stop robots.
 
     It presses no stop itself. Its thread opens the link, so that the server waits for nothing, and closes it.
 
