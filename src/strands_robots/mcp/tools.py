@@ -10,7 +10,7 @@ import asyncio
 import contextlib
 import json
 import time
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping
 from functools import partial
 from typing import Annotated, Any, Literal, TypeAlias
 
@@ -51,8 +51,14 @@ Speed = Annotated[Number, Field(description="Share of full speed, above 0 and at
 Answer: TypeAlias = Result | InputRequiredResult
 
 
-def add_reads(server: MCPServer[Any], access: AccessOf) -> None:
-    """Add the tools that read."""
+def add_reads(server: MCPServer[Any], access: AccessOf, standing: Callable[[], str] = str) -> None:
+    """Add the tools that read.
+
+    Args:
+        server: that gets them.
+        access: of a call's client.
+        standing: returns why this server does not report whom it misses when others stop robots, or "".
+    """
 
     @server.tool(annotations=READ)
     async def list_robots(
@@ -135,7 +141,9 @@ def add_reads(server: MCPServer[Any], access: AccessOf) -> None:
             for each in reports
         }
         locked = sum(bool(each.lockouts) for each in reports)
-        return result(success(f"{locked} of {len(rows)} robots are locked.", robots=rows))
+        problem = standing()
+        absent = f" This server does not answer the stops of others: {problem}." if problem else ""
+        return result(success(f"{locked} of {len(rows)} robots are locked.{absent}", robots=rows, stands=not problem))
 
 
 def add_stops(server: MCPServer[Any], access: AccessOf) -> None:
