@@ -90,7 +90,7 @@ def add_reads(server: MCPServer[Any], access: AccessOf, standing: Callable[[], s
     async def get_state(context: Context[Any, Any], robot: Robot) -> Result:
         """Read the state of a robot: task, joints, lockout, who holds it."""
         caller = access(context).caller
-        status, state = await asyncio.gather(caller.read(robot, "getStatus"), caller.read(robot, "getState"))
+        status, state = await asyncio.gather(caller.query(robot, "getStatus"), caller.query(robot, "getState"))
         if is_error(status):
             return result(status)
         return result({**status, **({} if is_error(state) else {"state": facts(state)})})
@@ -98,7 +98,7 @@ def add_reads(server: MCPServer[Any], access: AccessOf, standing: Callable[[], s
     @server.tool(annotations=READ)
     async def get_pose(context: Context[Any, Any], robot: Robot, robot_name: InWorld = "") -> Result:
         """Read an arm's tip, approach, joints and gripper, in metres and degrees."""
-        return result(await access(context).caller.read(robot, "getPose", _given(robot_name=robot_name)))
+        return result(await access(context).caller.query(robot, "getPose", _given(robot_name=robot_name)))
 
     @server.tool(annotations=READ)
     async def get_picture(
@@ -110,12 +110,12 @@ def add_reads(server: MCPServer[Any], access: AccessOf, standing: Callable[[], s
     ) -> Result:
         """Take a picture with a camera of the robot."""
         params = {"camera": camera, "width": width, "height": height}
-        return picture(await access(context).caller.read(robot, "getPicture", params))
+        return picture(await access(context).caller.query(robot, "getPicture", params))
 
     @server.tool(annotations=READ)
     async def get_objects(context: Context[Any, Any], robot: Robot, robot_name: InWorld = "") -> Result:
         """Read the objects that can be seen: centre, size and yaw of each."""
-        return result(await access(context).caller.read(robot, "getObjects", _given(robot_name=robot_name)))
+        return result(await access(context).caller.query(robot, "getObjects", _given(robot_name=robot_name)))
 
     @server.tool(annotations=READ)
     async def wait_for(
