@@ -38,6 +38,7 @@ TIMES, TIMES_QUICK = 100, 5
 SERVERS, SERVERS_QUICK = 20, 2
 STOP_MS, HALT_MS, PAGE_BYTES = 80.0, 300.0, 8000
 ROBOTS = 500
+BURST, BURSTS = 100, 7
 AFTER_S = 0.4
 """Seconds for which writes are waited for after the last one may have come."""
 
@@ -187,7 +188,7 @@ def run(*, quick: bool = False) -> list[Row]:
         os.environ["STRANDS_STATE_DIR"] = folder
         site = Site(state)
         try:
-            return [*asyncio.run(measured(site, quick=quick)), asyncio.run(pages())]
+            rows = [*asyncio.run(measured(site, quick=quick)), asyncio.run(pages())]
         finally:
             site.fleet.close()
             site.close()
@@ -195,6 +196,37 @@ def run(*, quick: bool = False) -> list[Row]:
                 del os.environ["STRANDS_STATE_DIR"]
             else:
                 os.environ["STRANDS_STATE_DIR"] = before
+    return [*rows, *bursts(quick=quick)]
+
+
+def bursts(*, quick: bool) -> list[Row]:
+    """Read the pose of a simulated arm many times at once; count refusals."""
+    times = 1 if quick else BURSTS
+    with tempfile.TemporaryDirectory(prefix="bench-mcp-") as folder:
+        state = Path(folder)
+        state.chmod(0o700)
+        site = McpSite(state)
+
+        async def read(name: str, connection: Any) -> Row:
+            refused, took = [], []
+            async with connection as client:
+                for _ in range(times):
+                    began = time.monotonic()
+                    calls = (client.call_tool("get_pose", {"robot": "arm-2"}) for _ in range(BURST))
+                    refused.append(sum(each.is_error for each in await asyncio.gather(*calls)))
+                    took.append((time.monotonic() - began) * 1000)
+            ours = f"{sum(refused)} refused, {sorted(took)[len(took) // 2]:.0f} ms a burst"
+            kept = f"{refused.count(0)} of {times}"
+            return Row(f"{BURST} `get_pose` at once, {name}", ours, kept, None, "none refused", not any(refused))
+
+        async def both() -> list[Row]:
+            with site.http() as url:
+                return [await read("stdio", site.client()), await read("HTTP", site.http_client(url))]
+
+        try:
+            return asyncio.run(both())
+        finally:
+            site.close()
 
 
 async def measured(site: Site, *, quick: bool) -> list[Row]:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import time
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,13 @@ from strands_robots.cli.output import CliError, Exit
 from strands_robots.device_connect.backends import loopback_config
 from strands_robots.device_connect.client import DeviceTimeoutError
 from strands_robots.device_connect.discovery import Peer
+from strands_robots.device_connect.enrollment import network_of
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.safety.approval import Grants
 from strands_robots.safety.ed25519 import keygen
 from strands_robots.safety.lockout import OVERFLOW, Lockout, LockoutState
 from strands_robots.safety.persistence import LockoutStore, StoredLockout
+from strands_robots.safety.sightings import sightings
 
 STRONG = "Plenty of 4 different words"
 A, B = "a" * 32, "b" * 32
@@ -96,6 +99,31 @@ def test_only_the_targets_are_freed(run: Run, fleet: FakeFleet, signed: tuple[st
     fleet.lockouts = {"arm-1": [A], "arm-2": [A], "arm-3": [A]}
     assert run(*signed, "--targets", "arm-1,arm-3").exit_code == 0
     assert fleet.lockouts == {"arm-1": [], "arm-2": [A], "arm-3": []}
+
+
+def test_silent_robot_is_named_before_the_targets_are_freed(
+    run: Run, fleet: FakeFleet, signed: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    network = network_of(fleet.link)
+    for name in ("arm-1", "arm-2", "arm-3"):
+        sightings().note(network, name, stoppable=True)
+    assert sightings().flush(20.0)
+    fleet.lockouts, fleet.silent = {"arm-1": [A], "arm-2": [A], "arm-3": [A]}, {"arm-3"}
+    result = run(*signed, "--targets", "arm-1")
+    assert result.stdout.index("NOT HEARD: arm-3.") < result.stdout.index("free")
+    assert fleet.lockouts == {"arm-1": [], "arm-2": [A], "arm-3": [A]}
+    assert json.loads(run(*signed, "--json").stdout)["unheard"] == ["arm-3"]
+
+
+def test_local_resume_names_who_was_not_heard_since_the_stop(run: Run, fleet: FakeFleet) -> None:
+    sightings().note(network_of(fleet.link), "arm-1", stoppable=True)
+    sightings().note(network_of(fleet.link), "arm-2", stoppable=True)
+    assert sightings().flush(20.0)
+    hold = Lockout(A, "desk", "a hand", time.time() + 1.0)
+    LockoutStore().save({"k": StoredLockout(LockoutState((hold,)), name="arm-1")})
+    result = run("resume", "--local")
+    assert result.exit_code == 0
+    assert result.stdout.index("NOT HEARD: arm-2.") < result.stdout.index("cleared")
 
 
 def test_robots_still_locked_are_named_with_exit_1(run: Run, fleet: FakeFleet, signed: tuple[str, ...]) -> None:

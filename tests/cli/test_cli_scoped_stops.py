@@ -137,7 +137,7 @@ def test_roster_of_a_stop_has_the_robots_in_its_scope() -> None:
     outcome = roster(ONLY).outcome(report("arm-1"))
     assert exit_code(outcome) is Exit.OK
     assert outcome.size == 1
-    assert "for only arm-1" in stop_notes(outcome)[0]
+    assert "for arm-1 only" in stop_notes(outcome)[0]
     cell = Scope(cell="cell-1")
     outcome = roster(cell).outcome(report("arm-1", scope=cell))
     assert (outcome.report.silent, exit_code(outcome)) == (("nowhere",), Exit.SILENT)
@@ -177,4 +177,4 @@ def test_lockout_table_shows_the_scope(run: Run) -> None:
     kept = StoredLockout(LockoutState((Lockout("e" * 32, "safety-1", "smoke", 1.0, ONLY),)), name="arm-1")
     LockoutStore().save({hardware_key("arm", "1"): kept})
     shown = run("lockout", "--local")
-    assert "by safety-1 for only arm-1: smoke" in " ".join(shown.stdout.split())
+    assert "by safety-1 for arm-1 only: smoke" in " ".join(shown.stdout.split())

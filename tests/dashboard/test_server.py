@@ -25,6 +25,8 @@ from strands_robots.dashboard.server import STATIC, Dashboard
 from strands_robots.envelope import error, success
 from strands_robots.safety.answers import Answer
 from strands_robots.safety.ed25519 import keygen
+from strands_robots.safety.network_key import NetworkKey
+from strands_robots.safety.sightings import sightings
 
 ORIGIN = "http://127.0.0.1:8800"
 PASSPHRASE = "Plenty of 4 different words"
@@ -291,6 +293,20 @@ def test_resume_takes_the_passphrase_and_the_machine_of_the_server(make: Make, t
         assert site.feed.resumed == []
         assert asked(socket, type="resume", key="", keys=["dc:arm-1"], passphrase=PASSPHRASE)["ok"]
     assert site.feed.resumed == ["arm-1"]
+
+
+def test_resume_names_the_robots_of_the_roster_that_are_not_heard(make: Make, tmp_path: Path) -> None:
+    key = tmp_path / "operator.pem"
+    keygen(key, PASSPHRASE)
+    site = make(key=key)
+    network = site.feed.controller.network = NetworkKey.of("device-connect", ["tcp/127.0.0.1:7447"])
+    sightings().note(network, "arm-9", stoppable=True)
+    assert sightings().flush(20.0)
+    with site.open("/state") as socket:
+        assert hello(socket)["operator_key"] is True
+        said = asked(socket, type="resume", key="", keys=["dc:arm-1"], passphrase=PASSPHRASE)
+    assert said["ok"]
+    assert "NOT HEARD: arm-9." in said["text"]
 
 
 def test_resume_from_another_machine_is_refused(make: Make, tmp_path: Path) -> None:

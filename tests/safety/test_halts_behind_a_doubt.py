@@ -105,11 +105,12 @@ def test_hung_readings_keep_few_threads_and_no_halt_back(
     for _ in range(3 * STUCK_MAX):
         verdict = submit(1)[0].result(20)
         assert "no answer in 0.05 s" in verdict.not_stopped["task"]
-    assert len(robot.stops) == 3 * STUCK_MAX
+    # A busy machine may begin a halt after its verdict was due.
+    eventually(lambda: len(robot.stops) == 3 * STUCK_MAX, what="every halt")
     assert robot.most_reading <= STUCK_MAX + 1
     hang.released.set()
     eventually(lambda: robot.reading == 0)
-    assert submit(1)[0].result(20).stopped is True, "a status that is back counts again"
+    eventually(lambda: submit(1)[0].result(20).stopped is True, what="a status that is back counts again")
 
 
 def test_the_next_return_of_a_blocked_halt_serves_all_that_wait(hang: Hang) -> None:

@@ -320,7 +320,7 @@ def test_lockout_refusal_and_audit_name_the_scope(plane: SafetyPlane, add: Add) 
     refusal = robot.gate.lockout("execute")
     assert refusal is not None
     assert refusal["scope"] == {"only": ["arm-1"]}
-    assert "for only arm-1" in str(refusal["reason"])
+    assert "for arm-1 only" in str(refusal["reason"])
     records = eventually(lambda: [each for each in read_audit_log() if each["event"] == "emergency_stop"])
     assert records[-1]["payload"]["scope"] == {"only": ["arm-1"]}
 

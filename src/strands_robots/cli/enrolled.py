@@ -22,6 +22,8 @@ from strands_robots.safety.identity import (
     local_name,
 )
 from strands_robots.safety.lockout import utc
+from strands_robots.safety.sightings import sightings
+from strands_robots.safety.silence import described
 from strands_robots.utils import shown, text
 
 REASON_MAX = 200
@@ -91,6 +93,8 @@ def apply(screen: Screen, change: Change, tenant: str) -> None:
         screen.say(f"{name} is not enrolled any more: its answers are not checked, and no stop waits for it by name.")
     else:
         screen.say(f"{name} is {change.action}: every stop prints that, and waits for it no more. {UNDONE}")
+        if any(each.alive and local_name(each.network.tenant, each.name) == name for each in sightings().read()[0]):
+            screen.say(f"A process of this machine serves {name} now: until that ends, it must answer.", "yellow")
 
 
 def show_enrolled(screen: Screen) -> None:
@@ -104,9 +108,13 @@ def show_enrolled(screen: Screen) -> None:
     except (KeyFileError, OSError) as exc:
         raise CliError(f"The enrolled robots cannot be read: {exc}") from exc
     rows = ((name, _state(each), _networks(each), fingerprint(each.key)) for name, each in sorted(robots.items()))
-    screen.show(table("", ("robot", "", "network", "fingerprint"), rows))
+    shown_robots = table("", ("robot", "", "network", "fingerprint"), rows)
+    # It is compared and copied, so it stays whole.
+    shown_robots.columns[-1].no_wrap = True
+    screen.show(shown_robots)
     screen.data({"status": "success", "robots": {name: _facts(each) for name, each in sorted(robots.items())}})
-    screen.say("" if robots else "No robot is enrolled: a stop waits for every robot that was heard.")
+    if not robots:
+        screen.say("No robot is enrolled: a stop waits for every robot that was heard.")
 
 
 def _state(robot: EnrolledRobot) -> Any:
@@ -118,7 +126,7 @@ def _state(robot: EnrolledRobot) -> Any:
 
 
 def _networks(robot: EnrolledRobot) -> str:
-    return "; ".join(each.text for each in robot.networks) or "every one (enrolled by an earlier release)"
+    return "; ".join(described(each) for each in robot.networks) or "every one (enrolled by an earlier release)"
 
 
 def _facts(robot: EnrolledRobot) -> dict[str, Any]:

@@ -47,7 +47,7 @@ def mcp(
     if http is None:
         with network.fleet(name) as fleet, closing(StandingController(name, fleet.link)) as standing:
             standing.open()
-            asyncio.run(serve_stdio(Caller(fleet), read_only=read_only))
+            asyncio.run(serve_stdio(Caller(fleet), read_only=read_only, standing=lambda: standing.problem))
         return
     from strands_robots.device_connect import FleetClient  # noqa: PLC0415 - as above
     from strands_robots.mcp.http import Address, serve_http  # noqa: PLC0415 - as above
@@ -68,6 +68,13 @@ def mcp(
 
     try:
         with closing(StandingController(name, link)) as standing:
-            asyncio.run(serve_http(lambda who: FleetClient(link, who), address, default=default, ready=ready))
+            serving = serve_http(
+                lambda who: FleetClient(link, who),
+                address,
+                default=default,
+                ready=ready,
+                standing=lambda: standing.problem,
+            )
+            asyncio.run(serving)
     except (StrandsRobotsError, OSError) as problem:
         raise CliError(str(problem), Exit.USAGE) from problem

@@ -24,10 +24,10 @@ from strands_robots.safety.identity import KeyFileError
 from strands_robots.safety.lockout import OVERFLOW, Lockout, utc
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.orders import new_epoch
-from strands_robots.safety.persistence import LockoutStore
+from strands_robots.safety.persistence import LockoutStore, StoredLockout
 from strands_robots.safety.resume import sign
 from strands_robots.safety.statements import Purpose, distrust
-from strands_robots.safety.stop_roster import unheard
+from strands_robots.safety.unheard import Unheard, unheard_now, unheard_since
 from strands_robots.tools.mesh_roster import mesh_network
 from strands_robots.tools.networks import discover
 from strands_robots.utils import device_id, number
@@ -75,17 +75,18 @@ def resume(
     signer = signing_key(key, passphrase_file)
     if on_mesh:
         network.use_mesh()
-        _report(screen, _resume_on_mesh(screen, wanted, signer, seconds), THEN)
+        _report(screen, *_resume_on_mesh(screen, wanted, signer, seconds), THEN)
         return
     from strands_robots.device_connect.enrollment import network_of  # noqa: PLC0415 - the network is loaded when it is used
 
     with network.fleet() as fleet:
-        found = ask_robots(fleet, wanted or lockable_robots(fleet), seconds)
-        if not found:
+        asked = ask_robots(fleet, dict.fromkeys([*wanted, *lockable_robots(fleet)]), seconds)
+        if not asked:
             raise CliError(f"No robot answered. {describe(fleet.link)}", Exit.SILENT, devices={})
-        _say_missing(screen, found, network_of(fleet.link))
+        unheard = _say_unheard(screen, asked, network_of(fleet.link))
+        found = [each for each in asked if not wanted or each.name in wanted]
         outcome = resume_robots(fleet, found, signer, seconds)
-    _report(screen, outcome, THEN)
+    _report(screen, outcome, unheard, THEN)
 
 
 def lockout(
@@ -193,23 +194,31 @@ def ask_mesh(network: Network, seconds: float, wanted: Iterable[str] = ()) -> li
         return ask_peers(mesh, wanted or lockable_peers(mesh), seconds)
 
 
-def _resume_on_mesh(screen: Screen, wanted: list[str], signer: Any, seconds: float) -> dict[str, tuple[bool, str]]:
+def _resume_on_mesh(
+    screen: Screen, wanted: list[str], signer: Any, seconds: float
+) -> tuple[dict[str, tuple[bool, str]], Unheard]:
     with mesh_peer(None, temporary_mesh_id("console"), "tool") as mesh:
         discover(mesh)
-        answers = ask_peers(mesh, wanted or lockable_peers(mesh), seconds)
-        if not answers:
+        asked = ask_peers(mesh, [*wanted, *lockable_peers(mesh)], seconds)
+        if not asked:
             raise CliError("No robot answered on the mesh of this machine.", Exit.SILENT, devices={})
-        _say_missing(screen, answers, mesh_network())
+        unheard = _say_unheard(screen, asked, mesh_network())
+        answers = [each for each in asked if not wanted or each.name in wanted]
         silent = {each.name: (False, each.problem) for each in answers if each.problem}
         found = {each.name: each.lockouts for each in answers if not each.problem}
-        return resume_peers(mesh, found, signer, seconds) | silent
+        return resume_peers(mesh, found, signer, seconds) | silent, unheard
 
 
-def _say_missing(screen: Screen, found: list[LockoutReport], network: NetworkKey) -> None:
-    """Name the robots of the roster that have not answered, before others move again."""
-    missing = unheard(network, {each.name for each in found if not each.problem})
-    if missing:
-        screen.say(plain(f"NOT HEARD, and what they do is not known: {missing}.", 2000), "bold red")
+def _say_unheard(screen: Screen, asked: list[LockoutReport], network: NetworkKey) -> Unheard:
+    """Name the robots of the roster that do not answer, before others move again."""
+    unheard = unheard_now(network, {each.name for each in asked if not each.problem})
+    _warn(screen, unheard)
+    return unheard
+
+
+def _warn(screen: Screen, unheard: Unheard) -> None:
+    if unheard:
+        screen.say(plain(str(unheard), 6000), "bold red")
 
 
 def operator() -> str:
@@ -226,11 +235,14 @@ def _stored_lockouts() -> dict[str, tuple[Lockout, ...]]:
     Raises:
         CliError: the file cannot be read.
     """
+    return {each.name or key: each.state.all for key, each in _stored_file().items() if each.state.locked}
+
+
+def _stored_file() -> dict[str, StoredLockout]:
     try:
-        stored = LockoutStore().load_all()
+        return LockoutStore().load_all()
     except (OSError, ValueError) as exc:
         raise CliError(f"The lockout file of this machine cannot be read, so its robots come up locked: {exc}") from exc
-    return {each.name or key: each.state.all for key, each in stored.items() if each.state.locked}
 
 
 def _enrolled(fleet: FleetClient) -> dict[str, bytes]:
@@ -283,12 +295,14 @@ def _clear_locally(screen: Screen, wanted: list[str]) -> None:
     if not names:
         why = state_problem() or "This machine's file has no lockout; name the robots whose process runs here."
         raise CliError(why, devices={})
+    unheard = unheard_since(names, _stored_file())
+    _warn(screen, unheard)
     try:
         cleared = clear_here(operator(), names)
     except (OSError, ValueError) as exc:
         raise CliError(f"Nothing was cleared: {exc}") from exc
     outcome = {name: (said.startswith("cleared"), said) for name, said in cleared.items()}
-    _report(screen, outcome, f"Recorded in the audit as cleared by {operator()}.")
+    _report(screen, outcome, unheard, f"Recorded in the audit as cleared by {operator()}.")
 
 
 def resume_robots(
@@ -341,12 +355,13 @@ def _resumed(
     return True, (answer.get("locked") is False, text_of(answer))
 
 
-def _report(screen: Screen, outcome: dict[str, tuple[bool, str]], then: str) -> None:
+def _report(screen: Screen, outcome: dict[str, tuple[bool, str]], unheard: Unheard, then: str) -> None:
     marks = {True: label("free", "green"), False: label("LOCKED", "bold red")}
     screen.show(table("", ("robot", "", "what it said"), ((n, marks[ok], said) for n, (ok, said) in outcome.items())))
     devices = {name: {"free": ok, "said": said} for name, (ok, said) in outcome.items()}
+    facts = {"devices": devices, "unheard": list(unheard.names), "unheard_problem": unheard.problem}
     locked = [name for name, (ok, _) in outcome.items() if not ok]
     if locked:
-        raise CliError(plain(f"Not resumed: {', '.join(locked)}.", 2000), Exit.REFUSED, devices=devices)
-    screen.data({"status": "success", "devices": devices})
+        raise CliError(plain(f"Not resumed: {', '.join(locked)}.", 2000), Exit.REFUSED, **facts)
+    screen.data({"status": "success", **facts})
     screen.say(then)

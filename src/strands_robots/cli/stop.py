@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import wait
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,20 +20,19 @@ from strands_robots.cli.running_stop import RunningStop
 from strands_robots.cli.stop_report import (
     LATE_MS,
     exit_code,
+    failure,
     outcome_rows,
     progress_rows,
     say_outcome,
     stop_table,
-    style_of,
-    summary,
 )
 from strands_robots.envelope import Envelope, text_of
 from strands_robots.safety.controller import DEADLINE_S, Progress
 from strands_robots.safety.stop_roster import StopOutcome
 from strands_robots.serving.robot_verbs import WORLD_VERBS
 from strands_robots.serving.stop_arguments import stop_reason, stop_robot, stop_scope
-from strands_robots.tools.networks import NativeMesh
-from strands_robots.tools.roster_verdict import stop_outcome
+from strands_robots.tools.networks import NativeMesh, silence_of, stop_found
+from strands_robots.tools.roster_verdict import OnOutcome, stop_outcome
 from strands_robots.utils import ValidationError, device_id, number
 
 LOCKED = "They are locked until they are resumed:"
@@ -40,6 +40,10 @@ LOCKED_THERE = "They are locked until they are resumed, at the machine of each r
 BY_KEY = "Or from here, once the robots know the key that this makes (docs/safety.md):"
 UNKNOWN_KEY = "A robot that does not know that key is resumed at its own machine:"
 RESUME_HERE = "strands-robots resume --local"
+KEPT_BY_NONE = (
+    "No robot answered, so none keeps this stop for one that comes back. Stop it again then, or keep "
+    "strands-robots safety-controller open: it tells a robot that comes back."
+)
 CLAIMED = "Claimed is not proven: no enrolled robot signed it. Enroll robots with strands-robots enroll."
 
 
@@ -68,27 +72,27 @@ def stop(
     _say_ignored(screen, unread)
     if on_mesh:
         network.use_mesh()
-        _report_mesh_stop(screen, NativeMesh().stop(device or "", name))
+        _stop_on_mesh(screen, lambda take: NativeMesh().stop(device or "", name, take))
         return
     seconds = _seconds(screen, "--timeout", timeout, 60, 5.0)
+    if device is None:
+        with network.fleet() as fleet:
+            answers, outcome = stop_found(fleet, seconds)
+        _report_all(screen, outcome, {"devices": _devices(answers, outcome)}, describe(fleet.link))
+        return
     with network.fleet() as fleet:
-        answers = fleet.stop_all(seconds) if device is None else {device: fleet.stop(device, seconds, name)}
-        unknown = device is not None and stop_outcome(answers[device])[0] is None
-        near = near_devices(fleet, device) if unknown and device is not None else ""
-    if not answers:
-        raise CliError(f"No robot that can be stopped answered. {describe(fleet.link)}", Exit.SILENT, devices={})
+        stopped, said = stop_outcome(fleet.stop(device, seconds, name))
+        near = ""
+        if stopped is None:
+            why = silence_of(fleet, device)
+            said, near = (f"{said.rstrip('.')}: {why}", "") if why else (said, near_devices(fleet, device))
     # One robot of a world is named with it: the others may move on.
-    outcomes = {f"{each}/{name}" if name else each: stop_outcome(answer) for each, answer in answers.items()}
-    _show_outcomes(screen, outcomes)
-    devices = {name: {"stopped": stopped, "said": said} for name, (stopped, said) in outcomes.items()}
-    moving = [name for name, (stopped, _) in outcomes.items() if stopped is False]
-    silent = [name for name, (stopped, _) in outcomes.items() if stopped is None]
-    if moving:
-        raise CliError(f"DID NOT STOP: {', '.join(moving)}.", Exit.REFUSED, devices=devices)
-    if silent:
-        raise CliError(f"It is unknown whether these stopped: {', '.join(silent)}.{near}", Exit.SILENT, devices=devices)
-    if everything and fleet.stale:
-        raise CliError(f"These stopped: {', '.join(outcomes)}. {fleet.stale}", Exit.SILENT, devices=devices)
+    robot = f"{device}/{name}" if name else device
+    _show_answers(screen, {robot: (stopped, said)})
+    devices = {robot: {"stopped": stopped, "said": said}}
+    if not stopped:
+        what, code = ("DID NOT STOP", Exit.REFUSED) if stopped is False else ("NO ANSWER", Exit.SILENT)
+        raise CliError(f"{what}: {robot}.{near}", code, devices=devices)
     screen.data({"status": "success", "devices": devices})
 
 
@@ -141,7 +145,7 @@ def estop(
             _say_ignored(screen, "estop --mesh stops every robot, and no DEVICE is waited for")
         network.use_mesh()
         on_key = None if key is None else signing_key(key, passphrase_file)
-        _report_mesh_stop(screen, NativeMesh().emergency_stop(reason, on_key, scope))
+        _stop_on_mesh(screen, lambda take: NativeMesh().emergency_stop(reason, on_key, scope, take))
         show_resume(screen, key, f" --mesh{network.flags}")
         return
     # What is no device's id answers to nothing, so the report has it as silent.
@@ -151,7 +155,7 @@ def estop(
     link = network.link()
     signer = None if key is None else signing_key(key, passphrase_file)
     from strands_robots.device_connect.safety_controller import (  # noqa: PLC0415 - the network is loaded when it is used
-        envelope,
+        outcome_envelope,
         safety_controller,
     )
 
@@ -166,9 +170,6 @@ def estop(
     finally:
         controller.close()
     report = outcome.report
-    answer = envelope(report, outcome.reasons)
-    facts = {**_facts(answer), **outcome.facts()}
-    screen.say(summary(report), "bold red" if outcome.problems else style_of(report))
     say_outcome(screen, outcome)
     for name, why in report.alarms.items():
         screen.say(
@@ -177,12 +178,9 @@ def estop(
         )
     if report.claimed:
         screen.say(CLAIMED, "yellow")
-    code = exit_code(outcome)
-    if code is not Exit.OK:
-        where = "" if report.link else f" {describe(link)}"
-        missed = "".join(f" {each.rstrip('.')}." for each in outcome.problems if each != report.widening)
-        raise CliError(plain(f"{text_of(answer)}{missed}{where}", 2000), code, **facts)
-    screen.data({"status": "success", **facts})
+    if report.link and report.silent and not (report.answered or outcome.others.answered):
+        screen.say(KEPT_BY_NONE, "yellow")
+    _end(screen, outcome, _facts(outcome_envelope(outcome)), "" if report.link else describe(link))
     if link.loopback_only:
         user = meeting_user(link)
         screen.say(LOCKED)
@@ -245,25 +243,55 @@ def _title(progress: Progress) -> str:
     return f"EMERGENCY STOP{age}" + ("" if progress.link_up else ": THE LINK IS DOWN")
 
 
-def _show_outcomes(screen: Screen, outcomes: Mapping[str, tuple[bool | None, str]]) -> None:
+def _report_all(screen: Screen, outcome: StopOutcome, facts: Mapping[str, Any], absent: str = "") -> None:
+    """Print a stop of all without times; raise unless the roster stands still."""
+    rows = outcome_rows(outcome)
+    if rows:
+        screen.show(stop_table(rows, timed=False))
+        say_outcome(screen, outcome)
+    _end(screen, outcome, {**facts, **outcome.facts()}, "" if rows else absent)
+
+
+def _end(screen: Screen, outcome: StopOutcome, facts: Mapping[str, Any], where: str) -> None:
+    """Print facts for programs; raise unless the roster stands still."""
+    code = exit_code(outcome)
+    if code is not Exit.OK:
+        raise CliError(plain(f"{failure(outcome)} {where}".rstrip(), 2000), code, **facts)
+    screen.data({"status": "success", **facts})
+
+
+def _devices(answers: Mapping[str, Envelope], outcome: StopOutcome) -> dict[str, Any]:
+    graded = {name: stop_outcome(answer) for name, answer in answers.items()}
+    missing = {name: (None, outcome.reasons.get(name, "no answer")) for name in outcome.report.silent}
+    return {name: {"stopped": stopped, "said": said} for name, (stopped, said) in {**graded, **missing}.items()}
+
+
+def _show_answers(screen: Screen, answers: Mapping[str, tuple[bool | None, str]]) -> None:
     marks = {
         True: label("stopped", "green"),
         False: label("DID NOT STOP", "bold red"),
         None: label("NO ANSWER", "bold red"),
     }
-    rows = ((name, marks[stopped], said) for name, (stopped, said) in outcomes.items())
+    rows = ((name, marks[stopped], said) for name, (stopped, said) in answers.items())
     screen.show(table("", ("robot", "answer", "what it said"), rows))
 
 
-def _report_mesh_stop(screen: Screen, answer: Envelope) -> None:
-    """Print the mesh's answers; raise :class:`CliError` unless all confirmed."""
+def _stop_on_mesh(screen: Screen, stop_robots: Callable[[OnOutcome], Envelope]) -> None:
+    """Stop robots of the mesh, print answers; raise unless all confirmed."""
+    outcomes: list[StopOutcome] = []
+    # The table names what the log would report.
+    with captured_log() if screen.live else nullcontext():
+        answer = stop_robots(outcomes.append)
+    facts = _facts(answer)
+    if outcomes:
+        _report_all(screen, outcomes[0], facts, "They were looked for on the native mesh.")
+        return
     moving, silent = answer.get("not_stopped", []), answer.get("silent", [])
 
-    def outcome(name: str) -> bool | None:
+    def stopped(name: str) -> bool | None:
         return False if name in moving else None if name in silent else True
 
-    _show_outcomes(screen, {name: (outcome(name), text) for name, text in answer.get("robots", {}).items()})
-    facts = _facts(answer)
+    _show_answers(screen, {name: (stopped(name), text) for name, text in answer.get("robots", {}).items()})
     if answer["status"] != "success":
         raise CliError(plain(text_of(answer), 2000), Exit.REFUSED if moving else Exit.SILENT, **facts)
     screen.data({"status": "success", **facts})

@@ -12,7 +12,7 @@ from strands_robots.safety.answers import Answer
 from strands_robots.safety.controller import Progress, StopReport
 from strands_robots.safety.roster import RosterRow
 from strands_robots.safety.silence import seconds
-from strands_robots.safety.stop_notes import stop_notes
+from strands_robots.safety.stop_notes import problem_sentence, stop_notes
 from strands_robots.safety.stop_roster import StopOutcome
 
 SLOW_MS = 100.0
@@ -50,7 +50,25 @@ def summary(report: StopReport) -> str:
     ):
         parts += [f"{len(robots)} {outcome}"] if robots else []
     late = f" It left {report.left_ms / 1000:.1f} s after the press." if report.left_ms > LATE_MS else ""
-    return f"{', '.join(parts)}, in {report.elapsed_ms:.0f} ms.{late} Emergency stop {report.estop_id}."
+    took = f", in {report.elapsed_ms:.0f} ms" if report.elapsed_ms else ""
+    which = f" Emergency stop {report.estop_id}." if report.estop_id else ""
+    return f"{', '.join(parts)}{took}.{late}{which}"
+
+
+def failure(outcome: StopOutcome) -> str:
+    """Return one line: the robots not known to stand still, and problems."""
+    report = outcome.report
+    groups = (
+        (report.not_stopped, "DID NOT STOP"),
+        (report.refused, "DID NOT ACT ON IT"),
+        (report.alarmed, "WRONG KEY"),
+        (report.claimed, "CLAIMED, NOT SIGNED"),
+        (report.silent, "NO ANSWER"),
+    )
+    said = [f"{what}: {', '.join(sorted(robots))}." for robots, what in groups if robots]
+    if not report.link:
+        said.append("The stop was not sent: the link is down.")
+    return " ".join([*said, *map(problem_sentence, outcome.problems)]) or "No robot that can be stopped answered."
 
 
 def report_rows(report: StopReport, reasons: Mapping[str, str] | None = None) -> list[tuple[Any, ...]]:
@@ -79,16 +97,22 @@ def progress_rows(progress: Progress) -> list[tuple[Any, ...]]:
     return [*(_silent_row(name, mark) for name, mark in marks.items() if name not in progress.answered), *answered]
 
 
-def stop_table(rows: list[tuple[Any, ...]], title: str = "") -> Table:
-    """Return the table of a stop."""
-    return table(title, ("robot", "answer", "ms", "what it said"), rows)
+def stop_table(rows: list[tuple[Any, ...]], title: str = "", *, timed: bool = True) -> Table:
+    """Return the table of a stop, with the times of answers where ``timed``."""
+    columns = ("robot", "answer", "ms", "what it said")
+    kept = [at for at, column in enumerate(columns) if timed or column != "ms"]
+    return table(title, [columns[at] for at in kept], [[row[at] for at in kept] for row in rows])
 
 
 def say_outcome(screen: Screen, outcome: StopOutcome) -> None:
-    """Print the roster's size, the groups, and the count of other networks."""
+    """Print counts, the roster's size, groups, and other networks."""
+    screen.say(summary(outcome.report), "bold red" if outcome.problems else style_of(outcome.report))
     screen.say(outcome.sentence, "green" if outcome.ok else "bold red")
+    # The command ends with its problems.
+    problems = {plain(problem_sentence(each), 600) for each in outcome.problems}
     for line in outcome_lines(outcome):
-        screen.say(line, "yellow")
+        if line not in problems:
+            screen.say(line, "yellow")
 
 
 def outcome_lines(outcome: StopOutcome) -> list[str]:

@@ -15,6 +15,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from strands_robots.arm_mixin import WAIT_S
 from strands_robots.bounded_json import json_object
+from strands_robots.cli.output import plain
 from strands_robots.dashboard.access import OPERATOR
 from strands_robots.dashboard.driving import HandControl
 from strands_robots.dashboard.feed import FleetFeed
@@ -24,6 +25,7 @@ from strands_robots.dashboard.pictures import SMALL, SMALL_HZ, Pictures
 from strands_robots.dashboard.verb_forms import LEFT_OUT
 from strands_robots.envelope import Envelope, error, is_error, jsonable, text_of
 from strands_robots.recording.cameras import OVERVIEW
+from strands_robots.safety.unheard import Unheard, unheard_now
 from strands_robots.utils import ValidationError, shown, text
 
 logger = logging.getLogger(__name__)
@@ -352,6 +354,7 @@ class PageSession:
         if not wanted:
             raise ValidationError("keys must name at least one robot.")
         outcomes: dict[str, Any] = {}
+        unheard = [await asyncio.to_thread(self._unheard, feed) for feed, _ in wanted.values()]
         for feed, robots in wanted.values():
             found = await asyncio.to_thread(feed.resume, robots, signer, RESUME_S)
             for name, (free, said) in found.items():
@@ -360,7 +363,16 @@ class PageSession:
         locked = [name for name, each in outcomes.items() if not each["free"]]
         told: Envelope = {"status": "error" if locked else "success", "robots": outcomes}
         said = f"Not resumed: {', '.join(locked)}." if locked else "Resumed. They move again when they are told to."
-        return {**told, "content": [{"text": said}], **({"reason": said} if locked else {})}
+        said = " ".join([said, *(plain(str(each), 2000) for each in unheard if each)])
+        names = [name for each in unheard for name in each.names]
+        return {**told, "unheard": names, "content": [{"text": said}], **({"reason": said} if locked else {})}
+
+    def _unheard(self, feed: FleetFeed) -> Unheard:
+        """Return the robots of the roster not heard lately; it reads the disk."""
+        model, network = self._server.model, feed.controller.network
+        since = model.clock() - FORGET_S
+        heard = {row.id for row in model.rows() if row.network == feed.network and (row.heard or since) > since}
+        return Unheard() if network is None else unheard_now(network, heard)
 
     async def _opened_key(self, message: Message) -> Any:
         if not self._local:

@@ -10,13 +10,14 @@ from strands_robots.device_connect.backends import LinkConfig
 from strands_robots.device_connect.enrollment import enrolled_robots, network_of
 from strands_robots.device_connect.links import usual_link
 from strands_robots.device_connect.stop_link import stop_link
-from strands_robots.envelope import Envelope, error, success
+from strands_robots.envelope import Envelope, error, success, text_of
 from strands_robots.safety.controller import SafetyController, StopReport
 from strands_robots.safety.estop_listener import notification
 from strands_robots.safety.roster import Roster
 from strands_robots.safety.roster_report import STOP_ROSTER
 from strands_robots.safety.standing_roster import StandingRoster, controllers_identity
-from strands_robots.safety.stop_roster import robots_known_at
+from strands_robots.safety.stop_notes import stop_notes
+from strands_robots.safety.stop_roster import StopOutcome, robots_known_at
 
 
 def safety_controller(controller_id: str, link: LinkConfig | None = None, **options: Any) -> SafetyController:
@@ -87,3 +88,11 @@ def envelope(report: StopReport, reasons: Mapping[str, str] | None = None) -> En
         failures.append("the stop was not sent: the link is down")
     failures += [report.widening] if report.widening else []
     return error(f"{'; '.join(failures) or 'No robot answered the emergency stop'}.", **fields)
+
+
+def outcome_envelope(outcome: StopOutcome) -> Envelope:
+    """Return the outcome as an answer, an error unless all of the roster stand still."""
+    answer = envelope(outcome.report, outcome.reasons)
+    fields = {name: value for name, value in answer.items() if name not in ("status", "content", "reason")}
+    said = " ".join([text_of(answer), outcome.sentence, *stop_notes(outcome)])
+    return (success if outcome.ok else error)(said, **fields, **outcome.facts())

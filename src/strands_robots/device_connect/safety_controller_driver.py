@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from device_connect_edge.drivers import DeviceDriver
 from device_connect_edge.types import DeviceIdentity, DeviceStatus
 
 from strands_robots.device_connect._compat import emit, rpc
-from strands_robots.device_connect.safety_controller import envelope
-from strands_robots.envelope import success
+from strands_robots.device_connect.safety_controller import envelope, outcome_envelope
+from strands_robots.envelope import Envelope, success
 from strands_robots.safety.controller import DEADLINE_S, SafetyController
+from strands_robots.safety.orders import new_epoch
+from strands_robots.safety.roster_search import RosterSearch
+from strands_robots.safety.scope import Scope
 from strands_robots.serving.stop_arguments import noted, stop_reason, stop_robot, stop_scope
 from strands_robots.serving.verbs import unknown_arguments
 from strands_robots.utils import ValidationError, number
@@ -87,10 +91,30 @@ class SafetyControllerDriver(DeviceDriver):  # type: ignore[misc]  # the framewo
         scope, unread = stop_scope(given.get("only"), given.get("cell"))
         unknown = given.keys() - {"reason", "expected", "deadline_s", "only", "cell"}
         notes += [unread, unknown_arguments(len(unknown))]
-        report = await asyncio.to_thread(
-            self.controller.stop, list(filter(None, names)), why, deadline_s=within, scope=scope
+        answer = await asyncio.to_thread(self._stopped, [*filter(None, names)], why, within, scope)
+        return noted(answer, *notes)
+
+    def _stopped(self, expected: list[str], reason: str, within: float, scope: Scope) -> Envelope:
+        """Stop robots; where the controller's network is known its roster must answer."""
+        controller = self.controller
+        if controller.network is None:
+            return envelope(controller.stop(expected, reason, deadline_s=within, scope=scope))
+        estop_id = new_epoch()
+        search = RosterSearch(controller, estop_id, controller.network, scope=scope, named=expected)
+        report = controller.stop(
+            expected,
+            reason,
+            deadline_s=within,
+            estop_id=estop_id,
+            more=True,
+            on_progress=search.begin,
+            on_report=search.take,
+            scope=scope,
         )
-        return noted(envelope(report), *notes)
+        outcome = search.roster.outcome(report, replace(controller.sending, left=report.link))
+        outcome.record(controller.controller_id)
+        search.roster.remember(report)
+        return outcome_envelope(outcome)
 
     @rpc(labels={"direction": "read"})
     async def getStatus(self) -> dict[str, Any]:

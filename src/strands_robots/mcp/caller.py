@@ -19,6 +19,7 @@ from strands_robots.device_connect import FleetClient
 from strands_robots.device_connect.client import CallRefusedError, DeviceTimeoutError, NoSuchDeviceError
 from strands_robots.device_connect.discovery import Peer
 from strands_robots.envelope import Envelope, error, is_error, success, text_of
+from strands_robots.mcp.queries import NoTurnError, Queries
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.safety.stopping import Outcome, grade
 from strands_robots.serving.verbs import LEASE_ID, LEASE_TTL_S, TTL_MAX_S, TTL_MIN_S
@@ -82,6 +83,7 @@ class Caller:
         self._secrets: dict[str, str] = {}
         self._binding: set[tuple[str, str]] = set()
         self._used_at = time.monotonic()
+        self._queries = Queries()
         # An emergency stop is never behind another call, nor behind the one before it.
         self._urgent = ThreadPoolExecutor(URGENT_MAX, "mcp-estop")
 
@@ -95,6 +97,14 @@ class Caller:
             return await self._call(robot, verb, params or {}, ANSWER_S)
         except DeviceTimeoutError as exc:
             return error(str(exc))
+
+    async def query(self, robot: str, verb: str, params: Mapping[str, Any] | None = None) -> Envelope:
+        """Do as :meth:`read`, in the client's turn: no burst of reads fills the robot."""
+        try:
+            async with self._queries.turn(robot, ANSWER_S):
+                return await self.read(robot, verb, params)
+        except NoTurnError as refused:
+            return error(str(refused))
 
     async def move(self, robot: str, verb: str, params: Mapping[str, Any], *, wait: bool) -> Envelope:
         """Carry out a motion of an arm; a call that is given up halts it.

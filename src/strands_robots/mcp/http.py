@@ -134,11 +134,18 @@ class HttpServer:
     Args:
         link_fleet: connects to the robots under a caller's name.
         default: the client without a token, while there is no token; None requires one.
+        standing: returns why this process does not answer the stops of others, or "".
     """
 
     def __init__(
-        self, link_fleet: Callable[[str], FleetClient], tokens: TokenFile, address: Address, default: Token | None
+        self,
+        link_fleet: Callable[[str], FleetClient],
+        tokens: TokenFile,
+        address: Address,
+        default: Token | None,
+        standing: Callable[[], str] = str,
     ) -> None:
+        self._standing = standing
         self._link_fleet, self._tokens, self._address, self._default = link_fleet, tokens, address, default
         self._clients: dict[Token, asyncio.Task[_Client]] = {}
         self._pictures: dict[str, bytes] = {}
@@ -158,7 +165,7 @@ class HttpServer:
             fleet = await self._connected("mcp-resources")
             resources, approvals = RobotResources(fleet), Approvals()
             for read_only in (False, True):
-                server = build(_access_of, resources, approvals, read_only=read_only)
+                server = build(_access_of, resources, approvals, read_only=read_only, standing=self._standing)
                 server.streamable_http_app(
                     streamable_http_path=PATH, transport_security=self._address.security(), host=self._address.host
                 )
@@ -326,17 +333,23 @@ def require_secure(address: Address, tokens: TokenFile) -> None:
 
 
 async def serve_http(
-    link_fleet: Callable[[str], FleetClient], address: Address, *, default: Token, ready: Callable[[str], object]
+    link_fleet: Callable[[str], FleetClient],
+    address: Address,
+    *,
+    default: Token,
+    ready: Callable[[str], object],
+    standing: Callable[[], str] = str,
 ) -> None:
     """Serve clients over HTTP until the process is told to end.
 
     Args:
         default: the client without a token, while this machine has no token and no other reaches the server.
         ready: called with the URL once it listens.
+        standing: as of :class:`HttpServer`.
     """
     tokens = TokenFile()
     require_secure(address, tokens)
-    app = HttpServer(link_fleet, tokens, address, default if address.loopback else None)
+    app = HttpServer(link_fleet, tokens, address, default if address.loopback else None, standing)
     config = uvicorn.Config(
         app,
         lifespan="off",

@@ -64,7 +64,7 @@ class RobotResources:
         @server.resource(SCHEME + "{robot}", mime_type="application/json")
         async def robot(robot: str, context: Context) -> str:
             """State of one robot: task, lockout, who holds it."""
-            return quoted({"robot": robot, **facts(await access(context).caller.read(robot, "getStatus"))})
+            return quoted({"robot": robot, **facts(await access(context).caller.query(robot, "getStatus"))})
 
         below = lowlevel(server)
         below.add_request_handler("resources/list", PaginatedRequestParams, self._list)

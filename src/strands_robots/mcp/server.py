@@ -8,7 +8,7 @@ import logging
 import os
 import signal
 import sys
-from collections.abc import AsyncIterator, Awaitable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import Any, BinaryIO, TypeVar, cast
 
 import anyio
@@ -98,9 +98,17 @@ async def _until(gone: asyncio.Event, call: Awaitable[T]) -> T | CallToolResult:
 
 
 def build(
-    access: AccessOf, resources: RobotResources, approvals: Approvals, *, read_only: bool = False
+    access: AccessOf,
+    resources: RobotResources,
+    approvals: Approvals,
+    *,
+    read_only: bool = False,
+    standing: Callable[[], str] = str,
 ) -> MCPServer[Any]:
-    """Return a server; ``read_only`` leaves out what moves robots or holds them."""
+    """Return a server; ``read_only`` leaves out what moves robots or holds them.
+
+    ``standing`` returns why the server does not answer the stops of others, or "".
+    """
     server = RobotServer(
         "strands-robots",
         instructions=INSTRUCTIONS,
@@ -108,7 +116,7 @@ def build(
         log_level="WARNING",
         subscriptions=resources.bus,
     )
-    add_reads(server, access)
+    add_reads(server, access, standing)
     add_stops(server, access)
     if not read_only:
         add_motions(server, access, approvals)
@@ -140,12 +148,12 @@ class _Lines:
         return await anyio.to_thread.run_sync(self._stream.readline, MESSAGE_MAX)
 
 
-async def serve_stdio(caller: Caller, *, read_only: bool = False) -> None:
+async def serve_stdio(caller: Caller, *, read_only: bool = False, standing: Callable[[], str] = str) -> None:
     """Serve one client on stdio; at its end halt what it moves and holds."""
     pictures = PictureFiles()
     access = ClientAccess(caller, approves=True, show_picture=pictures.show)
     resources = RobotResources(caller.fleet)
-    server = build(lambda _context: access, resources, Approvals(), read_only=read_only)
+    server = build(lambda _context: access, resources, Approvals(), read_only=read_only, standing=standing)
     ending: list[asyncio.Task[None]] = []
 
     async def end() -> None:

@@ -10,7 +10,7 @@ import asyncio
 import contextlib
 import json
 import time
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping
 from functools import partial
 from typing import Annotated, Any, Literal, TypeAlias
 
@@ -51,8 +51,14 @@ Speed = Annotated[Number, Field(description="Share of full speed, above 0 and at
 Answer: TypeAlias = Result | InputRequiredResult
 
 
-def add_reads(server: MCPServer[Any], access: AccessOf) -> None:
-    """Add the tools that read."""
+def add_reads(server: MCPServer[Any], access: AccessOf, standing: Callable[[], str] = str) -> None:
+    """Add the tools that read.
+
+    Args:
+        server: that gets them.
+        access: of a call's client.
+        standing: returns why this server does not report whom it misses when others stop robots, or "".
+    """
 
     @server.tool(annotations=READ)
     async def list_robots(
@@ -84,7 +90,7 @@ def add_reads(server: MCPServer[Any], access: AccessOf) -> None:
     async def get_state(context: Context[Any, Any], robot: Robot) -> Result:
         """Read the state of a robot: task, joints, lockout, who holds it."""
         caller = access(context).caller
-        status, state = await asyncio.gather(caller.read(robot, "getStatus"), caller.read(robot, "getState"))
+        status, state = await asyncio.gather(caller.query(robot, "getStatus"), caller.query(robot, "getState"))
         if is_error(status):
             return result(status)
         return result({**status, **({} if is_error(state) else {"state": facts(state)})})
@@ -92,7 +98,7 @@ def add_reads(server: MCPServer[Any], access: AccessOf) -> None:
     @server.tool(annotations=READ)
     async def get_pose(context: Context[Any, Any], robot: Robot, robot_name: InWorld = "") -> Result:
         """Read an arm's tip, approach, joints and gripper, in metres and degrees."""
-        return result(await access(context).caller.read(robot, "getPose", _given(robot_name=robot_name)))
+        return result(await access(context).caller.query(robot, "getPose", _given(robot_name=robot_name)))
 
     @server.tool(annotations=READ)
     async def get_picture(
@@ -104,12 +110,12 @@ def add_reads(server: MCPServer[Any], access: AccessOf) -> None:
     ) -> Result:
         """Take a picture with a camera of the robot."""
         params = {"camera": camera, "width": width, "height": height}
-        return picture(await access(context).caller.read(robot, "getPicture", params))
+        return picture(await access(context).caller.query(robot, "getPicture", params))
 
     @server.tool(annotations=READ)
     async def get_objects(context: Context[Any, Any], robot: Robot, robot_name: InWorld = "") -> Result:
         """Read the objects that can be seen: centre, size and yaw of each."""
-        return result(await access(context).caller.read(robot, "getObjects", _given(robot_name=robot_name)))
+        return result(await access(context).caller.query(robot, "getObjects", _given(robot_name=robot_name)))
 
     @server.tool(annotations=READ)
     async def wait_for(
@@ -135,7 +141,9 @@ def add_reads(server: MCPServer[Any], access: AccessOf) -> None:
             for each in reports
         }
         locked = sum(bool(each.lockouts) for each in reports)
-        return result(success(f"{locked} of {len(rows)} robots are locked.", robots=rows))
+        problem = standing()
+        absent = f" This server does not answer the stops of others: {problem}." if problem else ""
+        return result(success(f"{locked} of {len(rows)} robots are locked.{absent}", robots=rows, stands=not problem))
 
 
 def add_stops(server: MCPServer[Any], access: AccessOf) -> None:

@@ -118,7 +118,7 @@ class StopReport:
     @property
     def widening(self) -> str:
         """Reason why a stop of some robots became one of all, or ""."""
-        return f"no robot was there for {self.scope}: every robot was stopped" if self.widened else ""
+        return f"no {self.scope.meant} answered or is known here, so every robot was stopped" if self.widened else ""
 
     @property
     def answered(self) -> Mapping[str, Answer]:

@@ -37,6 +37,7 @@ class RosterSearch:
         look_up: finds devices, whether each has a stop, and its cell or None, on a thread of its own; the stop goes on
             until then.
         scope: the robots that the stop is for.
+        named: robots that must answer besides the roster.
     """
 
     def __init__(
@@ -46,8 +47,10 @@ class RosterSearch:
         network: NetworkKey,
         look_up: LookUp | None = None,
         scope: Scope = EVERY_ROBOT,
+        *,
+        named: Collection[str] = (),
     ) -> None:
-        self.roster, self.begun = StopRoster(network, scope=scope), False
+        self.roster, self.begun = StopRoster(network, named, scope), False
         self._controller, self._id, self._look_up = controller, estop_id, look_up
         self._answered: Mapping[str, Answer] = {}
         self._lock = threading.Lock()

@@ -87,9 +87,16 @@ class Scope:
         """Return the field ``scope`` of a message or a record; nothing for every robot."""
         return {} if self.everything else {SCOPE: self.value()}
 
+    @property
+    def meant(self) -> str:
+        """The robots that :meth:`names` looks for, in words."""
+        if self.only:
+            return f"robot named {' or '.join(sorted(self.only))}"
+        return f"robot of cell {self.cell}" if self.cell else "robot"
+
     def __str__(self) -> str:
         if self.only:
-            return f"only {', '.join(sorted(self.only))}"
+            return f"{', '.join(sorted(self.only))} only"
         return f"cell {self.cell} and robots without a cell" if self.cell else "every robot"
 
 
@@ -128,9 +135,10 @@ class KnownRobots:
 def report_widened(epoch: str, scope: Scope) -> None:
     """Log that a stop of some robots has become one of every robot."""
     logger.critical(
-        "Emergency stop %s was for %s. None of these has answered or is known here: EVERY ROBOT IS STOPPED.",
+        "Emergency stop %s was for %s. No %s has answered or is known here: EVERY ROBOT IS STOPPED.",
         epoch,
         scope,
+        scope.meant,
     )
 
 

@@ -74,6 +74,11 @@ def seconds(age_s: float) -> str:
     return f"{age_s:.0f} s" if age_s < 600 else f"{age_s / 60:.0f} min"
 
 
+def cannot_answer(row: RosterRow) -> bool:
+    """Return True where its process on this machine has ended, or is stopped."""
+    return row.alive is not None and (not row.alive or process_state(row.pid) in ("Z", "X", "T", "t"))
+
+
 def _process(row: RosterRow) -> str:
     state = process_state(row.pid) if row.alive and row.pid else ""
     if not row.alive or state in ("Z", "X"):

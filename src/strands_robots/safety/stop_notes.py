@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from strands_robots.safety.roster import RosterRow
-from strands_robots.safety.silence import UNTOLD, described
+from strands_robots.safety.silence import UNTOLD, cannot_answer, described
 from strands_robots.safety.stop_roster import StopOutcome
 
 STOPS_ANYWAY = "Bare devices and robots of earlier releases stop all the same."
@@ -17,7 +17,7 @@ def stop_notes(outcome: StopOutcome) -> list[str]:
     """Return sentences on problems, the roster's limit, groups, other networks."""
     scoped = not (outcome.report.scope.everything or outcome.report.widened)
     notes = [f"This stop was for {outcome.report.scope}. {STOPS_ANYWAY}"] if scoped else []
-    notes += [f"{each[:1].upper()}{each[1:].rstrip('.')}." for each in outcome.problems]
+    notes += [problem_sentence(each) for each in outcome.problems]
     notes += [outcome.worth] if outcome.worth else []
     notes += [each for each in (_others(outcome), _unproven(outcome), _no_stop(outcome), _exempt(outcome)) if each]
     notes += [_processes(row) for row in outcome.roster.rows if len(row.processes) > 1][:FEW]
@@ -26,9 +26,20 @@ def stop_notes(outcome: StopOutcome) -> list[str]:
         notes.append(f"Robots known under another address answered, so its robots must answer, too: {where}.")
     if outcome.roster.elsewhere:
         notes.append(f"{_number(outcome.roster.elsewhere, 'robot')} of other networks: this stop is not for them.")
-    if outcome.report.silent and not outcome.sending.tells:
+    if outcome.report.silent and not outcome.sending.tells and not _explained(outcome):
         notes.append(UNTOLD)
     return notes
+
+
+def problem_sentence(problem: str) -> str:
+    """Return one of an outcome's problems as a sentence."""
+    return f"{problem[:1].upper()}{problem[1:].rstrip('.')}."
+
+
+def _explained(outcome: StopOutcome) -> bool:
+    """Return True where the process of each silent robot cannot answer."""
+    rows = {row.name: row for row in outcome.roster.rows}
+    return all(name in rows and cannot_answer(rows[name]) for name in outcome.report.silent)
 
 
 def _others(outcome: StopOutcome) -> str:

@@ -75,13 +75,15 @@ class StopOutcome:
     def sentence(self) -> str:
         """The number of robots that are known to stand still, in a sentence."""
         still, size = len(self.report.stopped), self.size
+        some = not (self.report.scope.everything or self.report.widened)
+        which = "that this stop was for" if some else "of the roster"
         if not size:
             return "The roster has no robot."
         if size == 1:
-            return f"The one robot of the roster is {'' if still else 'not '}known to stand still."
+            return f"The one robot {which} is {'' if still else 'not '}known to stand still."
         if still == size:
-            return f"All {size} robots of the roster are known to stand still."
-        return f"{still} of the {size} robots of the roster {'is' if still == 1 else 'are'} known to stand still."
+            return f"All {size} robots {which} are known to stand still."
+        return f"{still} of the {size} robots {which} {'is' if still == 1 else 'are'} known to stand still."
 
     @property
     def worth(self) -> str:
@@ -387,20 +389,6 @@ def robots_known_at(network: Callable[[], NetworkKey]) -> Remembers:
         return any(scope.names(row.name, row.cell) for row in roster.rows if counts(roster, row))
 
     return remembers
-
-
-def unheard(network: NetworkKey, answered: Collection[str]) -> str:
-    """Return the robots of the roster that are not among ``answered``, as text.
-
-    Names that were only heard are left out where robots are enrolled. It reads the disk.
-    """
-    try:
-        roster = Roster.of(network)
-    except Exception as exc:  # noqa: BLE001 - said in place of the names
-        return f"the roster cannot be read: {exc}"
-    names = [row.name for row in roster.rows if counts(roster, row) and row.name not in answered]
-    more = f" and {len(names) - NAMED_MAX} more" if len(names) > NAMED_MAX else ""
-    return f"{', '.join(names[:NAMED_MAX])}{more}"
 
 
 def counts(roster: Roster, row: RosterRow) -> bool:

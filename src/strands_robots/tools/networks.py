@@ -16,7 +16,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from strands_robots import settings
-from strands_robots.envelope import Envelope, error, success, text_of
+from strands_robots.envelope import Envelope, error, success
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety.orders import new_epoch
 from strands_robots.safety.peer_answers import enrolled_peers, stop_distrust
@@ -24,11 +24,10 @@ from strands_robots.safety.roster_search import RosterSearch
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.safety.silence import Sending
 from strands_robots.safety.statements import ALARM
-from strands_robots.safety.stop_notes import stop_notes
-from strands_robots.safety.stop_roster import StopRoster, robots_known_at
+from strands_robots.safety.stop_roster import StopOutcome, StopRoster, robots_known_at
 from strands_robots.safety.stopping import explain, grade
 from strands_robots.tools.mesh_roster import MeshReports, mesh_network
-from strands_robots.tools.roster_verdict import combined_verdict, measured, roster_verdict
+from strands_robots.tools.roster_verdict import OnOutcome, combined_verdict, measured, roster_verdict, unanswered
 from strands_robots.utils import MissingExtraError, ValidationError, finite
 
 if TYPE_CHECKING:
@@ -44,6 +43,10 @@ ESTOP_S = 1.5
 """Seconds in which robots answer an emergency stop; it is repeated until then."""
 
 AGAIN_S, LOOK_S = 1.0, 0.05
+
+
+def ignore_outcome(outcome: StopOutcome) -> None:
+    """Do without the outcome: the envelope says it."""
 
 
 class MeshUnavailableError(StrandsRobotsError, RuntimeError):
@@ -121,10 +124,10 @@ class NativeMesh:
         """Send the peer a ``releaseTorque``."""
         return self._request(target, action="releaseTorque")
 
-    def stop(self, target: str, robot_name: str = "") -> Envelope:
+    def stop(self, target: str, robot_name: str = "", on_outcome: OnOutcome = ignore_outcome) -> Envelope:
         """Stop one peer, or every peer in reach at once; answers by name.
 
-        ``robot_name`` stops one robot of the target's world alone.
+        ``robot_name`` stops one robot of the target's world alone. ``on_outcome`` takes the outcome of a stop of all.
         """
 
         def stopped(mesh: Mesh) -> Envelope:
@@ -135,17 +138,22 @@ class NativeMesh:
                 )
             roster = StopRoster(mesh_network())
             answers = _stop_all(mesh, lambda: mesh.broadcast(command, ESTOP_S), roster)
-            return roster_verdict(answers, measured(answers, roster, Sending()))
+            outcome = measured(answers, roster, Sending())
+            on_outcome(outcome)
+            return roster_verdict(answers, outcome)
 
         return _on_mesh(stopped, stopped=None)
 
-    def emergency_stop(self, reason: str, signing_key: Any = None, scope: Scope = EVERY_ROBOT) -> Envelope:
+    def emergency_stop(
+        self, reason: str, signing_key: Any = None, scope: Scope = EVERY_ROBOT, on_outcome: OnOutcome = ignore_outcome
+    ) -> Envelope:
         """Send the mesh's emergency stop, again while a peer has not confirmed it.
 
         A peer that was seen and did not answer is named. Every repetition is the same stop, ``estop_id``.
 
         Args:
             scope: the robots that it is for. Where none of them is there, every robot is stopped.
+            on_outcome: takes the outcome.
         """
         estop_id = new_epoch()
 
@@ -173,6 +181,7 @@ class NativeMesh:
                 reports.close()
             outcome = measured(answers, roster, Sending(signed=signing_key is not None), estop_id)
             outcome.record(mesh.peer_id)
+            on_outcome(outcome)
             return {**roster_verdict(answers, outcome), "estop_id": estop_id, **scope.field()}
 
         return _on_mesh(stopped, stopped=None)
@@ -221,8 +230,7 @@ def _stop_all(mesh: Mesh, stop: Callable[[], list[dict[str, Any]]], roster: Stop
     if unconfirmed():
         send()
     roster.find(dict.fromkeys(seen, True), {name: next(iter(_cells(mesh, name)), "") for name in seen})
-    silent: dict[str, Envelope] = {name: error(f"{name} did not answer.", stopped=None) for name in seen}
-    return silent | answers
+    return {name: unanswered(name) for name in seen} | answers
 
 
 def _cells(mesh: Mesh, peer: str) -> frozenset[str]:
@@ -235,7 +243,7 @@ def _stop_answer(
 ) -> Envelope:
     """Return a reply as an envelope; one of ``locks`` has to say that it is locked."""
     if reply.get("status") in ("timeout", "error"):
-        return error(f"{target} did not answer.", stopped=None)
+        return unanswered(target)
     result = reply.get("result")
     if grade(result).stopped:
         why = stop_distrust(reply, keys)
@@ -356,13 +364,30 @@ class DeviceConnect:
 
 def stop_everything(fleet: FleetClient) -> Envelope:
     """Stop each device that is found; answers by name, measured by the roster."""
+    answers, outcome = stop_found(fleet, STOP_S)
+    return roster_verdict(answers, outcome)
+
+
+def stop_found(fleet: FleetClient, seconds: float) -> tuple[dict[str, Envelope], StopOutcome]:
+    """Stop each device when it is found; return answers and outcome."""
     from strands_robots.device_connect.enrollment import network_of  # noqa: PLC0415 - the network is loaded when it is used
 
     roster = StopRoster(network_of(fleet.link))
-    answers = fleet.stop_all(STOP_S)
+    answers = fleet.stop_all(seconds)
+    # What was found has to answer, though nothing remembers it.
+    roster.find(dict.fromkeys(answers, True))
     roster.read()
-    outcome = measured(answers, roster, Sending(tells=fleet.link.transport == "nats"))
-    return roster_verdict(answers, outcome, fleet.stale)
+    sending = Sending(tells=fleet.link.transport == "nats")
+    return answers, measured(answers, roster, sending, problem=fleet.stale.rstrip("."))
+
+
+def silence_of(fleet: FleetClient, device: str) -> str:
+    """Return why a robot of the roster may be silent; "" for another name."""
+    from strands_robots.device_connect.enrollment import network_of  # noqa: PLC0415 - the network is loaded when it is used
+
+    roster = StopRoster(network_of(fleet.link))
+    roster.read()
+    return measured({}, roster, Sending(tells=fleet.link.transport == "nats")).reasons.get(device, "")
 
 
 def stop_and_lock(fleet: FleetClient, reason: str, scope: Scope = EVERY_ROBOT) -> Envelope:
@@ -371,7 +396,7 @@ def stop_and_lock(fleet: FleetClient, reason: str, scope: Scope = EVERY_ROBOT) -
     A device of its scope that is in reach and did not answer it gets a plain ``stop`` as well. The roster must answer.
     """
     from strands_robots.device_connect.enrollment import network_of  # noqa: PLC0415 - the network is loaded when it is used
-    from strands_robots.device_connect.safety_controller import envelope, safety_controller  # noqa: PLC0415 - as above
+    from strands_robots.device_connect.safety_controller import outcome_envelope, safety_controller  # noqa: PLC0415 - as above
 
     estop_id = new_epoch()
     controller = safety_controller(fleet.source, fleet.link)
@@ -407,10 +432,7 @@ def stop_and_lock(fleet: FleetClient, reason: str, scope: Scope = EVERY_ROBOT) -
     roster.remember(report)
     if rest:
         return {**roster_verdict(answers, outcome), "not_locked": rest, "estop_id": estop_id}
-    answer = envelope(outcome.report, outcome.reasons)
-    fields = {name: value for name, value in answer.items() if name not in ("status", "content", "reason")}
-    said = " ".join([text_of(answer), outcome.sentence, *stop_notes(outcome)])
-    return (success if outcome.ok else error)(said, **fields, **outcome.facts())
+    return outcome_envelope(outcome)
 
 
 def _peer_list(rows: list[dict[str, Any]], stale: str = "") -> Envelope:

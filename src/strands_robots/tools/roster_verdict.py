@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 from strands_robots.envelope import Envelope, error, is_error, success, text_of
@@ -12,6 +13,9 @@ from strands_robots.safety.silence import Sending
 from strands_robots.safety.stop_notes import stop_notes
 from strands_robots.safety.stop_roster import StopOutcome, StopRoster
 from strands_robots.safety.stopping import explain, grade
+
+OnOutcome = Callable[[StopOutcome], object]
+"""Takes the outcome of a stop, for a face that prints more than its envelope."""
 
 
 def stop_outcome(answer: Envelope) -> tuple[bool | None, str]:
@@ -46,8 +50,18 @@ def combined_verdict(answers: Mapping[str, Envelope], stale: str = "") -> Envelo
     return error("; ".join(problems) + ".", **fields)
 
 
-def measured(answers: Mapping[str, Envelope], roster: StopRoster, sending: Sending, estop_id: str = "") -> StopOutcome:
-    """Measure answers by the roster; one of unknown outcome is no answer."""
+def measured(
+    answers: Mapping[str, Envelope], roster: StopRoster, sending: Sending, estop_id: str = "", problem: str = ""
+) -> StopOutcome:
+    """Measure answers by the roster; one of unknown outcome is no answer.
+
+    Args:
+        answers: by robot.
+        roster: of the stop.
+        sending: how it was sent.
+        estop_id: of an emergency stop.
+        problem: why there may be more robots than these.
+    """
     graded = {name: stop_outcome(answer) for name, answer in answers.items()}
     rows = {name: Answer(name, stopped, 0.0, said) for name, (stopped, said) in graded.items() if stopped is not None}
     report = StopReport(
@@ -59,24 +73,33 @@ def measured(answers: Mapping[str, Envelope], roster: StopRoster, sending: Sendi
         sending.left,
         0.0,
     )
-    return roster.outcome(report, sending)
+    outcome = roster.outcome(report, sending, problem)
+    reasons = dict(outcome.reasons)
+    for name in outcome.report.silent:
+        said = text_of(answers[name]).rstrip(".") if name in answers else ""
+        if said and said != text_of(unanswered(name)).rstrip("."):
+            reasons[name] = f"{said}: {reasons[name]}" if name in reasons else said
+    return replace(outcome, reasons=reasons)
 
 
-def roster_verdict(answers: Mapping[str, Envelope], outcome: StopOutcome, stale: str = "") -> Envelope:
+def unanswered(robot: str) -> Envelope:
+    """Return what stands for the answer of a robot that gave none."""
+    return error(f"{robot} did not answer.", stopped=None)
+
+
+def roster_verdict(answers: Mapping[str, Envelope], outcome: StopOutcome) -> Envelope:
     """Return one answer: success when every robot of the roster was confirmed.
 
     Args:
         answers: by robot.
         outcome: of these answers.
-        stale: as of :func:`combined_verdict`.
     """
     report = outcome.report
     rows = {name: answers[name] for name in answers if name in report.answered}
     for name in report.silent:
-        said = text_of(answers[name]) if name in answers else f"{name} did not answer."
         why = outcome.reasons.get(name, "")
-        rows[name] = error(f"{said.rstrip('.')}{f': {why}' if why else ''}.", stopped=None)
-    verdict = combined_verdict(rows, stale or " ".join(outcome.problems))
+        rows[name] = error(f"{why}.", stopped=None) if why else unanswered(name)
+    verdict = combined_verdict(rows, " ".join(outcome.problems))
     fields = {name: value for name, value in verdict.items() if name not in ("status", "content", "reason")}
     said = " ".join([text_of(verdict), outcome.sentence, *stop_notes(outcome)])
     return (error if is_error(verdict) else success)(said, **fields, **outcome.facts())

@@ -75,10 +75,15 @@ def test_frozen_process_is_named_with_its_reason(site: Site) -> None:
         site.remembers("arm-1", "arm-2")
         with frozen(second):
             code, said = site.estop()
-        assert code == 3, said
+            stopped, plainly = site.json("stop", "--all", *site.flags)
+            freed, resumed = site.json("resume", "--local", "arm-1")
+        for each, answer in ((code, said), (stopped, plainly)):
+            assert each == 3, answer
+            assert answer["reason"] == "NO ANSWER: arm-2."
+            assert "SIGSTOP" in answer["reasons"]["arm-2"]
+            assert answer["roster"]["size"] == 2
         assert said["silent"] == ["arm-2"]
-        assert "SIGSTOP" in said["reasons"]["arm-2"]
-        assert said["roster"]["size"] == 2
+        assert (freed, resumed["unheard"]) == (0, ["arm-2"]), resumed
 
 
 def test_enrolled_robot_that_was_killed_is_named(site: Site) -> None:

@@ -46,6 +46,19 @@ async def test_a_simulated_arm_says_what_it_reached_and_refuses_what_it_cannot(s
             assert (await client.call_tool("move", {"robot": "arm-2", **malformed})).is_error
 
 
+async def test_no_read_of_a_burst_is_refused_and_the_server_says_that_it_stands(site: McpSite) -> None:
+    async with site.client() as client:
+        burst = (client.call_tool("get_pose", {"robot": "arm-2"}) for _ in range(100))
+        refused = [answer.content for answer in await asyncio.gather(*burst) if answer.is_error]
+        assert refused == []
+
+        async def stands() -> bool:
+            answer = await client.call_tool("lockouts", {})
+            return bool(answer.structured_content["data"]["stands"])
+
+        await eventually_async(stands, within=60, what="its e-stop link")
+
+
 @BOTH
 async def test_a_cancelled_call_halts_the_motion_that_it_began(site: McpSite, mode: str) -> None:
     async with site.client(mode=mode) as client:

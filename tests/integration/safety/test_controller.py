@@ -22,6 +22,7 @@ from strands_robots.envelope import is_error
 from strands_robots.safety import ed25519
 from strands_robots.safety.controller import Progress, SafetyController
 from strands_robots.safety.orders import StopRules
+from strands_robots.safety.sightings import sightings
 from strands_robots.utils import ValidationError
 
 Broker = ZenohRouter | NatsServer
@@ -228,6 +229,18 @@ async def test_the_controller_as_a_device_answers_by_name(
     for said in ("reason is a list", "expected names", "deadline_s", "1 unknown argument"):
         assert said in stopped["ignored"]
     assert (await driver.getStatus())["link_up"] is True
+
+
+async def test_the_controller_as_a_device_names_a_silent_robot_of_the_roster(
+    controller: SafetyController, site_of: Callable[..., Site]
+) -> None:
+    site_of("arm-1")
+    assert controller.network is not None
+    sightings().note(controller.network, "arm-2", stoppable=True)
+    assert sightings().flush(20.0)
+    answer = await SafetyControllerDriver(controller).stopAll("smoke", ["arm-1"])
+    assert (answer["status"], answer["silent"], list(answer["stopped"])) == ("error", ["arm-2"], ["arm-1"])
+    assert "1 of the 2 robots of the roster is known to stand still." in answer["reason"]
 
 
 def test_a_text_in_place_of_names_and_a_bad_deadline_are_refused(controller: SafetyController) -> None:
