@@ -29,7 +29,7 @@ STILL = 1e-3
 
 
 class StateRate:
-    """Whether a robot moves, by its gate, its lockouts and its last states; callable from any thread.
+    """Signs of a robot's motion: its gate, lockouts and last states; any thread.
 
     Args:
         gate: every motion asks it for a permit before it begins.
