@@ -41,6 +41,9 @@ class FakeFleet:
     def peers(self, timeout: float = 2.0) -> list[Peer]:
         return [Peer(name, functions=({"name": "resume"},)) for name in self.lockouts] + [Peer("camera")]
 
+    def announces(self, device: str, function: str, argument: str) -> bool:
+        return False
+
     def call(self, device: str, function: str, params: dict[str, Any], timeout: float) -> Envelope:
         if device in self.silent:
             raise DeviceTimeoutError(f"{device} is announced and did not answer.")

@@ -35,6 +35,21 @@ def test_peers_that_start_at_once_do_not_read_at_once() -> None:
         assert min(later - earlier for earlier, later in pairwise(due)) > 1 / (BY_NAME["state"].ceiling_hz or 1)
 
 
+def test_job_whose_pace_rises_runs_at_once_and_once() -> None:
+    runs, scheduler = list[int](), Scheduler("peer")
+    scheduler.every("state", 0.01, lambda: runs.append(1))
+    scheduler.start()
+    try:
+        eventually(lambda: len(runs) == 1)
+        scheduler.pace("state", 0.02, soon=True)
+        eventually(lambda: len(runs) == 2)
+        scheduler.pace("state", 100.0)
+        eventually(lambda: len(runs) > 5)
+        scheduler.pace("gone", 100.0, soon=True)
+    finally:
+        assert scheduler.stop(20) == []
+
+
 def test_wedged_robot_delays_no_other_and_its_stop_names_what_still_runs() -> None:
     release, beats, read = threading.Event(), list[int](), list[int]()
     wedged, sound = Scheduler("wedged"), Scheduler("sound")

@@ -143,7 +143,7 @@ def _on_fleet(network: Network, wanted: list[str], seconds: float) -> tuple[list
     from strands_robots.device_connect.enrollment import network_of  # noqa: PLC0415 - loaded when a network is used
 
     with network.fleet() as fleet:
-        reports = ask_robots(fleet, wanted or lockable_robots(fleet, seconds), seconds)
+        reports = ask_robots(fleet, wanted or lockable_robots(fleet, seconds), seconds, signed=True)
         return reports, network_of(fleet.link), describe(fleet.link)
 
 

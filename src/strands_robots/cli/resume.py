@@ -170,13 +170,18 @@ def lockable_robots(fleet: FleetClient, seconds: float = 2.0) -> list[str]:
     return [peer.id for peer in fleet.peers(seconds) if any(each.get("name") == "resume" for each in peer.functions)]
 
 
-def ask_robots(fleet: FleetClient, names: Iterable[str], seconds: float) -> list[LockoutReport]:
+def ask_robots(
+    fleet: FleetClient, names: Iterable[str], seconds: float, *, signed: bool = False
+) -> list[LockoutReport]:
     """Ask each robot for its status, many at once and without a thread for each.
 
     An enrolled robot whose answer is not its own has a ``problem``.
+
+    Args:
+        signed: ask every robot to sign its answer, even one that announces no nonce.
     """
     keys = _enrolled(fleet)
-    asked = {name: {"nonce": new_epoch()} if name in keys else {} for name in names}
+    asked = {name: status_question(fleet, name, signed=signed or name in keys) for name in names}
     reports = []
     for name, (answer, took_s) in fleet.call_each(asked, "getStatus", seconds).items():
         if isinstance(answer, Exception):
@@ -257,6 +262,15 @@ def _enrolled(fleet: FleetClient) -> dict[str, bytes]:
         return enrolled_robots(fleet.link)
     except (KeyFileError, OSError) as exc:
         raise CliError(f"The enrolled keys cannot be used: {exc}") from exc
+
+
+def status_question(fleet: FleetClient, name: str, *, signed: bool) -> dict[str, str]:
+    """Return the arguments of ``getStatus``: a fresh nonce, by which the robot signs.
+
+    Args:
+        signed: ask for the signature in any case; without it only a robot that announces the nonce is asked for it.
+    """
+    return {"nonce": new_epoch()} if signed or fleet.announces(name, "getStatus", "nonce") else {}
 
 
 def status_report(

@@ -12,7 +12,7 @@ from typing import Any
 from device_connect_edge.messaging import MessagingError
 
 from strands_robots.cli.output import CliError
-from strands_robots.cli.resume import ask_robots, resume_robots, status_report
+from strands_robots.cli.resume import ask_robots, resume_robots, status_question, status_report
 from strands_robots.cli.watch import joint_limits
 from strands_robots.dashboard.feed import ASK_S, DEVICE_CONNECT, PARALLEL, LoopThread, poll_interval
 from strands_robots.dashboard.fleet_model import FleetModel, key_of
@@ -24,7 +24,6 @@ from strands_robots.device_connect.enrollment import enrolled_robots
 from strands_robots.device_connect.safety_controller import safety_controller, stand
 from strands_robots.envelope import Envelope, error, is_error
 from strands_robots.safety.identity import KeyFileError
-from strands_robots.safety.orders import new_epoch
 from strands_robots.utils import ValidationError
 
 logger = logging.getLogger(__name__)
@@ -176,7 +175,7 @@ class DeviceConnectFeed:
         async with limit:
             self._load_keys()
             key, began = self._keys.get(name), time.monotonic()
-            asked = {} if key is None else {"nonce": new_epoch()}
+            asked = status_question(self._fleet, name, signed=key is not None)
             try:
                 answer = await self._fleet.call_async(name, "getStatus", asked, ASK_S)
             except (LookupError, TimeoutError, RuntimeError, MessagingError, ValidationError):

@@ -140,6 +140,10 @@ class FleetClient:
         """Return the ids of live devices announced since the last :meth:`peers`."""
         return self._found.known
 
+    def announces(self, device: str, function: str, argument: str) -> bool:
+        """Return True where the last :meth:`peers` found the device with this argument."""
+        return self._found.announces(device, function, argument)
+
     def last_heartbeat(self, device: str) -> float | None:
         """Return the monotonic time of a device's last heartbeat; None before the first.
 

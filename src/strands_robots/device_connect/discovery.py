@@ -160,6 +160,12 @@ class Discovery:
         """Ids of the devices that were announced since the last collection."""
         return tuple(sorted(self._present))
 
+    def announces(self, name: str, function: str, argument: str) -> bool:
+        """Return True where a device's description has this argument of this function."""
+        peer = self._present.get(name) or self._described.get(name) or self._listed.get(name)
+        stated = (each for each in (peer.functions if peer else ()) if each.get("name") == function)
+        return any(argument in _object(_object(each, "parameters"), "properties") for each in stated)
+
     def last_heartbeat(self, name: str) -> float | None:
         """Return the monotonic time of a device's last heartbeat; None before the first.
 

@@ -211,19 +211,22 @@ class SafetyRegistration:
         """Return the lockouts and the check-in of the robot, for ``getStatus``.
 
         Args:
-            nonce: of the question; the signed part repeats it.
+            nonce: of the question; the signed part repeats it. Without one nothing is signed: a signature that fits
+                every question proves nothing, and it is half of the answer's time.
         """
         lockouts = self.entry.latch.state.all
         check_in = plane().checkin.fields(time.monotonic())
-        fields = {**self._lock_fields(), "check_in": check_in, **({"nonce": nonce} if nonce else {})}
-        return {
+        facts = {
             "locked": bool(lockouts),
             "lockout": [each.fields() for each in lockouts],
             "check_in": check_in,
             "stop_lane": self.up,
             "cell": self.cell,
-            "statement": signed(self.identity, Purpose.LOCKOUT_STATE, self.device_id, fields),
         }
+        if not nonce:
+            return facts
+        fields = {**self._lock_fields(), "check_in": check_in, "nonce": nonce}
+        return {**facts, "statement": signed(self.identity, Purpose.LOCKOUT_STATE, self.device_id, fields)}
 
     def _lock_fields(self) -> dict[str, Any]:
         epochs = self.entry.epochs

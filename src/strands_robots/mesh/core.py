@@ -34,6 +34,7 @@ from strands_robots.mesh.scheduler import Scheduler
 from strands_robots.mesh.security import validate_peer_id
 from strands_robots.mesh.sensors import CameraPublisher, SensorLoopsMixin, SensorPublisher
 from strands_robots.mesh.state import Description, StateReader
+from strands_robots.mesh.state_rate import IDLE_HZ, STATE_RATES, StateRate
 from strands_robots.mesh.stream import StepPublisher
 from strands_robots.mesh.subscriptions import DataCallback, SampleCallback, Subscriptions
 from strands_robots.mesh.teleop import TeleopReceivers, join
@@ -42,6 +43,7 @@ from strands_robots.mesh.transport import Declaration, Sample, Transport
 from strands_robots.mesh.transport.zenoh_config import Posture, TlsCredentials
 from strands_robots.mesh.wire_identity import Identity, signature_policy
 from strands_robots.recording.cameras import frames_of
+from strands_robots.safety.gate import MotionGate
 from strands_robots.safety.persistence import simulation_key
 from strands_robots.safety.plane import SafetyPlane
 from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope, none_known, own_cell
@@ -134,6 +136,7 @@ class Mesh(SensorLoopsMixin):
         self._handles: list[Declaration] = []
         self._missed: MeshMissedStops | None = None
         self._inputs: dict[str, dict[str, Any]] = {}
+        self._unwatch: Callable[[], None] = lambda: None
         self._scheduler = Scheduler(peer)
         self._sensors = SensorPublisher(context, self._scheduler)
         self._requester = Requester(context)
@@ -277,7 +280,8 @@ class Mesh(SensorLoopsMixin):
         if self.robot is not None:
             self.add_robot_sensors()
         every("describe", rates["presence"].rate_hz, self._presence.refresh)
-        every("state", rates["state"].rate_hz, self._publish_state)
+        if self.robot is not None:
+            self._report_states(self.robot.gate)
         if self.children is not None:
             every("children", rates["presence"].rate_hz, self.children.refresh)
             every("children's presence", rates["presence"].rate_hz, self.children.announce, quick=True)
@@ -323,16 +327,33 @@ class Mesh(SensorLoopsMixin):
         self._handles = []
         alive += self._pipeline.close(left()) + self._delivery.stop(left()) + join(streams, left())
         self._context.transport = None
+        self._unwatch()
         if self.robot is not None:
             self.robot.gate.detach(self._hearing)
         self._context.audit.close()
         if alive:
             logger.warning("%s left the mesh with loops still running: %s.", self.peer_id, ", ".join(alive))
 
-    def _publish_state(self) -> None:
-        body = self._state.read()
-        if body is not None:
-            self._context.put(topics.state(self.peer_id), body | self._safety_facts())
+    def _report_states(self, gate: MotionGate) -> None:
+        hz = topics.BY_NAME["state"].rate_hz
+        rate = StateRate(gate, self._adapter.epochs, lambda: self._scheduler.pace("state", hz, soon=True))
+
+        def publish() -> None:
+            body = self._state.read()
+            if body is not None:
+                self._context.put(topics.state(self.peer_id), body | self._safety_facts())
+                rate.published(body)
+            self._scheduler.pace("state", hz if rate.active else IDLE_HZ)
+
+        self._scheduler.every("state", hz, publish)
+        STATE_RATES.join(rate)
+        unwatch = gate.watch(rate.begins)
+
+        def unwatch_all() -> None:
+            unwatch()
+            STATE_RATES.leave(rate)
+
+        self._unwatch = unwatch_all
 
     def close(self) -> None:
         """Leave the mesh for good, and the safety plane with it."""

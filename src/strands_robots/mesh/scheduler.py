@@ -114,6 +114,21 @@ class Timer:
                 self._changed.notify()
                 self._work.notify_all()
 
+    def pace(self, job: Job, period: float, phase: float, *, soon: bool) -> None:
+        """Run a job every ``period`` seconds from now on.
+
+        Args:
+            phase: share of a period by which its second turn is moved.
+            soon: run it now; otherwise a slower job goes on with the turn that is due.
+        """
+        with self._lock:
+            sooner, job.period = period < job.period, period
+            if job.over or not (soon or sooner):
+                return
+            job.due, job.phase = time.monotonic() + (0.0 if soon else period), phase
+            self._push(job)
+            self._changed.notify()
+
     def wait(self, jobs: Iterable[Job], timeout: float) -> list[str]:
         """Wait until none runs on another thread; names of those that do."""
         own, jobs = threading.current_thread(), list(jobs)
@@ -152,8 +167,9 @@ class Timer:
         """Return the quick jobs due; hand the others to workers."""
         quick: list[Job] = []
         while self._heap and self._heap[0][0] <= now:
-            job = heapq.heappop(self._heap)[2]
-            if job.over:
+            due, _, job = heapq.heappop(self._heap)
+            # An entry of another time is that of a job whose pace was changed.
+            if job.over or due != job.due:
                 continue
             job.skip_to(now)
             self._push(job)
@@ -268,6 +284,13 @@ class Scheduler:
                 job = self._jobs[name] = Job(f"{self._name} {name}", period, run, own, self.phase)
                 if self._running:
                     self._timer.add([job])
+
+    def pace(self, name: str, hz: float, *, soon: bool = False) -> None:
+        """Run a job ``hz`` times a second from now on; ``soon`` for the first time now."""
+        with self._lock:
+            job = self._jobs.get(name)
+        if job is not None:
+            self._timer.pace(job, max(MIN_PERIOD_S, 1.0 / hz), self.phase, soon=soon)
 
     def start(self) -> None:
         with self._lock:

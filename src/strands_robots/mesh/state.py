@@ -61,7 +61,9 @@ class StateReader:
         self, peer_id: str, robot: TaskRobot | WorldRobot | None, clock: Callable[[], float] = time.time
     ) -> None:
         self._peer_id = peer_id
-        self._robot = robot
+        # Asking a protocol takes longer than a read of most robots.
+        self._world = robot if isinstance(robot, WorldRobot) else None
+        self._arm = robot if self._world is None and isinstance(robot, TaskRobot) else None
         self._clock = clock
         self._degraded: dict[str, _Degradation] = {}
         self._positions: dict[str, tuple[float, float]] = {}
@@ -86,20 +88,20 @@ class StateReader:
         return {**body, "peer_id": self._peer_id, "t": self._clock()} if body else None
 
     def _sections(self) -> dict[str, Callable[[], Any]]:
-        robot = self._robot
-        if isinstance(robot, WorldRobot):
+        world, arm = self._world, self._arm
+        if world is not None:
             # A read that succeeds is shared by the sections of one message.
-            state, running, names = cache(robot.get_state), cache(robot.list_policies_running), cache(robot.list_robots)
+            state, running, names = cache(world.get_state), cache(world.list_policies_running), cache(world.list_robots)
             return {
                 "joints": lambda: self._world_joints(_checked(state()), names()),
                 "sim_time": lambda: _sim_time(_checked(state())),
                 "robots": lambda: _active(names(), running()),
                 "task": lambda: _world_task(running()),
             }
-        if isinstance(robot, TaskRobot):
+        if arm is not None:
             return {
-                "joints": lambda: _joints(_checked(robot.get_state())),
-                "task": lambda: _task(_checked(robot.get_task_status())),
+                "joints": lambda: _joints(_checked(arm.get_state())),
+                "task": lambda: _task(_checked(arm.get_task_status())),
             }
         return {}
 
@@ -154,23 +156,27 @@ class Description:
     def __init__(self, peer_id: str, robot: TaskRobot | WorldRobot | None) -> None:
         self._peer_id = peer_id
         self._robot = robot
+        self._world = robot if isinstance(robot, WorldRobot) else None
+        self._arm = robot if self._world is None and isinstance(robot, TaskRobot) else None
+        self._kind = "" if robot is None else kind_of(robot)
         self._troubles = TroubleLog(logger)
 
     def read(self) -> dict[str, Any]:
         """Return the fields that can be read now."""
-        robot = self._robot
+        robot, world, arm = self._robot, self._world, self._arm
         if robot is None:
             return {}
-        fields: dict[str, Any] = {"tool_name": robot.tool_name_str, "robot_kind": kind_of(robot)}
-        if isinstance(robot, WorldRobot):
+        fields: dict[str, Any] = {"tool_name": robot.tool_name_str, "robot_kind": self._kind}
+        if world is not None:
             fields["world"] = True
-            fields.update(self._field("sim_robots", lambda: {"sim_robots": robot.list_robots()}))
-            fields.update(self._field("task_status", lambda: _world_status(robot.list_policies_running())))
-            fields.update(self._field("features", lambda: _world_features(_checked(robot.get_features()))))
+            fields.update(self._field("sim_robots", lambda: {"sim_robots": world.list_robots()}))
+            fields.update(self._field("task_status", lambda: _world_status(world.list_policies_running())))
+            fields.update(self._field("features", lambda: _world_features(_checked(world.get_features()))))
             return fields
         device = body_of(robot)
-        fields.update(self._field("task_status", lambda: _status(_checked(robot.get_task_status()))))
-        fields.update(self._field("features", lambda: _features(_checked(robot.get_features()))))
+        if arm is not None:
+            fields.update(self._field("task_status", lambda: _status(_checked(arm.get_task_status()))))
+            fields.update(self._field("features", lambda: _features(_checked(arm.get_features()))))
         fields.update(self._field("connected", lambda: _typed(device, "connected", "is_connected", bool)))
         fields.update(self._field("hw", lambda: _typed(device, "hw", "hardware_name", str)))
         return fields

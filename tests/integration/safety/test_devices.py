@@ -150,6 +150,7 @@ def test_a_stop_halts_locks_and_is_answered_and_a_signed_resume_frees_without_mo
         nonce = new_epoch()
         status = floor.agent.call(device, "getStatus", {"nonce": nonce})
         assert status["statement"]["nonce"] == nonce
+        assert "statement" not in floor.agent.call(device, "getStatus")
         assert floor.agent.call(device, "getStatus", {"nonce": "of old"})["status"] == "error"
         assert status["status"] == "success"
         assert status["locked"] is True
