@@ -96,7 +96,9 @@ export class Stop {
     this.head.replaceChildren(el("strong", { text: latest ? `${S.pressed(S.when(new Date(latest * 1000)))}: ` : "" }), summary);
     // Once all are free the cards say the rest.
     this.drawAnswers(freed ? [] : ORDER.flatMap((state) => groups.get(state)).slice(0, NAMES_MAX));
-    this.notes.replaceChildren(...rosters.flatMap((each) => [each.sentence, ...each.notes]).map((text) => el("p", { class: "small", text })));
+    const notes = el("div", {}, ...rosters.flatMap((each) => [each.sentence, ...each.notes]).map((text) => el("p", { class: "small", text })));
+    this.notes.replaceWith(notes);
+    this.notes = notes;
   }
 
   // Each robot keeps its place while the answers come: by name, and the summary names those that did not stop.
