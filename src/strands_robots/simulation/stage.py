@@ -56,7 +56,11 @@ class Actuator:
 
 @dataclass(frozen=True, slots=True)
 class Joint:
-    """One joint with a single coordinate: indices, range, and its unit, ``radians`` or ``metres``."""
+    """One joint with a single coordinate: indices and range.
+
+    Attributes:
+        unit: of the range: ``radians`` or ``metres``.
+    """
 
     key: str
     qpos: int

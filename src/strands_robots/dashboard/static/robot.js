@@ -111,7 +111,7 @@ export class RobotView {
     }
     setLine(this.task, taskText(row));
     setAttr(this.task, "data-on", this.fleet.moving(row) ? "yes" : "no");
-    setText(this.lock, lockText(row) + (row.lockouts.length ? ` \u00b7 ${S.epoch} ${row.lockouts[0].epoch.slice(0, 8)}` : ""));
+    setLine(this.lock, lockText(row) + (row.lockouts.length ? ` \u00b7 ${S.epoch} ${row.lockouts[0].epoch.slice(0, 8)}` : ""));
     setAttr(this.lock, "data-tone", row.alarm ? "bad" : row.locked === false ? "quiet" : "warn");
     setText(this.verdict, row.stop ? `${S.lastStop}: ${verdictText(row.stop)}` : "");
     setAttr(this.verdict, "data-tone", row.stop ? verdictTone(row.stop) : "quiet");

@@ -12,13 +12,15 @@ const NONE = { text: "", factor: 1, digits: 2 };
 export const unitOf = (units, name) => UNITS[units && units[name]] || NONE;
 
 export function shownIn(unit, value) {
-  return `${(value * unit.factor).toFixed(unit.digits)}${unit.text === "\u00b0" ? "\u00b0" : unit.text ? `\u00a0${unit.text.slice(0, 2).trim()}` : ""}`;
+  const number = (value * unit.factor).toFixed(unit.digits).replace(/^-(?=[0.]+$)/, "");
+  return `${number}${unit.text === "\u00b0" ? "\u00b0" : unit.text ? `\u00a0${unit.text.slice(0, 2).trim()}` : ""}`;
 }
 
 // Where a robot tells no limits: a turn of a joint that is told as an angle, else what is seen.
 export function limitsOf(limits, units, name) {
   if (limits && limits[name]) return limits[name];
   if (units && units[name] === "degrees") return [-180, 180];
-  if (units && ["percent", "normalized"].includes(units[name])) return [-100, 100];
+  if (units && units[name] === "percent") return [0, 100];
+  if (units && units[name] === "normalized") return [-100, 100];
   return [-Math.PI, Math.PI];
 }
