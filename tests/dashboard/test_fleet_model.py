@@ -137,3 +137,25 @@ def test_joints_are_kept_for_thirty_seconds_and_are_finite_numbers() -> None:
     assert len(details["history"]) == 300
     assert details["history"][-1][1] == {"": {"pan": 399.0}}
     assert fleet.joints("dc:arm-1", clock.now) is None
+
+
+def held_by(holder: str) -> LockoutReport:
+    return LockoutReport("arm-1", facts={"control": {"held": bool(holder), "holder": holder, "kind": "agent"}})
+
+
+def events(fleet: FleetModel) -> list[str]:
+    return [each["event"] for each in json.loads(fleet.changes(0)[1])["events"]]
+
+
+def test_changes_of_control_are_events_once() -> None:
+    clock = Clock()
+    fleet = model(clock)
+    for holder in ("", "agent-a", "agent-a", "agent-b"):
+        fleet.report("dc", held_by(holder))
+    assert events(fleet) == ["control acquired", "control changed"]
+    fleet.note("dc", "arm-1", "controlTaken", {"holder": "desk-1"})
+    fleet.report("dc", held_by("desk-1"))
+    assert events(fleet)[2:] == ["controlTaken"], "the robot told it by an event"
+    clock.now += 10
+    fleet.report("dc", held_by(""))
+    assert events(fleet)[3:] == ["control released"]
