@@ -1,5 +1,6 @@
 // The rows of all robots, and their cards sorted by what needs attention.
 import { el, setAttr, setText } from "./dom.js";
+import { Filter } from "./filter.js";
 import { S } from "./strings.js";
 
 // Made once: a comparison that makes its own collator costs a hundred times as much.
@@ -47,14 +48,8 @@ export class Fleet {
     return this.moving(row) ? 5 : 6;
   }
 
-  sorted(text, which) {
-    const wanted = text.trim().toLowerCase();
-    return [...this.rows.values()]
-      .filter((row) => !wanted ||
-        `${row.id} ${row.kind} ${kindText(row)} ${row.task.instruction || ""}`.toLowerCase().includes(wanted))
-      .filter((row) => which === "all" || (which === "attention" && this.attention(row) < 5) ||
-        (which === "locked" && row.locked) || (which === "moving" && this.moving(row)) ||
-        (which === "idle" && !this.moving(row) && row.locked === false))
+  sorted(filter) {
+    return [...this.rows.values()].filter((row) => filter.passes(row))
       .map((row) => [this.attention(row), row])
       .sort((a, b) => a[0] - b[0] || byName.compare(a[1].id, b[1].id))
       .map((pair) => pair[1]);
@@ -168,18 +163,12 @@ export class FleetView {
     this.visible = new Set();
     this.drawn = new Map();
     this.starting = [];
-    this.search = el("input", { id: "search", type: "search", placeholder: S.searchHint, autocomplete: "off", spellcheck: "false" });
-    this.filter = el("select", { id: "filter" });
-    for (const [value, text] of Object.entries(S.filters)) this.filter.append(el("option", { value, text }));
-    this.count = el("span", { id: "count", role: "status" });
+    this.filter = new Filter(fleet, kindText, () => { this.order = ""; this.draw(); });
     this.list = el("ul", { id: "cards" });
     this.coming = el("ul", { id: "coming", "aria-label": S.coming });
     this.empty = el("p", { class: "empty" });
     this.node = el("div", { id: "fleet" },
-      el("div", { class: "tools" }, el("label", { for: "search", text: S.search }), this.search,
-        el("label", { for: "filter", text: S.filter }), this.filter, this.count),
-      this.empty, this.list, this.coming);
-    for (const control of [this.search, this.filter]) control.addEventListener("input", () => { this.order = ""; this.draw(); });
+      this.filter.node, this.empty, this.list, this.coming);
     this.observer = new IntersectionObserver((entries) => {
       for (const entry of entries) {
         const key = entry.target.dataset.key;
@@ -190,8 +179,8 @@ export class FleetView {
   }
 
   draw() {
-    const rows = this.fleet.sorted(this.search.value, this.filter.value);
-    setText(this.count, S.shown(rows.length, this.fleet.rows.size));
+    const rows = this.fleet.sorted(this.filter);
+    this.filter.tell(rows.length);
     this.drawComing();
     setText(this.empty, !this.admitted || this.coming.childElementCount ? "" : this.fleet.rows.size === 0 ? S.none : rows.length === 0 ? S.noMatch : "");
     this.empty.hidden = this.empty.textContent === "";
