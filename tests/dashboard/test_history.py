@@ -198,7 +198,7 @@ def test_forgotten_robot_has_no_history_and_gives_its_joints_back(monkeypatch: p
     fleet.model.observe("dc", "arm-1", {"pan": 0.5})
     fleet.sample()
     assert fleet.model.forget("dc:arm-1", 0.0)
-    assert fleet.model.states(["dc:arm-1"], 0, 0.0) == []
+    assert list(fleet.model.states(["dc:arm-1"], 0, 0.0)) == []
     assert fleet.model.series("dc:arm-1", 0.0) is None
     fleet.model.observe("dc", "arm-2", {"pan": 0.5})
     fleet.now += 2.0

@@ -364,25 +364,23 @@ class FleetModel:
             for row in filter(None, map(self._rows.get, keys)):
                 self.history.sample(row, now)
 
-    def states(self, keys: Iterable[str], number: int, at: float) -> list[str]:
-        """Return the changes of state of some robots since the page's last question, encoded one by one.
+    def states(self, keys: Iterable[str], number: int, at: float) -> Iterator[str]:
+        """Yield each robot's changes of state since a question, encoded.
 
         Args:
             keys: of the robots.
             number: the history's number at that question; 0 for everything.
             at: the time of it.
         """
-        lines = []
         for key in keys:
             with self._lock:
                 found = self.history.states(key, number, at - OVERLAP_S)
             if found is not None:
                 starts = [round(each, 2) for each in found[0]]
-                lines.append(json.dumps({"key": key, "at": starts, "as": found[1]}, allow_nan=False))
-        return lines
+                yield json.dumps({"key": key, "at": starts, "as": found[1]}, allow_nan=False)
 
     def series(self, key: str, after: float) -> Iterator[str] | None:
-        """Return the samples of a robot after a time, a line a series, or None where it is not known."""
+        """Return the samples of a robot after a time, a line a series, or None."""
         with self._lock:
             row, found = self._rows.get(key), self.history.series(key, after)
         if row is None or found is None:

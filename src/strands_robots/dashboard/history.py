@@ -1,6 +1,6 @@
-"""History of the fleet: what each robot did in the last hour, its joints, lag and load in the last 15 minutes.
+"""History of the fleet: states of the last hour, samples of 15 minutes.
 
-It lives in the page's server, so a page that is loaded again shows what happened before. What a message costs is
+A sample has joints, lag and load. The history lives in the page's server, so a page that is loaded again shows what happened before. What a message costs is
 constant: states are noted when they change, everything else is read from the rows once in ``SAMPLE_S``. Every length is
 bounded, per robot and in all.
 """
@@ -13,11 +13,14 @@ from bisect import bisect_right
 from typing import Protocol
 
 MOVING, STILL, LOCKED, LOCKED_MOVING, SILENT = "m", "s", "l", "x", "q"
-"""States, as they are sent: moving, still, locked, moving although locked, silent."""
+"""Moving, still, locked, moving although locked, silent; as they are sent."""
 
 IN_MOTION = frozenset({"running", "stopping", "starting", "connecting"})
 SILENT_S = 3.0
-"""Seconds without a sign of life after which a robot counts as silent, from its last sign of life on."""
+"""Seconds without a sign of life after which a robot is silent.
+
+The silence begins at the last sign of life.
+"""
 
 WINDOW_S = 3600.0
 CHANGES_MAX = 1000
@@ -30,10 +33,10 @@ ROBOT_JOINTS_MAX, JOINTS_MAX = 16, 8192
 """Joints that are kept of one robot, and of all; 512 robots have their 16."""
 
 JOINTS_OLD_S = 15.0
-"""Age from which joints are not sampled; a robot at rest tells them once in 10 s."""
+"""Age from which joints are not sampled; at rest they come once in 10 s."""
 
 OVERLAP_S = 30.0
-"""Seconds that an update goes back, in which a silence that was found later may have begun."""
+"""Seconds that an update goes back: a silence is found after it began."""
 
 NAN = float("nan")
 _BLANK = array("f", [NAN]) * SAMPLES
@@ -55,7 +58,7 @@ class Row(Protocol):
 
 
 def state_of(row: Row) -> str:
-    """Return the state of a robot that is heard; a lockout that is not known is not claimed."""
+    """Return the state of a robot that is heard; an unknown lockout is none."""
     moving = row.task.get("state") in IN_MOTION
     if row.locked:
         return LOCKED_MOVING if moving else LOCKED
@@ -75,7 +78,7 @@ class States:
         self.starts, self.letters, self.number = array("d"), bytearray(), 0
 
     def enter(self, state: str, at: float) -> bool:
-        """Note a state since ``at``, not before the latest change; False where it is the present one."""
+        """Note a state since ``at``; False where it is the present one."""
         letter = ord(state)
         if self.letters and self.letters[-1] == letter:
             return False
@@ -140,13 +143,13 @@ class History:
     # Written by the model, in constant time.
 
     def changed(self, row: Row, now: float) -> None:
-        """Note a robot's state after a change of its row; a silent one stays silent until it is heard."""
+        """Note a robot's state after a change of its row, unless it is silent."""
         states = self._states.get(row.key)
         if row.heard is not None and (states is None or states.letters[-1] != ord(SILENT)):
             self._enter(row.key, state_of(row), now)
 
     def heard(self, row: Row, before: float | None, now: float) -> None:
-        """Note that a robot was heard now, and a silence since ``before`` that nobody had looked at."""
+        """Note that a robot was heard now, and a silence since ``before``."""
         if before is not None and now - before > self.silent_s:
             self._enter(row.key, SILENT, before)
         states = self._states.get(row.key)
@@ -209,16 +212,16 @@ class History:
     # Read by the pages.
 
     def states(self, key: str, number: int, at: float) -> tuple[list[float], str] | None:
-        """Return a robot's changes since ``at``, or None where nothing changed after ``number``."""
+        """Return a robot's changes since ``at``, None without any after ``number``."""
         states = self._states.get(key)
         if states is None or states.number <= number:
             return None
         return states.since(at)
 
     def series(self, key: str, after: float) -> tuple[list[float], dict[str, list[float]]] | None:
-        """Return the times after ``after``, and by name a robot's values then, NaN for no value.
+        """Return the times after ``after``, and a robot's values then by name.
 
-        The names are lag, answer, rate, load and ``joint:PART/NAME``.
+        No value is NaN. The names are lag, answer, rate, load and ``joint:PART/NAME``.
         """
         series = self._series.get(key)
         if series is None:

@@ -48,8 +48,8 @@ LINK_LOOK_S = 0.04
 REFRESH_S = 0.02
 AUDIT_S = 1.0
 AUDIT_BYTES = 256 * 2**10
-SAMPLED_AT_ONCE = 50
-"""Robots whose history is taken, or sent, before other work has a turn: a stop is other work."""
+SAMPLED_AT_ONCE = 10
+"""Robots that are sampled before other work, such as a stop, has a turn."""
 
 SESSIONS_MAX = 64
 MESSAGE_MAX = 64 * 2**10
@@ -251,10 +251,8 @@ class Dashboard:
 
         async def lines() -> AsyncIterator[str]:
             yield json.dumps(head) + "\n"
-            for first in range(0, len(keys), SAMPLED_AT_ONCE):
-                found = self.model.states(keys[first : first + SAMPLED_AT_ONCE], int(number), at)
-                if found:
-                    yield "\n".join(found) + "\n"
+            for line in self.model.states(keys, int(number), at):
+                yield line + "\n"
                 await asyncio.sleep(0)
 
         return StreamingResponse(lines(), media_type=NDJSON)
@@ -336,7 +334,7 @@ def _file(path: Path) -> Any:
 
 
 def _number(given: str | None) -> float:
-    """Return a finite number of a query, 0 for anything else: everything is sent then."""
+    """Return a finite number of a query, 0 for anything else."""
     try:
         value = float(given or 0)
     except ValueError:

@@ -63,7 +63,7 @@ export class Lane {
 
   block(draw, style, state, left, width, height) {
     // A state has a height and a pattern of its own, too.
-    const top = state === "s" ? height * 0.32 : state === "q" ? height * 0.2 : 3, tall = height - 2 * top;
+    const top = state === "s" ? height * 0.22 : state === "q" ? height * 0.2 : 3, tall = height - 2 * top;
     draw.save();
     draw.beginPath(); draw.rect(left, top, width, tall); draw.clip();
     draw.fillStyle = style.getPropertyValue(PAPER[state]);
