@@ -14,7 +14,7 @@ from device_connect_edge.messaging import MessagingError
 from strands_robots.cli.output import CliError
 from strands_robots.cli.resume import ask_robots, resume_robots, status_report
 from strands_robots.cli.watch import joint_limits
-from strands_robots.dashboard.feed import ASK_S, DEVICE_CONNECT, PARALLEL, LoopThread, poll_interval
+from strands_robots.dashboard.feed import ASK_S, DEVICE_CONNECT, PARALLEL, LoopThread, joint_units, poll_interval
 from strands_robots.dashboard.fleet_model import FleetModel, key_of
 from strands_robots.dashboard.verb_forms import forms_of
 from strands_robots.device_connect import FleetClient
@@ -88,7 +88,7 @@ class DeviceConnectFeed:
         found = cameras.get("cameras")
         names = tuple(str(each)[:128] for each in found[:32]) if isinstance(found, list) else ()
         limits = joint_limits(features) if not is_error(features) else {}
-        self._model.update(self.network, robot, cameras=names, limits=limits)
+        self._model.update(self.network, robot, cameras=names, limits=limits, units=joint_units(features))
         if isinstance(state.get("joints"), Mapping):
             self._model.observe(self.network, robot, state["joints"])
 

@@ -31,6 +31,9 @@ LOCKS_WITHIN_S = 3.0
 """Seconds from a robot's answer to a stop until a status without that lockout means that it was resumed."""
 
 JOINTS_MAX = 64
+CONTROL_EVENTS = frozenset({"controlTaken", "controlExpired", "control taken here"})
+CONTROL_TOLD_S = 3.0
+"""Seconds after such an event in which a status with another holder tells nothing new."""
 
 Joints = dict[str, float]
 
@@ -67,6 +70,7 @@ class RobotRow:
     stop_at: float = 0.0
     locked_by: str = ""
     control: dict[str, Any] = field(default_factory=dict)
+    control_told_at: float = float("-inf")
     check_in: dict[str, Any] | None = None
     forms: tuple[Mapping[str, Any], ...] = ()
     limits: dict[str, tuple[float, float]] = field(default_factory=dict)
@@ -219,6 +223,8 @@ class FleetModel:
             for each in answer.lockouts[:LOCKOUTS_MAX]
         ]
         self._note_freed(network, answer.name, {each.epoch for each in answer.lockouts}, answer.at)
+        control = _control(facts.get("control"))
+        self._note_control(network, answer.name, control)
         self.update(
             network,
             answer.name,
@@ -226,9 +232,26 @@ class FleetModel:
             lockouts=[{name: _cut(value) for name, value in row.items()} for row in rows],
             doubt="",
             alarm=False,
-            control=_control(facts.get("control")),
+            control=control,
             check_in=_check_in(facts.get("check_in")),
         )
+
+    def _note_control(self, network: str, name: str, control: Mapping[str, Any]) -> None:
+        """Add a change of the holder to the timeline, unless the robot has just told it by an event."""
+        with self._lock:
+            row = self._rows.get(key_of(network, name))
+            told = row is not None and self.clock() - row.control_told_at < CONTROL_TOLD_S
+            before = row.control if row is not None else {}
+        holder, had = control.get("holder"), before.get("holder")
+        # What held it before the page came is no change.
+        if not before or not control or told or holder == had:
+            return
+        if not control["held"]:
+            self.note(network, name, "control released", {"by": had})
+        elif not before["held"]:
+            self.note(network, name, "control acquired", {"by": holder, "kind": control.get("kind")})
+        else:
+            self.note(network, name, "control changed", {"from": had, "by": holder, "kind": control.get("kind")})
 
     def _note_freed(self, network: str, name: str, epochs: set[str], at: float) -> None:
         """Mark the answer to a stop that locks the robot no more: it is past."""
@@ -264,7 +287,7 @@ class FleetModel:
             for each, value in list(facts.items())[:12]
             if not str(each).startswith("_") and each not in ("event_id", "ts", "sig", "key", "nonce")
         }
-        entry = {
+        entry: dict[str, Any] = {
             "key": key_of(network, name) if name else "",
             "robot": _cut(name),
             "event": _cut(event),
@@ -273,6 +296,9 @@ class FleetModel:
             "audit": audit,
         }
         with self._lock:
+            row = self._rows.get(entry["key"])
+            if row is not None and event in CONTROL_EVENTS:
+                row.control_told_at = self.clock()
             number = self._next()
             self._timeline.append((number, json.dumps({**entry, "n": number}, allow_nan=False, default=str)))
 
@@ -338,6 +364,7 @@ class FleetModel:
                 "key": key,
                 "forms": list(row.forms),
                 "limits": row.limits,
+                "units": row.units,
                 "cameras": row.cameras,
                 "now": self.clock(),
                 "history": [[round(at, 3), joints] for at, joints in row.history],

@@ -1,8 +1,8 @@
 """History of the fleet: states of the last hour, samples of 15 minutes.
 
-A sample has joints, lag and load. The history lives in the page's server, so a page that is loaded again shows what happened before. What a message costs is
-constant: states are noted when they change, everything else is read from the rows once in ``SAMPLE_S``. Every length is
-bounded, per robot and in all.
+A sample has joints, lag and load. The history lives in the page's server, so a page that is loaded again shows what
+happened before. What a message costs is constant: states are noted when they change, everything else is read from the
+rows once in ``SAMPLE_S``. Every length is bounded, per robot and in all.
 """
 
 from __future__ import annotations

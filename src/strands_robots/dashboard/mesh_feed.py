@@ -12,7 +12,7 @@ from typing import Any
 from strands_robots.cli.mesh_controller import MeshController
 from strands_robots.cli.resume_mesh import ask_peers, lockable_peers, resume_peers
 from strands_robots.cli.watch import joint_limits
-from strands_robots.dashboard.feed import ASK_S, MESH, PARALLEL, poll_interval
+from strands_robots.dashboard.feed import ASK_S, MESH, PARALLEL, joint_units, poll_interval
 from strands_robots.dashboard.fleet_model import FleetModel
 from strands_robots.dashboard.verb_forms import peer_forms
 from strands_robots.device_connect.telemetry import numbers
@@ -79,7 +79,7 @@ class MeshFeed:
         found = cameras.get("cameras")
         names = tuple(str(each)[:128] for each in found[:32]) if isinstance(found, list) else ()
         limits = joint_limits(features) if not is_error(features) else {}
-        self._model.update(self.network, robot, cameras=names, limits=limits)
+        self._model.update(self.network, robot, cameras=names, limits=limits, units=joint_units(features))
 
     def resume(self, robots: list[str], signer: Any, seconds: float) -> dict[str, tuple[bool, str]]:
         """Free robots with the operator's key; blocks, and returns each outcome."""

@@ -188,7 +188,7 @@ class PageSession:
         elif kind == "jog":
             self._jog(key, message)
         elif kind in _ASKED:
-            if len(self._calls) >= CALLS_MAX:
+            if len(self._calls) >= CALLS_MAX and not (kind == "call" and message.get("verb") in STOPS):
                 self._answer(message, error("Too many calls of this page are waiting for an answer."))
                 return
             task = asyncio.create_task(self._answered(message, lambda: _ASKED[kind](self, key, message)))
@@ -255,7 +255,7 @@ class PageSession:
                 if not looked:
                     self._tell_details(key)
                     await feed.look_closer(robot)
-                    self._tell_details(key)
+                    self._tell_details(key, looked=True)
                 why = await self._no_pose(key, feed, robot)
                 looked = why != NOT_KNOWN
             if why != told:
@@ -275,10 +275,11 @@ class PageSession:
         drawn = await self._server.pictures.poses.picture(feed, robot)
         return text_of(drawn) if is_error(drawn) else ""
 
-    def _tell_details(self, key: str) -> None:
+    def _tell_details(self, key: str, *, looked: bool = False) -> None:
+        """Tell what is known; ``looked`` once the robot itself was asked."""
         details = self._server.model.details(key)
         if details is not None:
-            self.tell(details)
+            self.tell({**details, "looked": looked})
 
     def _jog(self, key: str, message: Message) -> None:
         why = "A viewer may not move robots." if self._role != OPERATOR else self._control.begin(key, message)

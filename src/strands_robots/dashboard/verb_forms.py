@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 from math import isfinite
 from typing import Any
@@ -14,6 +15,31 @@ LEFT_OUT = frozenset({*CONTROL_VERBS, "resume", "ping", "teleop_status", "teleop
 """Verbs that the page has a control of its own for, or none."""
 
 FORMS_MAX, PARAMETERS_MAX, TEXT_MAX = 100, 40, 600
+
+SHOWN_AT_LEAST = 2
+SHOWN = {
+    "pick": ("object", "speed"),
+    "place": ("on", "x", "y"),
+    "moveBy": ("direction", "distance"),
+    "getPicture": ("camera",),
+}
+"""Fields that a form shows unfolded, where they are not the required ones and those that come first."""
+
+_UNITS = (
+    (re.compile(r"\bdegrees\b", re.I), "\u00b0"),
+    (re.compile(r"\bmetres\b", re.I), "m"),
+    (re.compile(r"\b(in )?seconds\b|\bLongest wait\b", re.I), "s"),
+    (re.compile(r"\bpixels\b", re.I), "px"),
+    (re.compile(r"\bradians\b", re.I), "rad"),
+)
+_CHOICES = (
+    (re.compile(r"\blistCameras\b"), "string", "cameras"),
+    (re.compile(r"\bgetObjects\b|\bName of the object\b"), "string", "objects"),
+    (re.compile(r"\bWhich robot of the world\b"), "string", "robots"),
+    (re.compile(r"\bforward, back, left, right, up or down\b"), "string", "directions"),
+    (re.compile(r"\bDegrees by joint name\b"), "object", "joints"),
+)
+"""What a parameter's description says of its values: the page lets them be chosen."""
 
 _TYPES = {float: "number", int: "integer", bool: "boolean", str: "string", dict: "object", list: "array"}
 
@@ -58,7 +84,13 @@ def peer_forms(verbs: Iterable[Verb] = tuple(PEER_VERBS.values())) -> tuple[dict
 def _form(name: object, kind: str, summary: object, parameters: list[dict[str, Any]]) -> dict[str, Any]:
     given = [each for each in parameters if each["name"] not in LEASE_NAMES][:PARAMETERS_MAX]
     told = str(summary or "").strip().partition("\n")[0][:TEXT_MAX]
-    return {"name": str(name or "")[:100], "kind": kind, "summary": told, "parameters": given}
+    verb = str(name or "")[:100]
+    needed = [each["name"] for each in given if each["required"]]
+    others = [each["name"] for each in given if not each["required"]]
+    usual = (*needed, *others[: max(0, SHOWN_AT_LEAST - len(needed))])
+    shown = SHOWN[verb] if set(SHOWN.get(verb, ())) & {each["name"] for each in given} else usual
+    fields = [{**each, "shown": each["name"] in shown} for each in given]
+    return {"name": verb, "kind": kind, "summary": told, "parameters": fields}
 
 
 def _field(name: object, schema: Mapping[str, Any], required: bool) -> dict[str, Any]:
@@ -67,10 +99,14 @@ def _field(name: object, schema: Mapping[str, Any], required: bool) -> dict[str,
         default = None
     elif isinstance(default, str):
         default = default[:TEXT_MAX]
+    meaning, kind = str(schema.get("description", ""))[:TEXT_MAX], str(schema.get("type", "string"))[:20]
+    unit = next((unit for words, unit in _UNITS if words.search(meaning)), "") if kind in ("number", "integer") else ""
     return {
         "name": str(name)[:100],
-        "type": str(schema.get("type", "string"))[:20],
-        "meaning": str(schema.get("description", ""))[:TEXT_MAX],
+        "type": kind,
+        "meaning": meaning,
+        "unit": unit,
+        "choices": next((of for words, wanted, of in _CHOICES if kind == wanted and words.search(meaning)), ""),
         "default": default,
         "required": required,
     }

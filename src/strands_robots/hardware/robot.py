@@ -149,6 +149,7 @@ class HardwareRobot(ArmMixin, TeleopMixin):
             observation_features={key: _kind(feature) for key, feature in self.device.observation_features.items()},
             action_features={key: _kind(feature) for key, feature in self.device.action_features.items()},
             ranges={key: [low, high] for key, (low, high) in self._body.bounds.items() if high - low < float("inf")},
+            joint_units=self.joint_units,
         )
 
     def get_state(self) -> Envelope:

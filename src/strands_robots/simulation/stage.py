@@ -56,13 +56,14 @@ class Actuator:
 
 @dataclass(frozen=True, slots=True)
 class Joint:
-    """One joint with a single coordinate: indices and range (rad or m)."""
+    """One joint with a single coordinate: indices, range, and its unit, ``radians`` or ``metres``."""
 
     key: str
     qpos: int
     qvel: int
     low: float
     high: float
+    unit: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -243,7 +244,8 @@ def _map_robot(model: Any, name: str, label: str, tip: str) -> RobotParts:
             continue
         key = full[len(prefix) :]
         low, high = model.jnt_range[index] if model.jnt_limited[index] else (-UNBOUNDED, UNBOUNDED)
-        joints[key] = Joint(key, address, int(model.jnt_dofadr[index]), float(low), float(high))
+        unit = "metres" if kind == mujoco.mjtJoint.mjJNT_SLIDE else "radians"
+        joints[key] = Joint(key, address, int(model.jnt_dofadr[index]), float(low), float(high), unit)
     actuators: dict[str, Actuator] = {}
     for index in range(model.nu):
         full = model.actuator(index).name

@@ -312,6 +312,7 @@ class Simulation(PicturesMixin, ArmMixin, TeleopMixin):
             name: {
                 "model": parts.model,
                 "joints": {key: _range(j.low, j.high) for key, j in parts.joints.items()},
+                "joint_units": {key: j.unit for key, j in parts.joints.items()},
                 "actuators": {key: _range(a.low, a.high) for key, a in parts.actuators.items()},
                 "cameras": list(parts.cameras),
                 "observation_features": list(snapshot.observation(parts)),

@@ -148,8 +148,8 @@ def test_robot_is_taken_from_an_agent_by_signature_and_given_back(cell: Any, tmp
     assert not moving(arms), "the agent's motion is halted"
     assert agent.ask("execute")["code"] == "displaced"
     page.get_by_text("Taken from agent-a, signed with the operator's key.").wait_for()
-    taken = page.locator(".events li", has_text="control taken here")
-    assert "from: agent-a · signed: true" in taken.inner_text()
+    taken = page.locator(".events li", has_text="Control taken over, by this page")
+    assert "from: agent-a · signed: yes" in taken.inner_text()
     picture(page, "taken-over")
 
     page.get_by_role("button", name="Give control back").click()

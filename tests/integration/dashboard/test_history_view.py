@@ -184,7 +184,7 @@ def test_cameras_show_twelve_at_a_time_and_rest_while_nobody_looks(page: Any, se
     shows(page, "document.querySelectorAll('.card').length === 20")
     opened(page, "Cameras")
     shows(page, "[...document.querySelectorAll('.tile-picture')].filter((i) => i.naturalWidth === 320).length === 12")
-    assert page.locator(".which").inner_text() == "1 to 12 of 19 cameras"
+    assert page.locator(".page-of").inner_text() == "1 to 12 of 19 cameras"
     asked = {name for name, verb, _ in feed.calls if verb == "getPicture"}
     assert "arm-5" not in asked
     for width, scheme in ((1280, "light"), (1280, "dark"), (360, "light"), (360, "dark")):

@@ -146,10 +146,10 @@ def test_page_works_by_keyboard_alone(page: Any, served: ServedPage) -> None:
     served.robot("arm-1")
     page.locator(".card").wait_for()
     reached = set()
-    for _ in range(8):
+    for _ in range(14):
         page.keyboard.press("Tab")
         reached.add(page.evaluate("document.activeElement.id || document.activeElement.className"))
-    assert {"stop", "search", "filter", "name", "stop-one"} <= reached
+    assert {"stop", "search", "filter", "sort", "name", "halt", "stop-one"} <= reached
     page.locator("#stop").focus()
     page.keyboard.press("Enter")
     shows(page, "document.getElementById('stop-said').textContent.includes('STOP pressed')")

@@ -10,7 +10,7 @@ from typing import Any
 import psutil
 import pytest
 from fixtures.nats_server import NatsServer
-from fixtures.page_driving import answer, card, hold_until, moving, open_robot, take
+from fixtures.page_driving import answer, card, hold_until, moving, open_robot, take, verb_form
 from fixtures.page_site import picture, shows
 from fixtures.waiting import eventually, free_port
 
@@ -49,10 +49,10 @@ def test_robot_of_the_mesh_is_shown_driven_and_stopped(cell: Any) -> None:
     shown.get_by_text("mesh", exact=False).first.wait_for()
     shown.get_by_text("not locked").wait_for(timeout=30_000)
     shown.locator("a.name").click()
-    start = page.locator("details.verb:has(code:text-is('start'))")
-    start.locator("summary").click(timeout=30_000)
+    start = verb_form(page, "start")
     start.locator("#p-start-instruction").fill("wave")
     start.locator("#p-start-policy_provider").fill("mock")
+    start.locator(".more summary").click()
     start.locator("#p-start-duration").fill("300")
     start.get_by_role("button", name="Run").click()
     page.locator("#robot .task", has_text="running").wait_for(timeout=30_000)

@@ -11,7 +11,7 @@ import re
 from typing import Any
 
 import pytest
-from fixtures.page_driving import open_robot
+from fixtures.page_driving import open_robot, verb_form
 from fixtures.page_site import picture, shows
 from fixtures.served_page import FORMS, ServedPage
 from fixtures.waiting import eventually
@@ -44,29 +44,29 @@ def test_timeline_shows_one_robot_and_is_filtered_by_kind_and_by_text(page: Any,
     served.model.note("audit", "arm-1", "remote_estop_engaged", {"estop_id": "e" * 32}, audit=True)
     served.model.note("", "", "STOP pressed", {"button": "all robots"})
     open_robot(page)
-    newest_first = ["STOP pressed", "remote_estop_engaged", "policyComplete", "policyStarted"]
-    eventually(lambda: events(page) == newest_first, 30.0, what="the events of arm-1 and of all")
+    newest_last = ["Started", "Ended", "Locked by an emergency stop", "STOP pressed"]
+    eventually(lambda: events(page) == newest_last, 30.0, what="the events of arm-1 and of all")
     picture(page, "timeline")
     assert "why" not in page.locator(".events").inner_text(), "what is empty is left out"
     for which, wanted in (
-        ("audit", ["remote_estop_engaged"]),
-        ("events", ["STOP pressed", "policyComplete", "policyStarted"]),
-        ("all", newest_first),
+        ("audit", ["Locked by an emergency stop"]),
+        ("events", ["Started", "Ended", "STOP pressed"]),
+        ("all", newest_last),
     ):
         page.select_option("#timeline-which", which)
         eventually(lambda wanted=wanted: events(page) == wanted, 30.0, what=which)
     for text, wanted in (
-        ("BLUE cups", ["policyStarted"]),
-        ("policy", ["policyComplete", "policyStarted"]),
+        ("BLUE cups", ["Started"]),
+        ("policy", ["Started", "Ended"]),
         ("collision", []),
-        ("", newest_first),
+        ("", newest_last),
     ):
         page.fill("#timeline-filter", text)
         eventually(lambda wanted=wanted: events(page) == wanted, 30.0, what=text)
     page.fill("#timeline-filter", "blue")
     served.model.note("dc", "arm-1", "taskPaused", {"instruction": "the blue one"})
     served.model.note("dc", "arm-1", "policyStarted", {"instruction": "the red one"})
-    eventually(lambda: events(page) == ["taskPaused", "policyStarted"], 30.0, what="what comes is filtered, too")
+    eventually(lambda: events(page) == ["Started", "task paused"], 30.0, what="what comes is filtered, too")
 
 
 def test_pose_of_an_arm_without_a_picture_of_it_is_drawn_from_its_joints(page: Any, served: ServedPage) -> None:
@@ -200,9 +200,10 @@ def test_every_control_has_a_name(page: Any, served: ServedPage) -> None:
     page.locator("#resume summary").click()
     fleet = reader.controls()
     open_robot(page)
-    for summary in page.locator(".verb summary").all():
-        summary.click()
     robot = reader.controls()
+    for verb in ("execute", "moveJoints"):
+        verb_form(page, verb)
+        robot += reader.controls()
     unnamed = [control for control in (*fleet, *robot) if not control[1]]
     assert unnamed == []
     buttons = [name for role, name in robot if role == "button"]

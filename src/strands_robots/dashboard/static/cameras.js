@@ -52,7 +52,7 @@ export class CamerasView {
     this.paused = false;
     this.filter = new Filter(fleet, kindText, () => { this.first = 0; this.list(); }, "cameras-");
     this.tiles = Array.from({ length: TILES }, () => new Tile());
-    this.which = el("span", { class: "which", role: "status" });
+    this.which = el("span", { class: "page-of", role: "status" });
     this.previous = el("button", { type: "button", text: H.previous });
     this.next = el("button", { type: "button", text: H.next });
     this.pause = el("button", { type: "button", class: "pause", text: H.pause });

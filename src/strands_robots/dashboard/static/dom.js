@@ -20,7 +20,23 @@ export function setAttr(node, name, value) {
   if (node.getAttribute(name) !== text) node.setAttribute(name, text);
 }
 
+// A line of a fixed height shows what fits; the rest is its title.
+export function setLine(node, text) {
+  setText(node, text);
+  setAttr(node, "title", text);
+}
+
+// A place that is kept: what is in it comes and goes, and what is below it stays.
+export function setShown(node, shown) {
+  setAttr(node, "data-shown", shown ? "yes" : "no");
+}
+
 export function typing(target) {
   return target instanceof HTMLTextAreaElement ||
     (target instanceof HTMLInputElement && !["button", "submit", "range"].includes(target.type));
+}
+
+// Space is the key of these: it types, opens a list, or scrolls on from a link.
+export function keepsSpace(target) {
+  return typing(target) || target instanceof HTMLSelectElement || (target instanceof HTMLAnchorElement && target.hasAttribute("href"));
 }

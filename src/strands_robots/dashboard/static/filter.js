@@ -59,9 +59,11 @@ export class Filter {
     }
   }
 
-  tell(shown) {
+  get everything() { return chosen.state === "all" && !chosen.kind && chosen.text.trim() === ""; }
+
+  tell(shown, more = "") {
     this.listKinds();
-    setText(this.count, H.shown(shown, this.fleet.rows.size));
+    setText(this.count, H.shown(shown, this.fleet.rows.size) + more);
     setText(this.hiddenCount, H.hidden(this.fleet.rows.size - shown));
   }
 }

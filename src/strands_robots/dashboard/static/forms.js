@@ -1,25 +1,76 @@
-// A form for every verb, made from its description.
-import { el, setText } from "./dom.js";
+// A form for a verb, made from its description: the fields that it needs, and the others folded.
+import { el, setAttr, setText } from "./dom.js";
+import { resultNodes } from "./result.js";
 import { S } from "./strings.js";
 
 // A stop needs no leave to move: viewers have it, too.
-const STOPS = ["stop", "stopMotion"];
+export const STOPS = ["stop", "stopMotion"];
 
-function field(verb, parameter) {
-  const id = `p-${verb}-${parameter.name}`;
-  let input;
-  if (parameter.type === "boolean") {
-    input = el("select", { id }, el("option", { value: "true", text: "true" }), el("option", { value: "false", text: "false" }));
-    input.value = String(parameter.default ?? true);
-  } else {
+const DIRECTIONS = ["forward", "back", "left", "right", "up", "down"];
+
+function choose(id, values, empty) {
+  const input = el("select", { id });
+  if (empty !== null) input.append(el("option", { value: "", text: empty }));
+  input.append(...values.map((value) => el("option", { value, text: value })));
+  return input;
+}
+
+// The values of a choice come from the robot, and what was chosen stays chosen while it is there.
+function refill(input, values) {
+  const chosen = input.value, empty = input.options[0] && input.options[0].value === "" ? input.options[0] : null;
+  input.replaceChildren(...(empty ? [empty] : []), ...values.map((value) => el("option", { value, text: value })));
+  if (values.includes(chosen)) input.value = chosen;
+}
+
+class Field {
+  constructor(verb, parameter, robot) {
+    this.parameter = parameter;
+    this.robot = robot;
+    const id = `p-${verb}-${parameter.name}`, empty = parameter.required ? null : S.notGiven;
     const number = ["number", "integer"].includes(parameter.type);
-    input = el("input", { id, type: "text", inputmode: number ? "decimal" : null, autocomplete: "off", spellcheck: "false", placeholder: parameter.type === "object" ? '{"joint": 10}' : "" });
-    if (parameter.default !== null && parameter.default !== undefined) input.value = String(parameter.default);
+    if (parameter.type === "boolean") {
+      this.input = el("select", { id }, el("option", { value: "true", text: S.yes }), el("option", { value: "false", text: S.no }));
+      this.input.value = String(parameter.default ?? true);
+    } else if (parameter.choices === "directions") this.input = choose(id, DIRECTIONS, empty);
+    else if (parameter.choices === "cameras") this.input = choose(id, robot.cameras(), empty);
+    else if (parameter.choices === "robots") this.input = choose(id, robot.parts(), empty);
+    else if (parameter.choices === "objects" && robot.has("getObjects")) this.input = choose(id, [], empty);
+    else {
+      this.input = el("input", { id, type: "text", inputmode: number ? "decimal" : null, autocomplete: "off", spellcheck: "false", placeholder: parameter.type === "object" ? '{"joint": 10}' : "" });
+      if (parameter.default !== null && parameter.default !== undefined) this.input.value = String(parameter.default);
+    }
+    this.input.setAttribute("aria-describedby", `${id}-meaning`);
+    const label = (parameter.unit ? `${parameter.name}, ${parameter.unit}` : parameter.name) + (parameter.required ? ` (${S.required})` : "");
+    this.joints = parameter.choices === "joints" && robot.has("getPose") ? el("div", { class: "joint-fields" }) : null;
+    this.node = el("div", { class: "field" }, el("label", { for: id, text: label }), this.input,
+      el("small", { id: `${id}-meaning`, text: parameter.meaning }), this.joints);
   }
-  input.setAttribute("aria-describedby", `${id}-meaning`);
-  return [input, el("div", { class: "field" },
-    el("label", { for: id, text: parameter.required ? `${parameter.name} (${S.required})` : parameter.name }), input,
-    el("small", { id: `${id}-meaning`, text: parameter.meaning }))];
+
+  async fill(shown) {
+    if (this.parameter.choices === "objects" && this.input instanceof HTMLSelectElement) refill(this.input, await this.robot.objects());
+    if (this.joints && !this.each) this.makeJoints(await this.robot.pose(), shown());
+  }
+
+  // A field for each joint in place of an object that is typed; one that is left empty stays where it is.
+  makeJoints(pose, shown) {
+    const names = Object.keys(pose);
+    if (!names.length || shown) return;
+    this.each = names.map((name) => [name, el("input", { id: `${this.input.id}-${name}`, type: "text", inputmode: "decimal", autocomplete: "off", placeholder: S.jointAt(pose[name]) })]);
+    this.joints.replaceChildren(...this.each.flatMap(([name, input]) => [el("label", { for: input.id, text: `${name}, \u00b0` }), input]));
+    this.input.hidden = true;
+    this.node.firstChild.removeAttribute("for");
+  }
+
+  value() {
+    if (!this.each) return valueOf(this.parameter, this.input.value);
+    const number = { type: "number", required: false }, found = {};
+    for (const [name, input] of this.each) {
+      const value = valueOf({ ...number, name }, input.value);
+      if (value !== undefined) found[name] = value;
+    }
+    if (!Object.keys(found).length) throw new Error(S.missing(this.parameter.name));
+    return found;
+  }
 }
 
 export function valueOf(parameter, text) {
@@ -40,31 +91,47 @@ export function valueOf(parameter, text) {
   return text;
 }
 
-export function verbForm(form, ask, canMove) {
-  const fields = form.parameters.map((parameter) => [parameter, ...field(form.name, parameter)]);
-  const said = el("p", { class: "said", role: "status" });
-  const run = el("button", { type: "submit", text: S.run, disabled: form.kind !== "read" && !canMove && !STOPS.includes(form.name) });
-  const node = el("form", { novalidate: true }, el("p", { text: form.summary }), ...fields.map((each) => each[2]), run, said);
-  node.addEventListener("submit", async (event) => {
-    event.preventDefault();
+export class VerbForm {
+  constructor(form, robot, canMove) {
+    this.form = form;
+    this.robot = robot;
+    this.shown = false;
+    this.fields = form.parameters.map((parameter) => new Field(form.name, parameter, robot));
+    const shown = this.fields.filter((each) => each.parameter.shown), folded = this.fields.filter((each) => !each.parameter.shown);
+    this.said = el("div", { class: "said", role: "status", tabindex: 0, "aria-label": S.result(form.name) });
+    const run = el("button", { type: "submit", class: "primary", text: S.run, disabled: form.kind !== "read" && !canMove && !STOPS.includes(form.name) });
+    this.node = el("form", { novalidate: true, "data-verb": form.name },
+      el("div", { class: "asked" }, el("h4", {}, el("code", { text: form.name })), el("p", { class: "small", text: form.summary }), ...shown.map((each) => each.node), run),
+      this.said,
+      folded.length ? el("details", { class: "more" }, el("summary", { text: S.more(folded.length) }), ...folded.map((each) => each.node)) : null);
+    this.node.addEventListener("submit", (event) => { event.preventDefault(); this.run(); });
+  }
+
+  // What can be chosen is asked of the robot when the form is opened, and after what may have changed it.
+  async fill() { await Promise.all(this.fields.map((each) => each.fill(() => this.shown))); }
+
+  say(text, tone, ...more) {
+    setAttr(this.said, "data-tone", tone);
+    const words = el("p");
+    this.said.replaceChildren(words, ...more);
+    setText(words, text);
+  }
+
+  async run() {
     const params = {};
     try {
-      for (const [parameter, input] of fields) {
-        const value = valueOf(parameter, input.value);
-        if (value !== undefined) params[parameter.name] = value;
+      for (const field of this.fields) {
+        const value = field.value();
+        if (value !== undefined) params[field.parameter.name] = value;
       }
     } catch (problem) {
-      setText(said, problem.message);
-      said.dataset.tone = "bad";
+      this.say(problem.message, "bad");
       return;
     }
-    setText(said, S.sending);
-    said.dataset.tone = "warn";
-    const answer = await ask({ verb: form.name, params });
-    said.dataset.tone = answer && answer.ok ? "good" : "bad";
-    const facts = answer && answer.facts && Object.keys(answer.facts).length ? ` ${JSON.stringify(answer.facts, null, 1)}` : "";
-    setText(said, answer ? `${answer.text}${facts}`.slice(0, 4000) : S.noAnswer);
-  });
-  return el("details", { class: "verb" },
-    el("summary", {}, el("code", { text: form.name }), " ", el("span", { class: "does", "data-kind": form.kind, text: STOPS.includes(form.name) ? S.stops : form.kind === "read" ? S.reads : S.moves })), node);
+    this.say(S.sending, "warn");
+    const answer = await this.robot.ask({ verb: this.form.name, params });
+    if (!answer) this.say(S.noAnswer, "bad");
+    else this.say(answer.text, answer.ok ? "good" : "bad", ...resultNodes(answer.facts));
+    if (this.form.kind !== "read") await this.fill();
+  }
 }

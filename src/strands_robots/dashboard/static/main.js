@@ -1,7 +1,8 @@
 import { CamerasView } from "./cameras.js";
+import { FleetView } from "./cards.js";
 import { Channel, State } from "./connection.js";
-import { el, setText, typing } from "./dom.js";
-import { Fleet, FleetView } from "./fleet.js";
+import { el, keepsSpace, setText, typing } from "./dom.js";
+import { Fleet } from "./fleet.js";
 import { H } from "./history-strings.js";
 import { HistoryView } from "./history.js";
 import { Resume } from "./resume.js";
@@ -24,24 +25,20 @@ const views = document.getElementById("views");
 for (const [href, text] of Object.entries(H.links)) views.append(el("a", { href, text }));
 const main = document.getElementById("main");
 
-document.title = S.title;
-setText(document.getElementById("home"), S.title);
-
-// Space is STOP, wherever the focus is but in a text that is being typed.
+// Space is STOP, wherever the focus is but in a text, on a list or on a link, whose own key it is.
 window.addEventListener("keydown", (event) => {
-  if (event.code !== "Space" || event.ctrlKey || event.altKey || event.metaKey || typing(event.target)) return;
+  if (event.code !== "Space" || event.ctrlKey || event.altKey || event.metaKey || keepsSpace(event.target)) return;
   event.preventDefault();
   event.stopImmediatePropagation();
   if (!event.repeat) stop.press("");
 }, true);
 window.addEventListener("keyup", (event) => {
   // The browser would click the focused button when the key is released.
-  if (event.code === "Space" && !typing(event.target)) { event.preventDefault(); event.stopImmediatePropagation(); }
+  if (event.code === "Space" && !keepsSpace(event.target)) { event.preventDefault(); event.stopImmediatePropagation(); }
 }, true);
 window.addEventListener("keydown", (event) => { if (event.key === "Escape" && typing(event.target)) event.target.blur(); });
 
 const theme = document.getElementById("theme");
-setText(theme, "\u25D0");
 theme.setAttribute("aria-label", S.theme);
 theme.title = S.theme;
 if (localStorage.getItem("theme")) document.documentElement.dataset.theme = localStorage.getItem("theme");
@@ -77,7 +74,7 @@ function route() {
     }
   } else {
     if (robot.key) robot.close();
-    if (view.node.parentNode !== main) { main.replaceChildren(view.node); view.filter.open(); view.asked = ""; view.askThumbnails(); }
+    if (view.node.parentNode !== main) { main.replaceChildren(view.node); view.filter.open(); view.anew = true; view.asked = ""; view.askThumbnails(); }
   }
   draw();
 }
@@ -97,11 +94,7 @@ state.addEventListener("hello", ({ detail }) => {
   robot.hello = resume.hello = detail;
   setText(document.getElementById("stop-hint"), detail.signed ? S.stopAllSigned : S.stopAll);
   view.starting = detail.starting;
-  fleet.rows.clear();
-  fleet.events = [];
-  fleet.mine.clear();
-  view.order = null;
-  view.drawn.clear();
+  fleet.begin();
   view.reconnected();
   history.ticket = detail.ticket;
   history.reset();

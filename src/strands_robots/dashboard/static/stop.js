@@ -1,10 +1,10 @@
 // STOP. The big button and the space bar mean one thing, always: stop every robot. Nothing on this page changes that.
-import { el, setText } from "./dom.js";
+import { el, setAttr, setText } from "./dom.js";
 import { byName, verdictText, verdictTone } from "./fleet.js";
 import { S } from "./strings.js";
 
 const ORDER = ["not_stopped", "alarm", "refused", "unknown", "silent", "claimed", "waiting", "stopped", "heard_only"];
-const NAMES_MAX = 60;
+const NAMES_MAX = 200, NAMED_MAX = 4;
 const CONFIRM_MS = 500;
 
 export class Stop {
@@ -16,12 +16,15 @@ export class Stop {
     this.unconfirmed = new Map();
     this.notSent = "";
     this.silentSince = 0;
+    this.items = new Map();
     this.button = document.getElementById("stop");
     this.said = document.getElementById("stop-said");
     this.alarm = document.getElementById("alarm");
-    setText(document.getElementById("stop-word"), S.stopWord);
-    setText(document.getElementById("stop-hint"), S.stopAll);
-    document.getElementById("stop-bar").setAttribute("aria-label", S.stopRegion);
+    this.head = el("p", { class: "stop-head", "data-tone": "quiet", tabindex: 0 });
+    this.list = el("ul", { class: "answers" });
+    this.notes = el("div");
+    this.said.setAttribute("aria-label", S.stopAnswers);
+    this.said.append(this.head, this.list, this.notes);
     // The press counts, not the release: a finger that slides away has pressed.
     this.button.addEventListener("pointerdown", (event) => { if (event.button === 0) this.press(""); });
     this.button.addEventListener("click", (event) => { if (event.detail === 0) this.press(""); });
@@ -69,7 +72,7 @@ export class Stop {
   }
 
   draw() {
-    const answers = [...this.fleet.rows.values()].filter((row) => row.stop).sort((a, b) => byName.compare(a.id, b.id));
+    const answers = [...this.fleet.rows.values()].filter((row) => row.stop);
     const latest = this.link ? this.link.pressed_at : this.pressedAt;
     this.pressedAt = latest;
     const ready = answers.length === 0 && document.body.dataset.canStop === "yes" ? this.fleet.rows.size : 0;
@@ -77,30 +80,52 @@ export class Stop {
     const signature = JSON.stringify([ready, latest, rosters, this.link && this.link.running, answers.map((row) => [row.key, row.stop])]);
     if (signature === this.signature) return;
     this.signature = signature;
-    if (!latest && answers.length === 0) { this.said.replaceChildren(...(ready ? [el("p", { "data-tone": "quiet", text: S.ready(ready) })] : [])); return; }
     const groups = new Map(ORDER.map((state) => [state, []]));
     for (const row of answers) (groups.get(row.stop.state) || groups.get("unknown")).push(row);
     const bad = ORDER.slice(0, -2).some((state) => groups.get(state).length) || answers.some((row) => row.stop.alarm) || rosters.some((each) => !each.ok);
-    const stopped = groups.get("stopped").length;
     const running = this.link && this.link.running;
     const someFreed = answers.some((row) => row.stop.freed), freed = answers.length > 0 && !bad && !running && answers.every((row) => row.stop.freed);
-    const counts = ORDER.filter((state) => groups.get(state).length)
-      .map((state) => `${groups.get(state).length} ${S.counts[state]}`).join(", ");
+    const counts = ORDER.filter((state) => groups.get(state).length).map((state) => count(state, groups.get(state))).join(", ");
     let summary = counts;
-    if (answers.length === 0) summary = running ? S.waitingAnswers : S.noneAnswered;
+    if (!latest && answers.length === 0) summary = ready ? S.ready(ready) : "";
+    else if (answers.length === 0) summary = running ? S.waitingAnswers : S.noneAnswered;
     else if (freed) summary = S.freedAll(counts);
-    else if (!bad && !running && !someFreed) summary = `${S.allStopped(stopped)} ${S.nowLocked}`;
-    const head = el("p", { class: "stop-head", "data-tone": bad || answers.length === 0 ? "bad" : running ? "warn" : someFreed ? "quiet" : "good" },
-      el("strong", { text: latest ? `${S.pressed(S.when(new Date(latest * 1000)))}: ` : "" }), summary);
-    const list = el("ul", { class: "answers" });
+    else if (!bad && !running && !someFreed) summary = `${S.allStopped(groups.get("stopped").length)} ${S.nowLocked}`;
+    const tone = !latest && answers.length === 0 ? "quiet" : bad || answers.length === 0 ? "bad" : running ? "warn" : someFreed ? "quiet" : "good";
+    setAttr(this.head, "data-tone", tone);
+    this.head.replaceChildren(el("strong", { text: latest ? `${S.pressed(S.when(new Date(latest * 1000)))}: ` : "" }), summary);
     // Once all are free the cards say the rest.
-    const worst = freed ? [] : ORDER.flatMap((state) => groups.get(state));
-    for (const row of worst.slice(0, NAMES_MAX)) {
-      list.append(el("li", { "data-tone": verdictTone(row.stop), "data-state": row.stop.state, "data-key": row.key },
-        el("strong", { text: row.id }), ` ${verdictText(row.stop)}`));
-    }
-    if (worst.length > NAMES_MAX) list.append(el("li", { text: `+ ${worst.length - NAMES_MAX}` }));
-    const notes = rosters.flatMap((each) => [each.sentence, ...each.notes]).map((text) => el("p", { class: "small", text }));
-    this.said.replaceChildren(head, ...notes, list);
+    this.drawAnswers(freed ? [] : ORDER.flatMap((state) => groups.get(state)).slice(0, NAMES_MAX));
+    const notes = el("div", {}, ...rosters.flatMap((each) => [each.sentence, ...each.notes]).map((text) => el("p", { class: "small", text })));
+    this.notes.replaceWith(notes);
+    this.notes = notes;
   }
+
+  // Each robot keeps its place while the answers come: by name, and the summary names those that did not stop.
+  drawAnswers(rows) {
+    const wanted = new Set(rows.map((row) => row.key));
+    for (const [key, item] of this.items) if (!wanted.has(key)) { item.node.remove(); this.items.delete(key); }
+    let at = this.list.firstChild;
+    for (const row of rows.sort((a, b) => byName.compare(a.id, b.id))) {
+      let item = this.items.get(row.key);
+      if (!item) {
+        const words = el("span");
+        item = { words, node: el("li", { "data-key": row.key }, el("strong", { text: row.id }), " ", words) };
+        this.items.set(row.key, item);
+      }
+      if (item.node === at) at = at.nextSibling; else this.list.insertBefore(item.node, at);
+      const text = verdictText(row.stop);
+      setAttr(item.node, "data-tone", verdictTone(row.stop));
+      setAttr(item.node, "data-state", row.stop.state);
+      setAttr(item.node, "title", `${row.id} ${text}`);
+      setText(item.words, text);
+    }
+  }
+}
+
+function count(state, rows) {
+  const text = `${rows.length} ${S.counts[state]}`;
+  if (["stopped", "heard_only", "waiting"].includes(state)) return text;
+  const names = rows.map((row) => row.id).sort(byName.compare);
+  return `${text}: ${names.slice(0, NAMED_MAX).join(", ")}${names.length > NAMED_MAX ? " ..." : ""}`;
 }

@@ -1,9 +1,10 @@
-// Events and audit records, newest first.
-import { el } from "./dom.js";
+// Events and audit records: a log of a fixed height. What comes is added below, and nobody who reads above is moved.
+import { el, setText } from "./dom.js";
+import { eventText, factsText } from "./events.js";
 import { S } from "./strings.js";
 
-const SHOWN_MAX = 100;
-const EMPTY = ["", "[]", "{}", null];
+const SHOWN_MAX = 200;
+const NEAR_PX = 24;
 
 export class Timeline {
   constructor(fleet) {
@@ -11,27 +12,37 @@ export class Timeline {
     this.filter = el("input", { id: "timeline-filter", type: "search", autocomplete: "off", spellcheck: "false" });
     this.which = el("select", { id: "timeline-which", "aria-label": S.timelineFilter });
     for (const [value, text] of Object.entries(S.withAudit)) this.which.append(el("option", { value, text }));
-    this.list = el("ol", { class: "events" });
-    this.node = el("section", { class: "panel", "aria-labelledby": "timeline-title" }, el("h3", { id: "timeline-title", text: S.timeline }),
-      el("div", { class: "tools" }, el("label", { for: "timeline-filter", text: S.timelineFilter }), this.filter, this.which), this.list);
+    this.list = el("ol", { class: "events", tabindex: 0, "aria-label": S.timeline });
+    this.none = el("p", { class: "small none" });
+    this.node = el("section", { class: "panel timeline", "aria-labelledby": "timeline-title" }, el("h3", { id: "timeline-title", text: S.timeline }),
+      el("div", { class: "tools" }, el("label", { for: "timeline-filter", text: S.timelineFilter }), this.filter, this.which), el("div", { class: "log" }, this.none, this.list));
     for (const control of [this.filter, this.which]) control.addEventListener("input", () => this.draw(this.robot, true));
   }
 
-  draw(robot, force = false) {
-    const last = this.fleet.events.length ? this.fleet.events[this.fleet.events.length - 1].n : 0;
-    const row = this.fleet.rows.get(robot);
-    if (!force && last === this.last && robot === this.robot) return;
+  wanted(each) {
+    const text = this.filter.value.trim().toLowerCase(), row = this.fleet.rows.get(this.robot);
+    return (!row || each.key === this.robot || each.robot === row.id || each.robot === "") &&
+      (this.which.value === "all" || (this.which.value === "audit") === each.audit) &&
+      (!text || `${each.event} ${eventText(each.event)} ${each.robot} ${JSON.stringify(each.facts)}`.toLowerCase().includes(text));
+  }
+
+  draw(robot, anew = false) {
+    const events = this.fleet.events, last = events.length ? events[events.length - 1].n : 0;
+    anew = anew || robot !== this.robot || last < this.last;
+    if (!anew && last === this.last) return;
+    const since = anew ? 0 : this.last;
     this.last = last;
     this.robot = robot;
-    const wanted = this.filter.value.trim().toLowerCase();
-    const shown = this.fleet.events.filter((each) =>
-      (!row || each.key === robot || each.robot === row.id || each.robot === "") &&
-      (this.which.value === "all" || (this.which.value === "audit") === each.audit) &&
-      (!wanted || `${each.event} ${each.robot} ${JSON.stringify(each.facts)}`.toLowerCase().includes(wanted)))
-      .slice(-SHOWN_MAX).reverse();
-    this.list.replaceChildren(...shown.map((each) => el("li", { "data-audit": each.audit ? "yes" : "no" },
-      el("time", { text: S.when(new Date(each.at * 1000)) }), " ", el("strong", { text: each.event }), ` ${each.robot} `,
-      el("small", { text: Object.entries(each.facts).filter(([, value]) => !EMPTY.includes(value)).map(([name, value]) => `${name}: ${value}`).join(" · ") }))));
-    if (!shown.length) this.list.append(el("li", { text: S.nothing }));
+    const below = anew || this.list.scrollHeight - this.list.scrollTop - this.list.clientHeight < NEAR_PX;
+    const lines = events.filter((each) => each.n > since && this.wanted(each)).slice(-SHOWN_MAX).map((each) =>
+      el("li", { "data-audit": each.audit ? "yes" : "no" }, el("time", { datetime: new Date(each.at * 1000).toISOString(), text: S.when(new Date(each.at * 1000)) }), " ",
+        el("strong", { text: eventText(each.event), title: each.event }), ` ${each.robot} `, el("small", { text: factsText(each) })));
+    if (anew) this.list.replaceChildren(...lines); else this.list.append(...lines);
+    // While somebody reads above, the oldest stay as well.
+    if (below) {
+      while (this.list.childElementCount > SHOWN_MAX) this.list.firstChild.remove();
+      this.list.scrollTop = this.list.scrollHeight;
+    }
+    setText(this.none, this.list.childElementCount ? "" : S.nothing);
   }
 }
