@@ -44,7 +44,7 @@ export class Chart {
     this.title = title;
     this.head = el("h4", { id: `${id}-title`, text: title });
     this.canvas = el("canvas", { class: "chart", role: "img" });
-    this.legend = el("ul", { class: "legend", tabindex: 0, "aria-label": `${title}: ${H.legend}` });
+    this.legend = el("ul", { class: "chart-legend", tabindex: 0, "aria-label": `${title}: ${H.legend}` });
     this.node = el("section", { id, class: "panel chart-panel", "aria-labelledby": `${id}-title` }, this.head, this.canvas, this.legend);
   }
 
@@ -104,7 +104,7 @@ export class Chart {
       this.names = names;
       this.values = told.slice(0, LEGEND_MAX).map(() => el("b"));
       this.legend.replaceChildren(...told.slice(0, LEGEND_MAX).map(([name], index) =>
-        el("li", {}, el("span", { class: "key", "data-color": index % 6, "data-dash": Math.floor(index / 6) }), `${name} `, this.values[index])));
+        el("li", {}, el("span", { class: "line-key", "data-color": index % 6, "data-dash": Math.floor(index / 6) }), `${name} `, this.values[index])));
     }
     told.slice(0, LEGEND_MAX).forEach(([, found], index) => setText(this.values[index], found ? short(found[2]) : "\u2013"));
   }

@@ -42,7 +42,7 @@ export class HistoryView {
     this.axis = el("canvas", { class: "axis", "aria-hidden": "true" });
     this.list = el("ul", { class: "lanes", tabindex: 0, "aria-label": H.lanes });
     this.empty = el("p", { class: "lanes-empty", role: "status" });
-    const legend = el("ul", { class: "legend states", "aria-label": H.legend }, ...Object.entries(H.states).map(([state, text]) => el("li", {}, el("span", { class: "swatch", "data-state": state }), text)));
+    const legend = el("ul", { class: "chart-legend states", "aria-label": H.legend }, ...Object.entries(H.states).map(([state, text]) => el("li", {}, el("span", { class: "state-key", "data-state": state }), text)));
     this.said = el("p", { class: "history-said", role: "status" });
     this.files = el("div", { class: "choices", role: "group", "aria-label": H.exportLabel });
     for (const [what, text] of [["states", H.statesCsv], ["charts", H.chartsCsv], ["json", H.bothJson]]) {
