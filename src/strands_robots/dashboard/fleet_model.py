@@ -10,12 +10,14 @@ import json
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import Any
 
 from strands_robots.cli.lockout_report import LockoutReport
 from strands_robots.cli.output import plain
+from strands_robots.dashboard.history import OVERLAP_S, History, plain_values
 from strands_robots.device_connect.telemetry import numbers
 
 ROBOTS_MAX = 2000
@@ -46,6 +48,8 @@ class RobotRow:
         stop: its answer to the latest emergency stop, first given at ``stop_at``; ``freed`` once it is not locked by
             that stop any more.
         locked_by: the latest emergency stop, once the robot has said that it locks it.
+        load: of its host, as it says it: 1-minute load average over the number of cores.
+        messages: signs of life since the last sample of the history, and ``gap_s`` the longest time between two.
         units: unit of each joint's position, as its features name it; ``limits`` are in the same.
         forms: its verbs, as :func:`~strands_robots.dashboard.verb_forms.forms_of` describes them.
         changed: number of the model's last change of something that the page shows at once.
@@ -74,6 +78,9 @@ class RobotRow:
     cameras: tuple[str, ...] = ()
     heard: float | None = None
     link_ms: float | None = None
+    load: float | None = None
+    messages: int = 0
+    gap_s: float = 0.0
     expected: bool = False
     changed: int = 0
     ticked: int = 0
@@ -123,6 +130,7 @@ class FleetModel:
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self.clock = clock
+        self.history = History()
         self._lock = threading.Lock()
         self._rows: dict[str, RobotRow] = {}
         self._timeline: deque[tuple[int, str]] = deque(maxlen=TIMELINE_MAX)
@@ -145,6 +153,7 @@ class FleetModel:
                     changed = True
             if changed:
                 row.changed = self._next()
+                self.history.changed(row, self.clock())
             if "expected" in facts:
                 self._note_expected(network)
 
@@ -153,7 +162,10 @@ class FleetModel:
         with self._lock:
             row = self._rows.get(key_of(network, name))
             if row is not None:
-                row.heard = self.clock()
+                before, row.heard = row.heard, self.clock()
+                row.messages += 1
+                row.gap_s = max(row.gap_s, 0.0 if before is None else row.heard - before)
+                self.history.heard(row, before, row.heard)
                 row.link_ms = row.link_ms if link_ms is None else link_ms
                 row.ticked = self._next()
 
@@ -172,6 +184,14 @@ class FleetModel:
                 row.ticked = number
             else:
                 row.changed = number
+                self.history.changed(row, self.clock())
+
+    def load(self, network: str, name: str, load: float) -> None:
+        """Set the load of a robot's host, 1 for all of its cores."""
+        with self._lock:
+            row = self._rows.get(key_of(network, name))
+            if row is not None:
+                row.load = load
 
     def observe(self, network: str, name: str, joints: Mapping[str, Any], part: str = "") -> None:
         """Take the joints of a robot, or of one robot of a world."""
@@ -289,6 +309,7 @@ class FleetModel:
             if row is None or (row.heard is not None and self.clock() - row.heard < longer_than_s):
                 return False
             del self._rows[key]
+            self.history.forget(key)
             self._gone.append((self._next(), key))
             self._note_expected(row.network)
             return True
@@ -356,6 +377,45 @@ class FleetModel:
             if row is None or row.joints_at <= since:
                 return None
             return {"type": "joints", "key": key, "at": row.joints_at, "now": self.clock(), "joints": row.joints}
+
+    def begin_sample(self) -> list[str]:
+        """Begin a sample of the history, and return the robots whose values it takes."""
+        with self._lock:
+            self.history.begin_sample(self.clock())
+            return list(self._rows)
+
+    def sample(self, keys: Iterable[str]) -> None:
+        """Take the values of some robots."""
+        with self._lock:
+            now = self.clock()
+            for row in filter(None, map(self._rows.get, keys)):
+                self.history.sample(row, now)
+
+    def states(self, keys: Iterable[str], number: int, at: float) -> Iterator[str]:
+        """Yield each robot's changes of state since a question, encoded.
+
+        Args:
+            keys: of the robots.
+            number: the history's number at that question; 0 for everything.
+            at: the time of it.
+        """
+        for key in keys:
+            with self._lock:
+                found = self.history.states(key, number, at - OVERLAP_S)
+            if found is not None:
+                starts = [round(each, 2) for each in found[0]]
+                yield json.dumps({"key": key, "at": starts, "as": found[1]}, allow_nan=False)
+
+    def series(self, key: str, after: float) -> Iterator[str] | None:
+        """Return the samples of a robot after a time, a line a series, or None."""
+        with self._lock:
+            row, found = self._rows.get(key), self.history.series(key, after)
+        if row is None or found is None:
+            return None
+        times, values = found
+        head = json.dumps({"key": key, "times": [round(each, 3) for each in times], "units": row.units}, default=str)
+        lines = (json.dumps({"name": name, "values": plain_values(each)}) for name, each in values.items())
+        return chain((head,), lines)
 
     def _row(self, network: str, name: str) -> RobotRow | None:
         key = key_of(network, name)

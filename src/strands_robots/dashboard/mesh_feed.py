@@ -23,6 +23,7 @@ from strands_robots.tools.mesh_roster import stand_on_mesh
 
 LOOK_S = 0.25
 STOP_S = 2.0
+LOAD_MAX = 1000.0
 
 
 class MeshFeed:
@@ -47,6 +48,7 @@ class MeshFeed:
         # A stop waits for no other call.
         self._stops = ThreadPoolExecutor(PARALLEL, "dashboard-mesh-stop")
         mesh.subscribe("strands/*/state", self._take_state, "dashboard state")
+        mesh.subscribe("strands/*/health", self._take_health, "dashboard load")
         mesh.subscribe("strands/*/safety/event", self._take_event, "dashboard events")
         self._thread = threading.Thread(target=self._look, name="dashboard-mesh", daemon=True)
         self._thread.start()
@@ -133,6 +135,11 @@ class MeshFeed:
         joints = message.get("joints")
         if isinstance(joints, Mapping):
             self._model.observe(self.network, name, numbers(joints))
+
+    def _take_health(self, key: str, message: Mapping[str, Any]) -> None:
+        name, load = key.split("/")[-2], numbers(message).get("cpu_load")
+        if name in self._names and load is not None and 0 <= load < LOAD_MAX:
+            self._model.load(self.network, name, load)
 
     def _take_event(self, key: str, message: Mapping[str, Any]) -> None:
         name = key.split("/")[-3]

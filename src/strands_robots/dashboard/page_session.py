@@ -293,7 +293,8 @@ class PageSession:
         for key in set(self._thumbnails) - set(wanted):
             self._thumbnails.pop(key).cancel()
         for key in wanted:
-            if key not in self._thumbnails:
+            # A stream that ended, such as one for which there was no room, is asked for again.
+            if key not in self._thumbnails or self._thumbnails[key].done():
                 self._thumbnails[key] = asyncio.create_task(self._send_thumbnails(key))
 
     async def _send_thumbnails(self, key: str) -> None:
@@ -380,6 +381,11 @@ class PageSession:
             raise KeyRefusedError("The operator's key is used from this server's own machine only (127.0.0.1).")
         return await asyncio.to_thread(self._server.operator_key.open, message.get("passphrase"))
 
+    async def _look_closer(self, key: str, message: Message) -> Envelope:
+        feed, robot = self._feed(key)
+        await feed.look_closer(robot)
+        return {"status": "success", "content": [{"text": "Its limits, units and cameras were read."}]}
+
     async def _forget(self, key: str, message: Message) -> Envelope:
         self._may_drive()
         if not self._server.model.forget(key, FORGET_S):
@@ -393,4 +399,5 @@ _ASKED: dict[str, Callable[[PageSession, str, Message], Awaitable[Envelope]]] = 
     "give": PageSession._give_control,
     "resume": PageSession._resume,
     "forget": PageSession._forget,
+    "look": PageSession._look_closer,
 }

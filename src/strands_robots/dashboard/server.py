@@ -6,7 +6,9 @@ import asyncio
 import contextlib
 import json
 import logging
+import math
 import socket
+import time
 from collections.abc import AsyncIterator, Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -23,8 +25,9 @@ from strands_robots import audit
 from strands_robots.audit.journal import NAME as AUDIT_FILE
 from strands_robots.dashboard.access import Access, Guard, is_local
 from strands_robots.dashboard.emergency import FleetStop
-from strands_robots.dashboard.feed import FleetFeed
+from strands_robots.dashboard.feed import FleetFeed, poll_interval
 from strands_robots.dashboard.fleet_model import FleetModel
+from strands_robots.dashboard.history import SAMPLE_S, SILENT_S
 from strands_robots.dashboard.operator_key import OperatorKey
 from strands_robots.dashboard.page_session import PageSession, Shared
 from strands_robots.dashboard.pictures import BOUNDARY, mjpeg
@@ -45,8 +48,13 @@ LINK_LOOK_S = 0.04
 REFRESH_S = 0.02
 AUDIT_S = 1.0
 AUDIT_BYTES = 256 * 2**10
+SAMPLED_AT_ONCE = 10
+"""Robots that are sampled before other work, such as a stop, has a turn."""
+
 SESSIONS_MAX = 64
 MESSAGE_MAX = 64 * 2**10
+NDJSON = "application/x-ndjson"
+NO_TICKET = "This page's ticket is needed.\n"
 
 
 class Dashboard:
@@ -86,6 +94,8 @@ class Dashboard:
             WebSocketRoute("/state", self._state),
             WebSocketRoute("/stop", self._stop),
             Route("/camera", self._camera),
+            Route("/history", self._history),
+            Route("/series", self._series),
             *(Route(f"/{name}", _file(path)) for name, path in _files().items()),
         ]
         return Guard(Starlette(routes=routes, lifespan=self._lifespan), self.access)
@@ -103,6 +113,7 @@ class Dashboard:
     @contextlib.asynccontextmanager
     async def _lifespan(self, _: Starlette) -> AsyncIterator[None]:
         tasks = [asyncio.create_task(self._refresh()), asyncio.create_task(self._follow_audit())]
+        tasks.append(asyncio.create_task(self._sample()))
         try:
             yield
         finally:
@@ -117,6 +128,23 @@ class Dashboard:
             except Exception:
                 logger.exception("The answers to a stop could not be read.")
             await asyncio.sleep(REFRESH_S if self.stop.running else 5 * REFRESH_S)
+
+    async def _sample(self) -> None:
+        """Take a sample of every robot's joints, lag and load, a few robots at a time."""
+        clock = asyncio.get_running_loop().time
+        due = clock()
+        while True:
+            try:
+                keys = self.model.begin_sample()
+                # A robot of a large fleet that does nothing is asked less often.
+                self.model.history.silent_s = SILENT_S + poll_interval(len(keys))
+                for first in range(0, len(keys), SAMPLED_AT_ONCE):
+                    self.model.sample(keys[first : first + SAMPLED_AT_ONCE])
+                    await asyncio.sleep(0)
+            except Exception:
+                logger.exception("A sample of the fleet's history could not be taken.")
+            due = max(due + SAMPLE_S, clock())
+            await asyncio.sleep(due - clock())
 
     async def _follow_audit(self) -> None:
         """Put new records of this machine's audit into the timeline."""
@@ -203,7 +231,7 @@ class Dashboard:
         row = self.model.row(asked.get("robot", ""))
         feed = None if row is None else self.feeds.get(row.network)
         if asked.get("ticket", "") not in self._sessions:
-            return PlainTextResponse("This page's ticket is needed.\n", 403)
+            return PlainTextResponse(NO_TICKET, 403)
         if row is None or feed is None:
             return PlainTextResponse("No such robot.\n", 404)
         pictures = self._shared.pictures
@@ -211,6 +239,39 @@ class Dashboard:
         frames = pictures.pose(feed, row.id) if posed else pictures.camera(feed, row.id, asked.get("camera", "")[:128])
         stream = mjpeg(frames)
         return StreamingResponse(stream, media_type=f"multipart/x-mixed-replace; boundary={BOUNDARY.decode()}")
+
+    async def _history(self, request: Request) -> Response:
+        """Send the states of all robots, a line a robot, behind a line with the time."""
+        asked = request.query_params
+        if asked.get("ticket", "") not in self._sessions:
+            return PlainTextResponse(NO_TICKET, 403)
+        number, at = _number(asked.get("number")), _number(asked.get("at"))
+        head = {"number": self.model.history.number, "now": self.model.clock(), "wall": time.time()}
+        keys = [row.key for row in self.model.rows()]
+
+        async def lines() -> AsyncIterator[str]:
+            yield json.dumps(head) + "\n"
+            for line in self.model.states(keys, int(number), at):
+                yield line + "\n"
+                await asyncio.sleep(0)
+
+        return StreamingResponse(lines(), media_type=NDJSON)
+
+    async def _series(self, request: Request) -> Response:
+        """Send the samples of one robot."""
+        asked = request.query_params
+        if asked.get("ticket", "") not in self._sessions:
+            return PlainTextResponse(NO_TICKET, 403)
+        found = self.model.series(asked.get("robot", ""), _number(asked.get("after")))
+        if found is None:
+            return PlainTextResponse("No such robot.\n", 404)
+
+        async def lines() -> AsyncIterator[str]:
+            for line in found:
+                yield line + "\n"
+                await asyncio.sleep(0)
+
+        return StreamingResponse(lines(), media_type=NDJSON)
 
 
 class QuietServer(uvicorn.Server):
@@ -270,6 +331,15 @@ def _file(path: Path) -> Any:
         return Response(content, media_type=kind)
 
     return serve
+
+
+def _number(given: str | None) -> float:
+    """Return a finite number of a query, 0 for anything else."""
+    try:
+        value = float(given or 0)
+    except ValueError:
+        return 0.0
+    return value if math.isfinite(value) else 0.0
 
 
 def _size(path: Path) -> int:

@@ -2,6 +2,7 @@
 // its own, and they are sorted anew only when somebody asks for it.
 import { el, setAttr, setLine, setText } from "./dom.js";
 import { ageText, byName, controlText, kindText, lockText, taskText, verdictText, verdictTone } from "./fleet.js";
+import { Filter } from "./filter.js";
 import { Halt } from "./halt.js";
 import { S } from "./strings.js";
 
@@ -63,18 +64,14 @@ export class FleetView {
     this.drawn = new Map();
     this.starting = [];
     this.anew = true;
-    this.search = el("input", { id: "search", type: "search", placeholder: S.searchHint, autocomplete: "off", spellcheck: "false" });
-    this.filter = el("select", { id: "filter" });
-    for (const [value, text] of Object.entries(S.filters)) this.filter.append(el("option", { value, text }));
+    this.filter = new Filter(fleet, kindText, () => this.arrangeAnew());
     this.sort = el("button", { id: "sort", type: "button", text: S.sort, title: S.sortWhy });
-    this.count = el("span", { id: "count", role: "status" });
+    this.filter.count.before(this.sort);
     this.list = el("ul", { id: "cards" });
     this.empty = el("p", { class: "empty" });
     this.node = el("div", { id: "fleet" },
-      el("div", { class: "tools" }, el("label", { for: "search", text: S.search }), this.search,
-        el("label", { for: "filter", text: S.filter }), this.filter, this.sort, this.count),
+      this.filter.node,
       el("div", { class: "places" }, this.empty, this.list));
-    for (const control of [this.search, this.filter]) control.addEventListener("input", () => this.arrangeAnew());
     this.sort.addEventListener("click", () => this.arrangeAnew());
     this.observer = new IntersectionObserver((entries) => {
       for (const entry of entries) {
@@ -89,9 +86,9 @@ export class FleetView {
 
   draw() {
     this.fleet.forgetOld();
-    const rows = this.fleet.chosen(this.search.value, this.filter.value);
+    const rows = [...this.fleet.rows.values()].filter((row) => this.filter.passes(row));
     const worst = rows.filter((row) => this.fleet.attention(row) < 2).length;
-    setText(this.count, S.shown(rows.length, this.fleet.rows.size) + (worst ? S.worst(worst) : ""));
+    this.filter.tell(rows.length, worst ? S.worst(worst) : "");
     for (const row of rows) {
       let card = this.cards.get(row.key);
       if (!card) {
@@ -131,7 +128,7 @@ export class FleetView {
 
   // Robots that the server has started and that are not on the network yet have their places.
   placeComing() {
-    const all = this.filter.value === "all" && this.search.value.trim() === "";
+    const all = this.filter.everything;
     const known = new Set([...this.fleet.rows.values()].map((row) => row.id));
     for (const name of all ? this.starting : []) {
       if (known.has(name) || this.list.querySelector(`.coming[data-id="${CSS.escape(name)}"]`)) continue;

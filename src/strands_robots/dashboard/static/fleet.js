@@ -63,16 +63,6 @@ export class Fleet {
     return this.moving(row) ? 5 : 6;
   }
 
-  chosen(text, which) {
-    const wanted = text.trim().toLowerCase();
-    return [...this.rows.values()]
-      .filter((row) => !wanted ||
-        `${row.id} ${row.kind} ${kindText(row)} ${row.task.instruction || ""}`.toLowerCase().includes(wanted))
-      .filter((row) => which === "all" || (which === "attention" && this.attention(row) < 5) ||
-        (which === "locked" && row.locked) || (which === "moving" && this.moving(row)) ||
-        (which === "idle" && !this.moving(row) && row.locked === false));
-  }
-
   // The worst first.
   sorted(rows) {
     return rows.map((row) => [this.attention(row), row])

@@ -1,7 +1,10 @@
+import { CamerasView } from "./cameras.js";
 import { FleetView } from "./cards.js";
 import { Channel, State } from "./connection.js";
-import { keepsSpace, setText, typing } from "./dom.js";
+import { el, keepsSpace, setText, typing } from "./dom.js";
 import { Fleet } from "./fleet.js";
+import { H } from "./history-strings.js";
+import { HistoryView } from "./history.js";
 import { Resume } from "./resume.js";
 import { RobotView } from "./robot.js";
 import { Stop } from "./stop.js";
@@ -14,7 +17,12 @@ const stop = new Stop(channel, fleet);
 const state = new State();
 const view = new FleetView(fleet, state, (id) => stop.press(id));
 const robot = new RobotView(fleet, state, (id, only) => stop.press(id, only));
+const history = new HistoryView(fleet, state);
+const cameras = new CamerasView(fleet, state);
+const others = { "#/history": history, "#/cameras": cameras };
 const resume = new Resume(fleet, state);
+const views = document.getElementById("views");
+for (const [href, text] of Object.entries(H.links)) views.append(el("a", { href, text }));
 const main = document.getElementById("main");
 
 // Space is STOP, wherever the focus is but in a text, on a list or on a link, whose own key it is.
@@ -45,7 +53,18 @@ function route() {
   const found = location.hash.match(/^#\/robot\/(.+)$/);
   let key = "";
   try { key = found ? decodeURIComponent(found[1]) : ""; } catch { key = ""; }
-  if (key) {
+  const other = others[location.hash];
+  for (const link of views.children) if (link.hash === (other ? location.hash : "#/")) link.setAttribute("aria-current", "page"); else link.removeAttribute("aria-current");
+  if (cameras.node.isConnected && other !== cameras) cameras.close();
+  if (other) {
+    if (robot.key) robot.close();
+    if (other.node.parentNode !== main) {
+      main.replaceChildren(other.node);
+      view.askThumbnails();
+      other.open();
+      window.scrollTo(0, 0);
+    }
+  } else if (key) {
     robot.open(key);
     if (robot.node.parentNode !== main) {
       main.replaceChildren(robot.node);
@@ -55,7 +74,7 @@ function route() {
     }
   } else {
     if (robot.key) robot.close();
-    if (view.node.parentNode !== main) { main.replaceChildren(view.node); view.anew = true; view.asked = ""; view.askThumbnails(); }
+    if (view.node.parentNode !== main) { main.replaceChildren(view.node); view.filter.open(); view.anew = true; view.asked = ""; view.askThumbnails(); }
   }
   draw();
 }
@@ -66,7 +85,7 @@ function draw() {
   asked = true;
   requestAnimationFrame(() => {
     asked = false;
-    if (robot.key) robot.draw(); else view.draw();
+    if (robot.key) robot.draw(); else if (view.node.isConnected) view.draw();
     resume.draw();
   });
 }
@@ -77,19 +96,23 @@ state.addEventListener("hello", ({ detail }) => {
   view.starting = detail.starting;
   fleet.begin();
   view.reconnected();
+  history.ticket = detail.ticket;
+  history.reset();
+  history.ask();
+  cameras.ask(true);
   robot.resetPictures();
   robot.watch();
   draw();
 });
 state.addEventListener("fleet", ({ detail }) => { fleet.take(detail); stop.draw(); draw(); });
-state.addEventListener("picture", ({ detail }) => view.picture(detail));
+state.addEventListener("picture", ({ detail }) => { if (cameras.node.isConnected) cameras.picture(detail); else view.picture(detail); });
 state.addEventListener("control", ({ detail }) => {
   if (detail.held) fleet.mine.add(detail.key); else fleet.mine.delete(detail.key);
   robot.control_changed(detail);
   draw();
 });
 state.addEventListener("lost", () => { fleet.mine.clear(); draw(); });
-document.addEventListener("visibilitychange", () => view.askThumbnails());
+document.addEventListener("visibilitychange", () => { view.askThumbnails(); cameras.ask(); });
 window.addEventListener("hashchange", route);
 // Ages grow also when nothing arrives.
 setInterval(draw, 250);
