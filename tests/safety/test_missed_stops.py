@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import random
 import sys
 import threading
@@ -19,7 +18,7 @@ from fixtures.waiting import eventually
 
 from strands_robots.audit import flush_audit, read_audit_log
 from strands_robots.safety import ed25519, missed_stops
-from strands_robots.safety.answer_slots import SWEPT_ABOVE, AnswerSlots
+from strands_robots.safety.answer_slots import AnswerSlots
 from strands_robots.safety.clearance import clear_here
 from strands_robots.safety.controller import SafetyController
 from strands_robots.safety.estop_listener import ESTOP, VERDICT, notification
@@ -487,6 +486,13 @@ def test_process_asks_again_after_two_seconds_and_not_more_than_once_a_second() 
     assert asked == [0.0, 1.0, 3.0]
 
 
+def test_question_because_a_peer_is_back_waits_for_the_others_and_is_not_put_off_by_them() -> None:
+    asker = Asker()
+    asker.want(10.0 + missed_stops.SETTLE_S)
+    asker.want(10.1 + missed_stops.SETTLE_S)
+    assert asker.due == 10.0 + missed_stops.SETTLE_S
+
+
 def test_process_whose_robots_are_all_locked_asks_later_and_seldom() -> None:
     asker, asked = Asker(), list[float]()
     for step in range(120):
@@ -500,31 +506,6 @@ def test_process_whose_robots_are_all_locked_asks_later_and_seldom() -> None:
     asker.want(12.0, 1.5)
     asker.want(12.6)  # it was resumed, and was away since
     assert asker.due == 12.6
-
-
-def test_processes_of_one_machine_give_three_answers_to_a_question(tmp_path: Path) -> None:
-    slots, (one, other) = [AnswerSlots(tmp_path) for _ in range(10)], (new_epoch(), new_epoch())
-    epochs = [new_epoch()]
-    assert [each.take([one], epochs) for each in slots].count([one]) == 3
-    assert slots[0].take([one, other], epochs) == [other]
-    assert slots[0].take([one], [*epochs, new_epoch()]), "nobody else has these stops"
-    assert len(list((tmp_path / "answers").iterdir())) == 5
-
-
-def test_machine_that_cannot_share_its_answers_gives_them_all(tmp_path: Path) -> None:
-    (tmp_path / "answers").mkdir()
-    (tmp_path / "answers").chmod(0o777)
-    assert all(AnswerSlots(tmp_path).take([new_epoch()], []) for _ in range(5))
-
-
-def test_slots_of_old_questions_are_removed(tmp_path: Path) -> None:
-    slots = AnswerSlots(tmp_path)
-    for _ in range(SWEPT_ABOVE + 1):
-        slots.take([new_epoch()], [])
-    for each in (tmp_path / "answers").iterdir():
-        os.utime(each, (1.0, 1.0))
-    slots.take([new_epoch()], [])
-    assert len(list((tmp_path / "answers").iterdir())) == 1
 
 
 def test_process_whose_answers_had_to_be_dropped_goes_on_asking_a_few_times() -> None:

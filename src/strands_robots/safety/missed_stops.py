@@ -56,6 +56,9 @@ LOCKED_EVERY_S = 5.0
 LOCKED_WAIT_S = 2.0
 """Longest wait of such a process before it asks; drawn anew each time."""
 
+SETTLE_S = 0.15
+"""Wait of a question because one peer is back: others follow, and the next question is a second off."""
+
 ASK_AGAIN_S = 2.0
 ASKS_MAX = 5
 """Questions after one reason: two, and more only while answers had to be dropped."""
@@ -185,7 +188,8 @@ class Asker:
             later_s: seconds that a process whose robots are all locked waits; it does so at most every five seconds.
         """
         if not later_s:
-            self._due = max(now, self._asked + ASK_EVERY_S)
+            soonest = max(now, self._asked + ASK_EVERY_S)
+            self._due = min(self._due, soonest) if self._asks else soonest
         elif not self._asks:
             self._due = max(now + later_s, self._asked + LOCKED_EVERY_S)
         self._asks = ASKS_MAX
@@ -459,7 +463,8 @@ class MissedStops:
                 self._port.hold(UNITE_S)
             self._back = self._back or reason == BACK
             logger.info("Asking for the stops missed: %s.", reason)
-            self._asker.want(self._clock(), self._chance() * LOCKED_WAIT_S if self._port.locked() else 0.0)
+            settle = SETTLE_S if reason == PEER_BACK else 0.0
+            self._asker.want(self._clock() + settle, self._chance() * LOCKED_WAIT_S if self._port.locked() else 0.0)
         self._take_questions()
         if self._asker.listens(self._clock()):
             self._take_answers()
