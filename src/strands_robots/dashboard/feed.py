@@ -75,7 +75,7 @@ class LoopThread:
 
 
 def joint_units(features: Mapping[str, Any]) -> dict[str, str]:
-    """Return the unit of each joint in an answer to getFeatures; a world's first robot."""
+    """Return the unit of each joint in an answer to getFeatures."""
     robots = features.get("robots")
     chosen: Any = next(iter(robots.values())) if isinstance(robots, Mapping) and robots else features
     units = chosen.get("joint_units") if isinstance(chosen, Mapping) else None

@@ -237,7 +237,7 @@ class FleetModel:
         )
 
     def _note_control(self, network: str, name: str, control: Mapping[str, Any]) -> None:
-        """Add a change of the holder to the timeline, unless the robot has just told it by an event."""
+        """Note a change of the holder that no event of the robot has told."""
         with self._lock:
             row = self._rows.get(key_of(network, name))
             told = row is not None and self.clock() - row.control_told_at < CONTROL_TOLD_S

@@ -56,7 +56,7 @@ class Actuator:
 
 @dataclass(frozen=True, slots=True)
 class Joint:
-    """One joint with a single coordinate: indices, range, and its unit, ``radians`` or ``metres``."""
+    """One joint of a single coordinate: indices, range, unit (radians, metres)."""
 
     key: str
     qpos: int
