@@ -122,6 +122,26 @@ def test_answers_of_robots_without_a_cell_do_not_hide_a_mistyped_one(stop: Calla
     assert fleet.scopes.count(EVERY_ROBOT) > 1
 
 
+def test_disk_that_takes_its_time_widens_no_stop_of_a_robot_that_is_known(stop: Callable[..., Any]) -> None:
+    def read_slowly(asked: Scope) -> bool:
+        threading.Event().wait(2 * WIDEN_S)
+        return True
+
+    report = stop(Fleet({"free-1": ""}), Scope(cell="cell-1"), ("free-1",), deadline_s=20, remembers=read_slowly)
+    assert report.ok and not report.widened
+
+
+def test_disk_that_hangs_widens_the_stop_all_the_same(stop: Callable[..., Any]) -> None:
+    hangs = threading.Event()
+    try:
+        report = stop(
+            Fleet({"arm-1": ""}), Scope.named(["arm-9"]), deadline_s=1, remembers=lambda asked: hangs.wait(60)
+        )
+    finally:
+        hangs.set()
+    assert report.widened and set(report.stopped) == {"arm-1"}
+
+
 def test_remembered_cell_ends_with_the_answers_of_robots_without_one(stop: Callable[..., Any]) -> None:
     fleet = Fleet({"free-1": ""})
     report = stop(fleet, Scope(cell="cell-1"), ("free-1",), deadline_s=20, remembers=lambda asked: True)

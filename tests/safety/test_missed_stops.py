@@ -381,6 +381,18 @@ def test_signed_stop_locks_and_unsigned_ones_in_an_answer_do_not_where_signature
     assert away.epochs() == (epoch,)
 
 
+def test_stops_that_do_not_count_hide_no_later_one_of_the_same_answer(
+    bus: StopBus, join: Join, estop_key: Ed25519PrivateKey, signed_only: Callable[[], StopRules]
+) -> None:
+    there, away = join("there"), join("away", rules=signed_only)
+    away.link.change(False)
+    unsigned = [bus.stop() for _ in range(missed_stops.REFUSED_MAX - 1)]
+    epoch = bus.stop(key=estop_key)
+    eventually(lambda: {*unsigned, epoch} <= set(there.epochs()), what="all of them lock where every source may stop")
+    away.link.change(True)
+    eventually(lambda: away.epochs() == (epoch,))
+
+
 def test_unsigned_stop_in_an_answer_does_not_lock_where_only_some_may_stop(bus: StopBus, join: Join) -> None:
     _, away, _ = locked_and_cut_off(bus, join, rules=lambda: StopRules(allow=("safety-*",), keys=()))
     away.link.change(True)

@@ -15,7 +15,7 @@ from typing import Any
 from strands_robots.mesh.context import Context
 from strands_robots.mesh.rpc import Requester
 from strands_robots.mesh.transport.zenoh_config import DISCOVERY_S
-from strands_robots.safety.scope import WIDEN_S, KnownRobots, Remembers, Scope, report_widened
+from strands_robots.safety.scope import KnownRobots, Remembers, Scope, report_widened
 from strands_robots.utils import RESERVED_IDS
 
 ESTOP = "estop"
@@ -82,7 +82,7 @@ class ScopedStop:
                 told = received
                 on_answers([each for each in replies if each["type"] == "response"])
                 inside = any(kind == "response" and self._means(name) for name, kind in received)
-            if now >= known_at + WIDEN_S and not (inside or known.known):
+            if now >= known_at + known.widens_after_s and not inside:
                 self.widened = True
                 report_widened(self.epoch, self.scope)
                 return False

@@ -38,6 +38,7 @@ from strands_robots.safety.roster_inbox import OnReport, RosterInbox
 from strands_robots.safety.roster_report import STOP_ROSTER
 from strands_robots.safety.scope import (
     EVERY_ROBOT,
+    READ_S,
     WIDEN_S,
     KnownRobots,
     Remembers,
@@ -570,10 +571,9 @@ class _Running:
     @property
     def widens_at(self) -> float:
         """Monotonic s at which it widens, unless a robot in its scope answers."""
-        scoped = self.left is not None and not (
-            self.scope.everything or self.widened or (self.known is not None and self.known.known)
-        )
-        return self.left + WIDEN_S if scoped and self.left is not None else float("inf")
+        if self.left is None or self.scope.everything or self.widened:
+            return float("inf")
+        return self.left + (READ_S if self.known is None else self.known.widens_after_s)
 
     @property
     def settled_scope(self) -> bool:
@@ -592,8 +592,8 @@ class _Running:
 
     def ends_at(self, deadline_s: float) -> float:
         """Return the monotonic s of its deadline, with time to widen once it has left."""
-        left = self.started if self.scope.everything or self.left is None else self.left
-        return max(self.started + deadline_s, left + 2 * WIDEN_S * (not self.scope.everything))
+        widens_at = self.widened_at if self.widened else self.widens_at
+        return max(self.started + deadline_s, widens_at + WIDEN_S if widens_at < float("inf") else 0.0)
 
     @property
     def complete(self) -> bool:

@@ -87,8 +87,8 @@ BUCKETS = 32
 BUCKET_CAPACITY = 2
 """Answers of the sources that share a bucket: 4 MiB in all at their bound, whoever sends how many."""
 
-REFUSED_MAX = 4
-"""Stops of one answer that do not count, after which the rest of it is not read."""
+REFUSED_MAX = 16
+"""Stops of one answer that do not count, after which the rest of it is not read unless a known key signed it."""
 
 RETRY_S = 0.1
 """Wait after a step that failed."""
@@ -509,19 +509,23 @@ class MissedStops:
             if self._answerer.waits:
                 self._note_given(source, fields, rows)
             if self._asker.listens(self._clock()):
-                self._learn(source, rows)
+                self._learn(source, rows, fields)
+
+    def _proven(self, source: str, fields: Mapping[str, Any]) -> bool:
+        """Return True for an answer that a known key signed."""
+        key = ed25519.decode(fields.get("key"), 32)
+        known = key is not None and self._port.knows_key(source, key)
+        return known and own_key(Purpose.MISSED_STOPS, source, fields) == key
 
     def _note_given(self, source: str, fields: Mapping[str, Any], rows: Sequence[_Row]) -> None:
         """Count an answer that another process gave, if a known key signed it."""
-        nonce, key = fields.get("nonce"), ed25519.decode(fields.get("key"), 32)
-        if not isinstance(nonce, str) or key is None or not self._port.knows_key(source, key):
-            return
-        if own_key(Purpose.MISSED_STOPS, source, fields) == key:
+        nonce = fields.get("nonce")
+        if isinstance(nonce, str) and self._proven(source, fields):
             told = {(each.source, each.payload) for each in rows}
             epochs = [each.epoch for each in self._port.originals() if (each.source, each.payload) in told]
             self._answerer.given(nonce, source, epochs)
 
-    def _learn(self, answerer: str, rows: Collection[_Row]) -> None:
+    def _learn(self, answerer: str, rows: Collection[_Row], fields: Mapping[str, Any]) -> None:
         refused = 0
         for each in rows:
             digest = hashlib.sha256(each.source.encode("utf-8", "replace") + b"\0" + each.payload).digest()
@@ -533,7 +537,7 @@ class MissedStops:
                 self._judged[digest] = each.age_s if counts else float("-inf")
             if not counts:
                 refused += 1
-                if refused >= REFUSED_MAX:
+                if refused == REFUSED_MAX and not self._proven(answerer, fields):
                     logger.info("An answer of %s is not read on: its stops do not count.", shown(answerer))
                     return
 
