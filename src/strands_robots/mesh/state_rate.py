@@ -1,4 +1,4 @@
-"""Rate of a robot's state: ten a second while it moves, one a second while it is idle.
+"""Rate of a robot's state: 10 Hz while it moves, 1 Hz while it is idle.
 
 More than 40 robots of a process that publish ten a second each pass what Zenoh carries on a link and states are lost.
 """
@@ -63,7 +63,7 @@ class StateRate:
             self._wake()
 
     def look(self) -> None:
-        """Publish at once after a halt and a change of the lockouts; a permit shows that it moves on."""
+        """Publish at once after a halt or a change of the lockouts."""
         halts, given = self._halts(), self._gate.given
         if halts != self._seen_halts:
             self._seen_halts = halts
@@ -95,7 +95,7 @@ class StateRate:
 
 
 class StateRates:
-    """The rates of a process, looked at by one job: a hundred idle robots cost one wake-up together."""
+    """The rates of a process, looked at by one job for all of its robots."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()

@@ -38,6 +38,7 @@ PARSERS = {
     "dashboard/poses.py": OWN_FILE,
     "dashboard/server.py": "WebSocket messages of 64 KiB at most, and the audit of this machine",
     "device_connect/backends/config.py": OWN_FILE,
+    "device_connect/backends/dial.py": BOUNDED,
     "device_connect/backends/jsonrpc.py": BOUNDED,
     "device_connect/beat.py": BOUNDED,
     "device_connect/client.py": BOUNDED,

@@ -127,7 +127,7 @@ def test_expected_but_silent_robot_is_named_with_exit_3(site: Site, arms: tuple[
     result = site.run("estop", "arm-1", "arm-9", "--deadline", "0.6")
     assert result.returncode == 3
     assert "arm-9" in result.stdout and "NO ANSWER" in result.stdout
-    assert "arm-9 gave no answer" in result.stderr
+    assert "NO ANSWER: arm-9." in result.stderr
     assert site.signed()[0] == 0
 
 

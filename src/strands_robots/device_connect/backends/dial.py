@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import re
 import socket
 import ssl
 from urllib.parse import urlsplit
 
+from ...bounded_json import json_object
 from .config import ZENOH_PORT, LinkConfig, host_of
 from .reasons import reason_of
 from .tls import client_context
@@ -74,9 +74,8 @@ def _greeting_problem(raw: socket.socket, link: LinkConfig) -> str:
             said += more
     if not said.startswith(b"INFO "):
         return "what listens there is no NATS server"
-    try:
-        server = json.loads(said[5:].partition(b"\r\n")[0])
-    except ValueError:
+    server = json_object(said[5:].partition(b"\r\n")[0])
+    if not server:
         return "what listens there is no NATS server"
     wanted = bool(server.get("tls_required"))
     if link.encrypted and not (wanted or server.get("tls_available")):
