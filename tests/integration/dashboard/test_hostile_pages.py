@@ -146,7 +146,7 @@ def test_page_works_by_keyboard_alone(page: Any, served: ServedPage) -> None:
     served.robot("arm-1")
     page.locator(".card").wait_for()
     reached = set()
-    for _ in range(14):
+    for _ in range(20):
         page.keyboard.press("Tab")
         reached.add(page.evaluate("document.activeElement.id || document.activeElement.className"))
     assert {"stop", "search", "filter", "sort", "name", "halt", "stop-one"} <= reached

@@ -1,7 +1,5 @@
 // Every English sentence of the views of history and cameras, and of the filter.
 export const H = {
-  links: { "#/": "Robots", "#/history": "History", "#/cameras": "Cameras" },
-  views: "Views",
   title: "The fleet over time",
   windows: { 300: "5 min", 900: "15 min", 3600: "1 h" },
   window: "Time",

@@ -1,9 +1,8 @@
 import { CamerasView } from "./cameras.js";
 import { FleetView } from "./cards.js";
 import { Channel, State } from "./connection.js";
-import { el, keepsSpace, setText, typing } from "./dom.js";
+import { keepsSpace, setText, typing } from "./dom.js";
 import { Fleet } from "./fleet.js";
-import { H } from "./history-strings.js";
 import { HistoryView } from "./history.js";
 import { Resume } from "./resume.js";
 import { RobotView } from "./robot.js";
@@ -22,7 +21,6 @@ const cameras = new CamerasView(fleet, state);
 const others = { "#/history": history, "#/cameras": cameras };
 const resume = new Resume(fleet, state);
 const views = document.getElementById("views");
-for (const [href, text] of Object.entries(H.links)) views.append(el("a", { href, text }));
 const main = document.getElementById("main");
 
 // Space is STOP, wherever the focus is but in a text, on a list or on a link, whose own key it is.
