@@ -15,7 +15,7 @@ from strands_robots.device_connect.safety_controller import envelope, outcome_en
 from strands_robots.envelope import Envelope, success
 from strands_robots.safety.controller import DEADLINE_S, SafetyController
 from strands_robots.safety.orders import new_epoch
-from strands_robots.safety.roster_search import RosterSearch
+from strands_robots.safety.roster_search import RosterSearch, stop_and_search
 from strands_robots.safety.scope import Scope
 from strands_robots.serving.stop_arguments import noted, stop_reason, stop_robot, stop_scope
 from strands_robots.serving.verbs import unknown_arguments
@@ -99,18 +99,8 @@ class SafetyControllerDriver(DeviceDriver):  # type: ignore[misc]  # the framewo
         controller = self.controller
         if controller.network is None:
             return envelope(controller.stop(expected, reason, deadline_s=within, scope=scope))
-        estop_id = new_epoch()
-        search = RosterSearch(controller, estop_id, controller.network, scope=scope, named=expected)
-        report = controller.stop(
-            expected,
-            reason,
-            deadline_s=within,
-            estop_id=estop_id,
-            more=True,
-            on_progress=search.begin,
-            on_report=search.take,
-            scope=scope,
-        )
+        search = RosterSearch(controller, new_epoch(), controller.network, scope=scope, named=expected)
+        report = stop_and_search(controller, search, expected, reason, within)
         outcome = search.roster.outcome(report, replace(controller.sending, left=report.link))
         outcome.record(controller.controller_id)
         search.roster.remember(report)

@@ -8,7 +8,6 @@ peers that missed it.
 from __future__ import annotations
 
 import contextlib
-import json
 import logging
 import secrets
 import time
@@ -391,7 +390,9 @@ class FleetSafety:
         if peer_id in scope.only:
             # A robot of a world is locked with it.
             scope = replace(scope, only=scope.only | {context.peer_id})
-        original = json.dumps(body).encode()
+        original = None
+        with contextlib.suppress(wire.WireError):  # too long to be passed on
+            original = wire.encode(body, topics.BY_NAME["estop"].max_bytes)
         self._adapter.begin(
             StopOrder(
                 notice.estop_id,
@@ -404,7 +405,7 @@ class FleetSafety:
                 wire.finite(body.get("pressed_at")),
                 scope=scope,
                 # Others that it names may have missed theirs.
-                original=original if len(original) <= topics.BY_NAME["estop"].max_bytes else None,
+                original=original,
                 network=self.network,
             )
         )

@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Mapping
 from typing import Protocol
 
 from strands_robots.safety.answers import Answer
-from strands_robots.safety.controller import Progress
+from strands_robots.safety.controller import Progress, SafetyController, StopReport
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.roster_report import RosterReport
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
@@ -51,7 +51,8 @@ class RosterSearch:
         named: Collection[str] = (),
     ) -> None:
         self.roster, self.begun = StopRoster(network, named, scope), False
-        self._controller, self._id, self._look_up = controller, estop_id, look_up
+        self.estop_id, self.scope = estop_id, scope
+        self._controller, self._look_up = controller, look_up
         self._answered: Mapping[str, Answer] = {}
         self._lock = threading.Lock()
         self._left = 1 if look_up is None else 2
@@ -94,4 +95,20 @@ class RosterSearch:
         with self._lock:
             self._left -= done
             more = self._left > 0 or self.roster.incomplete(self._answered)
-            self._controller.expect(self._id, self.roster.awaited(self._answered), more=more)
+            self._controller.expect(self.estop_id, self.roster.awaited(self._answered), more=more)
+
+
+def stop_and_search(
+    controller: SafetyController, search: RosterSearch, expected: Collection[str], reason: str, deadline_s: float
+) -> StopReport:
+    """Send the stop of ``search``, which goes on while it is repeated; return the report."""
+    return controller.stop(
+        expected,
+        reason,
+        deadline_s=deadline_s,
+        estop_id=search.estop_id,
+        more=True,
+        on_progress=search.begin,
+        on_report=search.take,
+        scope=search.scope,
+    )

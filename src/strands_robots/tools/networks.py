@@ -20,7 +20,7 @@ from strands_robots.envelope import Envelope, error, success
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety.orders import new_epoch
 from strands_robots.safety.peer_answers import enrolled_peers, stop_distrust
-from strands_robots.safety.roster_search import RosterSearch
+from strands_robots.safety.roster_search import RosterSearch, stop_and_search
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.safety.silence import Sending
 from strands_robots.safety.statements import ALARM
@@ -405,16 +405,7 @@ def stop_and_lock(fleet: FleetClient, reason: str, scope: Scope = EVERY_ROBOT) -
             seen = pool.submit(fleet.peers)
             found = lambda: {peer.id: (peer.stop_verb is not None, peer.cell) for peer in seen.result()}  # noqa: E731
             search = RosterSearch(controller, estop_id, network_of(fleet.link), found, scope)
-            report = controller.stop(
-                (),
-                reason,
-                deadline_s=ESTOP_S,
-                estop_id=estop_id,
-                more=True,
-                on_progress=search.begin,
-                on_report=search.take,
-                scope=scope,
-            )
+            report = stop_and_search(controller, search, (), reason, ESTOP_S)
             sending = replace(controller.sending, left=report.link)
         finally:
             controller.close()
