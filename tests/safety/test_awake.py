@@ -12,8 +12,9 @@ from typing import Any
 import pytest
 from fixtures.waiting import eventually
 
+from strands_robots.device_connect.stop_link import LEASE_MS
 from strands_robots.safety import awake as module
-from strands_robots.safety.awake import HOLD_S, PAUSE_S, AwakeClock
+from strands_robots.safety.awake import BEAT_S, HOLD_S, LONG_HOLD_S, PAUSE_S, AwakeClock
 from strands_robots.safety.gate import MotionGate
 from strands_robots.safety.state_files import uptime
 
@@ -52,6 +53,16 @@ def test_first_look_after_a_pause_holds_every_gate(clock: AwakeClock, hands: Han
     hands.now += HOLD_S
     assert [permit.held for permit in permits] == [False, False]
     assert (clock.pauses, gates[0].holds) == (1, 1)
+
+
+def test_pause_in_which_peers_may_have_given_up_the_links_holds_longer(clock: AwakeClock, hands: Hands) -> None:
+    permit = MotionGate(awake=clock).permit("move")
+    hands.now += (LEASE_MS / 1000) * 3 / 4  # Zenoh keeps a link alive four times in a lease
+    held = 0.0
+    while permit.held:
+        hands.now += BEAT_S
+        held += BEAT_S
+    assert held == pytest.approx(LONG_HOLD_S)
 
 
 def test_motion_that_writes_once_a_second_is_not_held_while_the_thread_looks(clock: AwakeClock, hands: Hands) -> None:

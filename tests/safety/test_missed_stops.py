@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -503,6 +504,20 @@ def test_question_because_a_peer_is_back_waits_for_the_others_and_is_not_put_off
     asker.want(10.0 + missed_stops.SETTLE_S)
     asker.want(10.1 + missed_stops.SETTLE_S)
     assert asker.due == 10.0 + missed_stops.SETTLE_S
+
+
+def test_question_that_may_have_gone_over_a_lost_link_is_soon_asked_again_but_not_each_time() -> None:
+    asker, asked = Asker(), list[float]()
+    for step in range(1200):
+        now = step / 100
+        asker.want(now, link_back=step > 0)  # a link that comes and goes
+        if now >= asker.due:
+            asker.asked(now)
+            asked.append(now)
+    early = [later for before, later in pairwise(asked) if later - before < missed_stops.ASK_EVERY_S - 0.02]
+    assert early[0] == pytest.approx(missed_stops.SETTLE_S, abs=0.02)
+    assert len(early) <= 1 + 12 / missed_stops.LOST_EVERY_S
+    assert len(asked) <= 12 / missed_stops.ASK_EVERY_S + len(early) + 1
 
 
 def test_process_whose_robots_are_all_locked_asks_later_and_seldom() -> None:

@@ -23,9 +23,14 @@ PAUSE_S = 0.5
 HOLD_S = 0.3
 """Seconds for which motions hold from the first look after that."""
 
-LINKS_LOST_S = 4.0
+LINKS_LOST_S = 2.75
+"""Pause from which peers may have given up the e-stop links of this process.
+
+Their lease is 4 s and begins with the last keep-alive, which may lie a second before the pause.
+"""
+
 LONG_HOLD_S = 2.0
-"""Hold after a pause as long as the lease of an e-stop link, whose peers have given it up and dial anew."""
+"""Hold after such a pause: links are dialled anew before the missed stops can be asked for."""
 
 BEAT_S = 0.1
 """Seconds between two looks of the thread of its own."""

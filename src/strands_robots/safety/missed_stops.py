@@ -59,6 +59,12 @@ LOCKED_WAIT_S = 2.0
 SETTLE_S = 0.15
 """Wait of a question because one peer is back: others follow, and the next question is a second off."""
 
+LOST_EVERY_S = 5.0
+"""Least time between two questions that do not wait for that second.
+
+One that left just before a link was back may have gone over the link that was lost, and reached nobody.
+"""
+
 ASK_AGAIN_S = 2.0
 ASKS_MAX = 5
 """Questions after one reason: two, and more only while answers had to be dropped."""
@@ -172,7 +178,7 @@ class Asker:
     """Times of the questions, in monotonic s."""
 
     def __init__(self) -> None:
-        self._due = self._asked = float("-inf")
+        self._due = self._asked = self._lost = float("-inf")
         self._asks = 0
         self.listens_until = float("-inf")
 
@@ -181,14 +187,18 @@ class Asker:
         """The moment of the next question; infinite where none is wanted."""
         return self._due if self._asks else float("inf")
 
-    def want(self, now: float, later_s: float = 0.0) -> None:
+    def want(self, now: float, later_s: float = 0.0, *, link_back: bool = False) -> None:
         """Ask, at once or as soon as a second has passed since the last question.
 
         Args:
             later_s: seconds that a process whose robots are all locked waits; it does so at most every five seconds.
+            link_back: a link is back, so a question of the last second may be lost and is soon asked again.
         """
         if not later_s:
             soonest = max(now, self._asked + ASK_EVERY_S)
+            if link_back and now < soonest and now - self._lost >= LOST_EVERY_S:
+                self._lost = now
+                soonest = now + SETTLE_S
             self._due = min(self._due, soonest) if self._asks else soonest
         elif not self._asks:
             self._due = max(now + later_s, self._asked + LOCKED_EVERY_S)
@@ -464,7 +474,8 @@ class MissedStops:
             self._back = self._back or reason == BACK
             logger.info("Asking for the stops missed: %s.", reason)
             settle = SETTLE_S if reason == PEER_BACK else 0.0
-            self._asker.want(self._clock() + settle, self._chance() * LOCKED_WAIT_S if self._port.locked() else 0.0)
+            later_s = self._chance() * LOCKED_WAIT_S if self._port.locked() else 0.0
+            self._asker.want(self._clock() + settle, later_s, link_back=reason in (BACK, PEER_BACK))
         self._take_questions()
         if self._asker.listens(self._clock()):
             self._take_answers()
