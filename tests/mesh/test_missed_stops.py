@@ -14,7 +14,7 @@ from fixtures.mesh_robots import Arm
 from fixtures.waiting import eventually
 from tests.mesh.peers import Fleet, received
 
-from strands_robots.mesh import core, late_peers, safety
+from strands_robots.mesh import late_peers, missed, safety
 from strands_robots.mesh.core import Mesh
 from strands_robots.safety import ed25519
 from strands_robots.safety.awake import AWAKE, PAUSE_S
@@ -28,7 +28,7 @@ from strands_robots.safety.statements import Purpose
 def brief(peers: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
     """Collect answers for a moment only, and look at links often."""
     monkeypatch.setattr(safety, "COLLECT_S", 0.2)
-    monkeypatch.setattr(core, "TOKENS_HZ", 50.0)
+    monkeypatch.setattr(missed, "LOOK_HZ", 50.0)
     monkeypatch.setattr(late_peers, "SPREAD_S", 0.0)
 
 

@@ -254,14 +254,15 @@ def test_bridge_declares_and_watches_tokens_when_its_local_leg_comes_up_late(
     context = Context("console", registry, AuditThrottle("console"), Identity(), transport=both)
     publisher = PresencePublisher(context, "robot", dict)
     publisher.start()
-    publisher.look()
+    publisher.announce()
     late.up = True
     eventually(lambda: both.session_id)
+    assert publisher.listener is not None
+    publisher.listener.judge_tokens()
     for _ in range(2):
-        publisher.look()
+        publisher.announce()
     assert shown == [(topics.token("console", str(both.session_id)), True)]
     other.declare_token(topics.token("arm-1", "aa")).undeclare()
-    assert publisher.listener is not None
     publisher.listener.judge_tokens(0.0)
     assert not reachable(registry)
     shown.clear()

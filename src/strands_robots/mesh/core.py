@@ -56,9 +56,8 @@ logger = logging.getLogger(__name__)
 LOOP_JOIN_TIMEOUT_S = 2.0
 """Seconds that :meth:`Mesh.stop` waits, in all, for what it started."""
 
-LATE_HZ = 2.0
+LATE_HZ, REST_HZ = 2.0, 0.2
 HEARING_HZ = 2.0
-TOKENS_HZ = 5.0
 DELIVERIES_MAX = 1024
 """Messages of the user's subscriptions that wait for their callbacks."""
 
@@ -268,7 +267,7 @@ class Mesh(SensorLoopsMixin):
             (topics.check_in_answer("*"), self._safety.on_check_in_answer),
         ):
             self._handles.append(transport.declare_subscriber(key, receive))
-        self._missed = missed = MeshMissedStops.joined_by(context, self._adapter)
+        self._missed = MeshMissedStops.joined_by(context, self._adapter)
         if self.robot is not None:
             if self._adapter.needs_check_in:
                 controllers = topics.check_in("*")
@@ -279,17 +278,15 @@ class Mesh(SensorLoopsMixin):
         every, rates = self._scheduler.every, topics.BY_NAME
         if self.robot is not None:
             self.add_robot_sensors()
-        every("describe", rates["presence"].rate_hz, self._presence.refresh)
         if self.robot is not None:
             self._report_states(self.robot.gate)
+        else:
+            every("describe", rates["presence"].rate_hz, self._presence.refresh)
         if self.children is not None:
             every("children", rates["presence"].rate_hz, self.children.refresh)
             every("children's presence", rates["presence"].rate_hz, self.children.announce, quick=True)
-        every("tokens", TOKENS_HZ, self._presence.look, quick=True)
-        every("missed stops", TOKENS_HZ, lambda: missed.look(context), quick=True)
         every("hearing", HEARING_HZ, self._hearing.look, quick=True)
-        # A stop that is published again may wait for its turn, and behind no robot.
-        every("late peers", LATE_HZ, self._safety.late.look, queue="late peers")
+        self._look_for_late_peers()
         frames = frames_of(self.robot)
         if frames is not None:
             every("camera", settings.number("STRANDS_MESH_CAMERA_HZ"), CameraPublisher(context, frames).publish)
@@ -334,9 +331,32 @@ class Mesh(SensorLoopsMixin):
         if alive:
             logger.warning("%s left the mesh with loops still running: %s.", self.peer_id, ", ".join(alive))
 
+    def _look_for_late_peers(self) -> None:
+        late, pace = self._safety.late, self._scheduler.pace
+
+        def look() -> None:
+            late.look()
+            # In this order, so that what is noted meanwhile is looked for in time.
+            pace("late peers", REST_HZ)
+            if late.waits:
+                pace("late peers", LATE_HZ)
+
+        late.on_noted = lambda: pace("late peers", LATE_HZ)
+        # A stop that is published again may wait for its turn, and behind no robot.
+        self._scheduler.every("late peers", LATE_HZ, look, queue="late peers")
+
     def _report_states(self, gate: MotionGate) -> None:
-        hz = topics.BY_NAME["state"].rate_hz
-        rate = StateRate(gate, self._adapter.epochs, lambda: self._scheduler.pace("state", hz, soon=True))
+        hz, describe_hz = topics.BY_NAME["state"].rate_hz, topics.BY_NAME["presence"].rate_hz
+
+        def hurry() -> None:
+            self._scheduler.pace("state", hz, soon=True)
+            self._scheduler.pace("describe", describe_hz, soon=True)
+
+        rate = StateRate(gate, self._adapter.epochs, hurry)
+
+        def describe() -> None:
+            self._presence.refresh()
+            self._scheduler.pace("describe", describe_hz if rate.active else IDLE_HZ)
 
         def publish() -> None:
             body = self._state.read()
@@ -345,6 +365,7 @@ class Mesh(SensorLoopsMixin):
                 rate.published(body)
             self._scheduler.pace("state", hz if rate.active else IDLE_HZ)
 
+        self._scheduler.every("describe", describe_hz, describe)
         self._scheduler.every("state", hz, publish)
         STATE_RATES.join(rate)
         unwatch = gate.watch(rate.begins)

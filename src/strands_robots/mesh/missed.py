@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 from strands_robots.mesh import session, topics, wire
 from strands_robots.mesh.context import Context
 from strands_robots.mesh.safety_adapter import SafetyAdapter
+from strands_robots.mesh.scheduler import repeat
 from strands_robots.mesh.transport import Declaration, Sample, Transport, TransportError, undeclare
 from strands_robots.safety.awake import AWAKE
 from strands_robots.safety.missed_stops import ANSWER, ANSWER_MAX_BYTES, PEER_BACK, QUESTION, MissedStops
@@ -18,6 +19,9 @@ from strands_robots.safety.orders import MISSED, StopOrder, StopRefused, derived
 from strands_robots.safety.plane import SafetyPlane
 from strands_robots.safety.question_ports import Member, RobotsPort, Stated
 from strands_robots.safety.statements import Purpose
+
+LOOK_HZ = 5.0
+"""Looks a second for a link that came back."""
 
 TOPICS = {QUESTION: topics.missed_ask, ANSWER: topics.missed_answer}
 
@@ -105,6 +109,7 @@ class MeshMissedStops:
         self._missed = MissedStops(MeshPort(adapter, lambda: self._peers, transport), parse=_fields_of)
         self._declared: list[Declaration] = []
         self._end_watch: Callable[[], None] = lambda: None
+        self._end_looks: Callable[[], None] = lambda: None
 
     @classmethod
     def joined_by(cls, context: Context, adapter: SafetyAdapter) -> MeshMissedStops:
@@ -133,16 +138,15 @@ class MeshMissedStops:
             if self._peers or self._all.pop((self._transport, adapter.plane), None) is None:
                 return
         self._end_watch()
+        self._end_looks()
         undeclare(self._declared)
         self._missed.close()
 
-    def look(self, context: Context) -> None:
-        """Ask where a link came back or stops can be received again, for our first peer.
+    def _look(self) -> None:
+        """Ask where a link came back or stops can be received again.
 
         Motions hold where no link was left. Where others stayed, the one that came back may be that of a stranger.
         """
-        if context.peer_id != next(iter(self._peers), None):
-            return
         # Read first: a link that comes back between the two asks again.
         rejoined, back = self._transport.rejoined(), self._transport.links_back()
         refused = topics.estop() in self._transport.refusals()
@@ -156,6 +160,7 @@ class MeshMissedStops:
         for event, topic in TOPICS.items():
             self._declared.append(self._transport.declare_subscriber(topic("*"), self._receiver(event)))
         self._end_watch = AWAKE.watch(lambda: self._missed.ask("the process did not run for a while"))
+        self._end_looks = repeat("missed stops", LOOK_HZ, self._look)
 
     def _receiver(self, event: str) -> Callable[[Sample], None]:
         def receive(sample: Sample) -> None:

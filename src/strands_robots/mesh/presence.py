@@ -13,12 +13,16 @@ from strands_robots.mesh import session as mesh_session
 from strands_robots.mesh import topics, wire
 from strands_robots.mesh.context import Context
 from strands_robots.mesh.registry import PeerRegistry
+from strands_robots.mesh.scheduler import repeat
 from strands_robots.mesh.throttle import TroubleLog
 from strands_robots.mesh.transport import Declaration, Sample, Transport, TransportError, undeclare
 from strands_robots.mesh.wire_identity import IdentityError
 from strands_robots.safety.sightings import sightings
 
 logger = logging.getLogger(__name__)
+
+LOOK_HZ = 5.0
+"""Looks a second for tokens that went and peers that fell silent."""
 
 DESCRIBE_S = 0.2
 """Seconds that the first heartbeat waits for the description of the peer."""
@@ -57,6 +61,7 @@ class PresencePublisher:
         self.described = threading.Event()
         self.listener: PresenceListener | None = None
         self._token: Declaration | None = None
+        self._declaring = threading.Lock()
         self._host = socket.gethostname()
 
     def start(self) -> None:
@@ -66,22 +71,21 @@ class PresencePublisher:
 
     def _declare_token(self) -> None:
         transport, session = self._context.transport, self._context.session_id()
-        if self._token is None and session is not None and transport is not None:
-            self._token = transport.declare_token(topics.token(self._context.peer_id, session))
+        if self._token is not None or session is None or transport is None:
+            return
+        with self._declaring:
+            # A heartbeat may be under way while the peer leaves.
+            if self._token is None and self.listener is not None:
+                self._token = transport.declare_token(topics.token(self._context.peer_id, session))
 
     def stop(self) -> None:
-        token, self._token = self._token, None
-        listener, self.listener = self.listener, None
+        with self._declaring:
+            listener, self.listener = self.listener, None
+            token, self._token = self._token, None
         if token is not None:
             undeclare([token])
         if listener is not None:
             listener.left_by(self._context)
-
-    def look(self) -> None:
-        """Declare our token once there is a session; judge others."""
-        self._declare_token()
-        if self.listener is not None:
-            self.listener.look(self._context)
 
     def refresh(self) -> None:
         """Read the description anew; a robot that fails is announced by name alone."""
@@ -93,7 +97,8 @@ class PresencePublisher:
         self.described.set()
 
     def announce(self) -> None:
-        """Publish one heartbeat."""
+        """Publish one heartbeat, after our token once there is a session."""
+        self._declare_token()
         context = self._context
         body = {
             **self._facts,
@@ -132,6 +137,7 @@ class PresenceListener:
         self._judged_later = transport.lost_link_at() is not None
         self._anchored_at: float | None = None
         self._declared: list[Declaration] = []
+        self._end_looks: Callable[[], None] = lambda: None
 
     @classmethod
     def joined_by(cls, context: Context) -> PresenceListener:
@@ -151,6 +157,7 @@ class PresenceListener:
                 listener._declared.append(transport.declare_subscriber(topics.presence("*"), listener.on_presence))
                 cls._all[key] = listener
                 listener._watch_tokens()
+                listener._end_looks = repeat("tokens", LOOK_HZ, listener._look)
         return listener
 
     def left_by(self, context: Context) -> None:
@@ -159,13 +166,13 @@ class PresenceListener:
             self._members = {peer: each for peer, each in self._members.items() if each is not context}
             if not self._members:
                 del self._all[self._transport, self._registry]
+                self._end_looks()
                 undeclare(self._declared)
 
-    def look(self, context: Context) -> None:
-        """Judge tokens and drop silent peers, for our first peer."""
-        if context is next(iter(self._members.values()), None):
-            self.judge_tokens()
-            self._registry.prune()
+    def _look(self) -> None:
+        """Judge tokens and drop silent peers."""
+        self.judge_tokens()
+        self._registry.prune()
 
     def _watch_tokens(self) -> None:
         if not self._watches and self._transport.session_id is not None:

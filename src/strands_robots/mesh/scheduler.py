@@ -306,3 +306,15 @@ class Scheduler:
             self._jobs.clear()
             self._timer.remove(jobs)
         return self._timer.wait(jobs, timeout)
+
+
+def repeat(name: str, hz: float, run: Callable[[], None]) -> Callable[[], None]:
+    """Run a quick job for all peers of the process; return its end, which waits for nothing."""
+    scheduler = Scheduler(name)
+    scheduler.every(name, hz, run, quick=True)
+    scheduler.start()
+
+    def end() -> None:
+        scheduler.stop(0.0)
+
+    return end

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from strands_robots.contract import RUNNING
-from strands_robots.mesh.scheduler import Scheduler
+from strands_robots.mesh.scheduler import repeat
 from strands_robots.safety.gate import MotionGate
 
 IDLE_HZ = 1.1
@@ -100,24 +100,22 @@ class StateRates:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._rates: tuple[StateRate, ...] = ()
-        self._scheduler: Scheduler | None = None
+        self._end: Callable[[], None] | None = None
 
     def join(self, rate: StateRate) -> None:
         """Look at ``rate`` from now on."""
         with self._lock:
             self._rates = (*self._rates, rate)
-            if self._scheduler is None:
-                self._scheduler = Scheduler("states")
-                self._scheduler.every("look", LOOK_HZ, self._look, quick=True)
-                self._scheduler.start()
+            if self._end is None:
+                self._end = repeat("states", LOOK_HZ, self._look)
 
     def leave(self, rate: StateRate) -> None:
         """Look at ``rate`` no more."""
         with self._lock:
             self._rates = tuple(each for each in self._rates if each is not rate)
-            ending, self._scheduler = (None, self._scheduler) if self._rates else (self._scheduler, None)
-        if ending is not None:
-            ending.stop(0.0)
+            end, self._end = (None, self._end) if self._rates else (self._end, None)
+        if end is not None:
+            end()
 
     def _look(self) -> None:
         for rate in self._rates:
