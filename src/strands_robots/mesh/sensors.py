@@ -17,7 +17,7 @@ import shutil
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +37,7 @@ logger = logging.getLogger(__name__)
 Provider = Callable[[], Mapping[str, Any] | None]
 
 STARTED = time.monotonic()
+HOST_FRESH_S = 0.5
 CAMERA_SPACING_S = 1.5 / (topics.BY_NAME["camera"].ceiling_hz or math.inf)
 """Between the frames of two cameras: the transport drops what comes closer on any of them."""
 
@@ -322,7 +323,16 @@ def health(own: Provider | None = None) -> dict[str, Any]:
     the share of memory in use, ``uptime_s`` of this process, ``temps`` in degrees Celsius by zone of the host and by
     motor.
     """
-    host: dict[str, Any] = {
+    host = _host_health(int(time.monotonic() / HOST_FRESH_S))
+    robot = (plain(own()) if own is not None else None) or {}
+    heat = robot.get("temps")
+    return {**host, **robot, "temps": {**host["temps"], **(heat if isinstance(heat, Mapping) else {})}}
+
+
+@lru_cache(maxsize=1)
+def _host_health(moment: int) -> dict[str, Any]:
+    """Return the health of the host: the robots of a process read it once for all."""
+    return {
         "battery_pct": None,
         "charging": None,
         "temps": _temperatures(),
@@ -331,9 +341,6 @@ def health(own: Provider | None = None) -> dict[str, Any]:
         "mem_pct": _memory_in_use(),
         "uptime_s": round(time.monotonic() - STARTED, 1),
     }
-    robot = (plain(own()) if own is not None else None) or {}
-    heat = robot.get("temps")
-    return {**host, **robot, "temps": {**host["temps"], **(heat if isinstance(heat, Mapping) else {})}}
 
 
 def _one_hand(read: Callable[[], Mapping[str, Any]], name: str) -> Mapping[str, Any] | None:
