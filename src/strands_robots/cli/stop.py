@@ -29,8 +29,7 @@ from strands_robots.cli.stop_report import (
 from strands_robots.envelope import Envelope, text_of
 from strands_robots.safety.controller import DEADLINE_S, Progress
 from strands_robots.safety.stop_roster import StopOutcome
-from strands_robots.serving.robot_verbs import WORLD_VERBS
-from strands_robots.serving.stop_arguments import stop_reason, stop_robot, stop_scope
+from strands_robots.serving.stop_arguments import robot_of_world, stop_reason, stop_robot, stop_scope
 from strands_robots.tools.networks import NativeMesh, silence_of, stop_found
 from strands_robots.tools.roster_verdict import OnOutcome, stop_outcome
 from strands_robots.utils import ValidationError, device_id, number
@@ -66,7 +65,7 @@ def stop(
     """Stop one robot, or all. Exits with 1 when one did not stop, with 3 when one is silent."""
     device, unread = stop_robot("DEVICE", None if everything else device)
     everything, device = not device, device or None
-    name = WORLD_VERBS["stop"].readable({"robot_name": one})[0]["robot_name"] if device else ""
+    name = robot_of_world({"robot_name": one})[0] if device else ""
     if one and not name:
         unread = unread or "--robot names no robot of a DEVICE's world, so all of it is stopped"
     _say_ignored(screen, unread)

@@ -11,11 +11,8 @@ from typing import Any
 from strands_robots.envelope import Envelope
 from strands_robots.safety.orders import REASON_MAX
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
-from strands_robots.serving.robot_verbs import WORLD_VERBS
 from strands_robots.serving.verbs import unknown_arguments
 from strands_robots.utils import ValidationError, device_id
-
-_OF_ROBOT = WORLD_VERBS["stop"]
 
 
 def stop_reason(value: object) -> tuple[str, str]:
@@ -72,6 +69,15 @@ def stop_scope(only: object, cell: object) -> tuple[Scope, str]:
     return scope, "" if whole == names else "a robot of a world is locked with its whole world"
 
 
+def robot_of_world(given: Mapping[str, Any]) -> tuple[str, str]:
+    """Return ``robot_name``, the robot of a device's world that a stop means, empty for all of it, and a note."""
+    # A command that stops all leaves before the verbs are loaded.
+    from strands_robots.serving.robot_verbs import WORLD_VERBS  # noqa: PLC0415
+
+    arguments, unread = WORLD_VERBS["stop"].readable(given)
+    return str(arguments["robot_name"]), unread
+
+
 def noted(answer: Envelope, *notes: str) -> Envelope:
     """Return the answer to a stop with the notes on what was dropped."""
     said = _joined(*notes)
@@ -81,8 +87,8 @@ def noted(answer: Envelope, *notes: str) -> Envelope:
 def network_stop(given: Mapping[str, Any]) -> tuple[dict[str, str], str]:
     """Return ``robot`` and ``robot_name`` of a client's stop, and a note."""
     robot, unknown = stop_robot("robot", given.get("robot"))
-    of_world, unread = _OF_ROBOT.readable({name: value for name, value in given.items() if name != "robot"})
-    return {"robot": robot, "robot_name": of_world["robot_name"] if robot else ""}, _joined(unknown, unread)
+    name, unread = robot_of_world({name: value for name, value in given.items() if name != "robot"})
+    return {"robot": robot, "robot_name": name if robot else ""}, _joined(unknown, unread)
 
 
 def network_emergency_stop(given: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
