@@ -78,6 +78,13 @@ def test_narrower_ranges_bound_the_joints() -> None:
     assert (chain.joints[1].low, chain.joints[1].high) == (-0.5, 1.0)
 
 
+def test_model_whose_inertia_is_inferred_from_geoms_that_are_only_seen_is_planned_with() -> None:
+    seen = '<geom size=".02" contype="0" conaffinity="0"/>'
+    inferred = SLIDING_JAWS.replace('autolimits="true"', 'autolimits="true" inertiafromgeom="true"')
+    chain = chain_of(inferred.replace('<geom size=".02"/>', '<geom size=".02"/>' + seen))
+    assert chain.spares.model(1).nbody > chain.model.nbody
+
+
 def test_model_without_a_joint_is_refused_and_one_with_few_has_no_arm() -> None:
     with pytest.raises(ValidationError, match="no joint that could be moved to a position, and no actuator"):
         chain_of("<mujoco><worldbody><body><geom size='.1'/></body></worldbody></mujoco>")

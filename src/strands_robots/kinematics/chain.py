@@ -116,7 +116,7 @@ class Chain:
         try:
             self.model = model = spec.compile()
         except (ValueError, mujoco.FatalError) as exc:
-            raise ValidationError(f"model {label} does not compile: {' '.join(str(exc).split())[:300]}") from exc
+            raise _uncompiled(label, exc) from exc
         self.label = label
         self.table_z = 0.0 if table_z is None else table_z
         self._drives = drives(model)
@@ -126,7 +126,10 @@ class Chain:
             raise ValidationError(f"{label} has no joint that could be moved to a position{_actuators(model)}.")
         self._models_body = True
         self.floats = bool((model.jnt_type == _FREE).any())
-        self.spares = Spares(spec, name)
+        try:
+            self.spares = Spares(spec, name)
+        except (ValueError, mujoco.FatalError) as exc:
+            raise _uncompiled(label, exc) from exc
         self.objects: Mapping[int, str] = {}
         self._home = _home(model)
         data = self.data(self.rest)
@@ -344,6 +347,10 @@ def _ancestors(model: Any, body: int) -> set[int]:
         found.add(body)
         body = int(model.body_parentid[body])
     return found
+
+
+def _uncompiled(label: str, exc: Exception) -> ValidationError:
+    return ValidationError(f"model {label} does not compile: {' '.join(str(exc).split())[:300]}")
 
 
 def _home(model: Any) -> Floats:

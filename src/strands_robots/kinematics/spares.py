@@ -66,10 +66,20 @@ class Spares:
         for index in range(self._count, count):
             _wait(self._spec.worldbody.add_body(name=f"{_NAME} {index}", pos=[0, 0, -_AWAY_M * (1 + index)]))
         self._count = count
-        model = self._spec.compile()
+        model = self._compiled()
         for body in (held_body(model), *(body_of(model, index) for index in range(count))):
             _meets(model, body, bits=0)
         return model
+
+    def _compiled(self) -> Any:
+        try:
+            return self._spec.compile()
+        except ValueError:
+            if not self._spec.compiler.discardvisual:
+                raise
+        # A body whose inertia MuJoCo infers from all of its geoms needs those that are only seen.
+        self._spec.compiler.discardvisual = False
+        return self._spec.compile()
 
 
 def body_of(model: Any, index: int) -> int:
