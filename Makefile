@@ -10,6 +10,8 @@ DDS_TESTS := tests/integration/ros/test_dds.py tests/integration/ros/test_dds_se
   tests/integration/ros/test_rtps_bridge.py tests/ros/test_dds_types.py tests/ros/test_dds_security.py
 # Most tests wait for another process; a file stays on one worker, so that its own tests never meet.
 WORKERS := --numprocesses 4 --dist loadfile
+# These start more of them, or a browser. Reachy Mini's daemons take one fixed port, so theirs run one after another.
+PAIR := --numprocesses 2 --dist loadfile
 GL_PACKAGES := libegl1 libgl1 libgl1-mesa-dri libosmesa6
 
 help:  ## Show these targets
@@ -47,7 +49,8 @@ system:
 	@./scripts/dds-security.sh
 
 test-all: venv system  ## What needs Debian or npm packages besides
-	@./scripts/tests.sh $(BIN)/python -m system $(ARGS)
+	@./scripts/tests.sh $(BIN)/python -m system --ignore tests/integration/reachy $(PAIR) $(ARGS)
+	@./scripts/tests.sh $(BIN)/python -m system tests/integration/reachy $(ARGS)
 	@./scripts/tests.sh $(REAL_ARM)/python tests/integration/hardware $(ARGS)
 	@./scripts/tests.sh $(MODELS)/python tests/integration/simulation $(ARGS)
 	@./scripts/tests.sh .venv-mcp/bin/python tests/integration/mcp $(ARGS)
