@@ -48,6 +48,8 @@ class MeshFeed:
         # A stop waits for no other call.
         self._stops = ThreadPoolExecutor(PARALLEL, "dashboard-mesh-stop")
         mesh.subscribe("strands/*/state", self._take_state, "dashboard state")
+        # An idle robot's states are further apart than its heartbeats.
+        mesh.subscribe("strands/*/presence", self._take_presence, "dashboard presence")
         mesh.subscribe("strands/*/health", self._take_health, "dashboard load")
         mesh.subscribe("strands/*/safety/event", self._take_event, "dashboard events")
         self._thread = threading.Thread(target=self._look, name="dashboard-mesh", daemon=True)
@@ -124,8 +126,6 @@ class MeshFeed:
         )
         state, instruction = str(row.get("task_status", "idle")), str(row.get("instruction", ""))
         self._model.task(self.network, name, state=state, instruction=instruction)
-        if isinstance(row.get("age"), int | float) and row["age"] < LOOK_S:
-            self._model.sign_of_life(self.network, name)
 
     def _take_state(self, key: str, message: Mapping[str, Any]) -> None:
         name = str(message.get("peer_id", ""))
@@ -135,6 +135,11 @@ class MeshFeed:
         joints = message.get("joints")
         if isinstance(joints, Mapping):
             self._model.observe(self.network, name, numbers(joints))
+
+    def _take_presence(self, key: str, message: Mapping[str, Any]) -> None:
+        name = key.split("/")[-2]
+        if name in self._names and message.get("robot_id") == name:
+            self._model.sign_of_life(self.network, name)
 
     def _take_health(self, key: str, message: Mapping[str, Any]) -> None:
         name, load = key.split("/")[-2], numbers(message).get("cpu_load")
