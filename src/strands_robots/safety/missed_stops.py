@@ -57,7 +57,7 @@ LOCKED_WAIT_S = 2.0
 """Longest wait of such a process before it asks; drawn anew each time."""
 
 SETTLE_S = 0.15
-"""Wait of a question because one peer is back: others follow, and the next question is a second off."""
+"""Wait of a question because one peer, or a link, is back: others follow, and the next question is a second off."""
 
 LOST_EVERY_S = 5.0
 """Least time between two questions that do not wait for that second.
