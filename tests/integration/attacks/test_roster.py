@@ -27,6 +27,7 @@ AWAY_ON: list[tuple[Kind, Absence, str]] = [
     ("nats", "frozen", "console"),
     ("mesh", "frozen", "robots"),
     ("nats", "frozen long", "robots"),
+    ("zenoh d2d", "frozen long", "robots"),
     ("zenoh d2d", "cut off", "robots"),
     ("zenoh router", "cut off", "robots"),
     ("nats", "cut off", "robots"),
