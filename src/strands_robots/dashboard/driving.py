@@ -36,6 +36,9 @@ METRES = (0.1, 0.04, 0.015, 0.005)
 """Lengths of one stretch of a jog, tried from the longest: the way of each is checked by the robot's planner."""
 
 DRIVE_S = 20.0
+DRIVEN = f"a drive ends after {DRIVE_S:g} s; press again to go on."
+"""A base does not say whether its drive was halted meanwhile, so no second one follows by itself."""
+
 LINEAR_M_S, ANGULAR_RAD_S = 0.3, 0.8
 """Speed of a base at full jog speed."""
 
@@ -313,9 +316,12 @@ class HandControl:
                     return ""
                 problem = text_of(answer) if is_error(answer) else ""
                 if not problem:
-                    await self._under_way(held, jog, answer)
+                    ended = await self._under_way(held, jog, answer)
+                    if ended:
+                        return ended
                     break
-                if answer.get("code") is not None:
+                # A motion that had begun was ended by somebody: a shorter one would start the robot again.
+                if answer.get("code") is not None or "task_id" in answer:
                     return problem
             if problem:
                 return problem
@@ -323,18 +329,24 @@ class HandControl:
                 await jog.released.wait()
         return ""
 
-    async def _under_way(self, held: HeldRobot, jog: Jogging, answer: Envelope) -> None:
-        """Wait for the end of a stretch, or for the release."""
+    async def _under_way(self, held: HeldRobot, jog: Jogging, answer: Envelope) -> str:
+        """Wait for the end of a stretch, or for the release; return why the jog ends with it, or "".
+
+        Only a stretch that was completed is followed by another one: any other end may be a halt, a stop or a contact.
+        """
         task_id = answer.get("task_id")
         if not isinstance(task_id, str):
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(jog.released.wait(), DRIVE_S)
-            return
+            return "" if jog.released.is_set() or jog.axis.kind == "gripper" else DRIVEN
         params = {"task_id": task_id, "seconds": 5.0, **({"robot_name": jog.axis.part} if jog.axis.part else {})}
         while True:
             state = await self._until_release(held, jog, "wait", params, [])
-            if state is None or str(state.get("task_status", "")).lower() != "running":
-                return
+            status = "" if state is None else str(state.get("task_status", "")).lower()
+            if state is None or status == "completed":
+                return ""
+            if status != "running":
+                return text_of(state) or f"the motion ended as {shown(status)}"
 
     async def _until_release(
         self, held: HeldRobot, jog: Jogging, verb: str, params: Mapping[str, Any], begun: list[asyncio.Task[Envelope]]

@@ -312,6 +312,8 @@ class PageSession:
         if verb in STOPS:
             # Before anything else of the message is looked at.
             stopped, name = self._feed(key)
+            # Its next stretch may be on the way to a robot that stands between two of them.
+            self._control.release(key, "it was halted")
             return await stopped.stop(name)
         if not isinstance(params, dict):
             raise ValidationError(f"params must be an object, not {shown(params)}.")

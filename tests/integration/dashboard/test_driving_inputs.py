@@ -81,6 +81,20 @@ def test_gamepad_that_is_unplugged_stops_the_jog(cell: Any) -> None:
     eventually(lambda: not moving(arms), what="the arm stands")
 
 
+def test_jog_that_is_held_does_not_start_the_arm_again_after_a_halt(cell: Any) -> None:
+    arms = cell.serve_arms("arm-1")
+    server = cell.serve_page()
+    page, other = cell.open(server, robots=1), cell.open(server, robots=1)
+    hold_until(page, take(page), lambda: moving(arms), "the arm moves")
+    card(other, "arm-1").get_by_role("button", name="Halt arm-1").click()
+    card(other, "arm-1").get_by_text("Halted at").wait_for()
+    page.locator(".drive .said", has_text="It does not move").wait_for()
+    for _ in range(10):
+        assert not moving(arms), "the button is still held"
+        page.wait_for_timeout(100)
+    page.mouse.up()
+
+
 BASE = forms_of([{"name": name, "labels": {"direction": "write"}} for name in ("acquireControl", "drive", "stop")])
 
 
