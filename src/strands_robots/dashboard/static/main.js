@@ -114,5 +114,5 @@ document.addEventListener("visibilitychange", () => { view.askThumbnails(); came
 window.addEventListener("hashchange", route);
 // Ages grow also when nothing arrives.
 setInterval(draw, 250);
-setInterval(() => { if (state.open && state.heardAt && performance.now() - state.heardAt > 5000) state.renew(); }, 1000);
+setInterval(() => state.renewIfSilent(5000), 1000);
 route();

@@ -59,7 +59,7 @@ export class Stop {
   }
 
   look() {
-    if (this.channel.open && this.channel.heardAt && performance.now() - this.channel.heardAt > 3000) this.channel.renew();
+    this.channel.renewIfSilent(3000);
     const late = [...this.unconfirmed.values()].some((at) => performance.now() - at > CONFIRM_MS);
     const problem = [this.problem(), this.notSent, late ? S.sentUnconfirmed : ""].filter(Boolean).join(" ");
     setText(this.alarm, problem);
