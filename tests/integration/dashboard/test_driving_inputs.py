@@ -135,6 +135,26 @@ def test_gripper_is_moved_by_its_pose_and_opened(
     assert served.feed.stops >= 1
 
 
+@pytest.mark.parametrize("view", ["#/", "#/history", "#/cameras"])
+def test_keys_and_sticks_move_nothing_on_another_view(page: Any, served: ServedPage, view: str) -> None:
+    served.robot("arm-1")
+    served.model.observe("dc", "arm-1", {"pan": 0.1})
+    page.evaluate(PADS)
+    take(page)
+    page.evaluate(f"location.hash = {view!r}")
+    page.locator("#robot").wait_for(state="detached")
+    page.keyboard.down("q")
+    page.evaluate("window.pads = [{axes: [0.9, 0]}]")
+    page.wait_for_timeout(500)
+    assert not served.feed.asked("moveJoints")
+    page.keyboard.up("q")
+    page.evaluate("window.pads = []")
+    page.evaluate("location.hash = '#/robot/dc:arm-1'")
+    button = page.locator("button.jog[aria-label='pan +']")
+    hold_until(page, button, lambda: served.feed.asked("moveJoints"), "the key moves it again", "q")
+    page.keyboard.up("q")
+
+
 def test_robot_is_taken_from_an_agent_by_signature_and_given_back(cell: Any, tmp_path: Path) -> None:
     key = tmp_path / "operator.pem"
     public = keygen(key, PASSPHRASE)

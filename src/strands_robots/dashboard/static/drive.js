@@ -28,6 +28,7 @@ export class Drive {
   }
 
   open(key) {
+    this.close();
     this.jog.key = this.key = key;
     this.jog.axes = [];
     this.groups.clear();
@@ -36,7 +37,11 @@ export class Drive {
     this.say(S.jogHint, "quiet");
   }
 
-  close() { this.jog.end("hidden"); }
+  // Keys and sticks move nothing that is not seen; draw() enables them again.
+  close() {
+    this.jog.end("hidden");
+    this.jog.setEnabled(false);
+  }
 
   say(text, tone) {
     setText(this.said, text);
