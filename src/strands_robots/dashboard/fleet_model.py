@@ -413,7 +413,7 @@ class FleetModel:
         if row is None or found is None:
             return None
         times, values = found
-        head = json.dumps({"key": key, "times": [round(each, 3) for each in times], "units": row.units}, default=str)
+        head = json.dumps({"key": key, "times": times, "units": row.units}, default=str)
         lines = (json.dumps({"name": name, "values": plain_values(each)}) for name, each in values.items())
         return chain((head,), lines)
 

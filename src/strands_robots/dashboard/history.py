@@ -166,7 +166,8 @@ class History:
 
     def begin_sample(self, now: float) -> None:
         """Begin the samples of a new time."""
-        self._times[self._count % SAMPLES] = now
+        # As it is sent: a page asks for what came after the last time that it got.
+        self._times[self._count % SAMPLES] = round(now, 3)
         self._count += 1
 
     def sample(self, row: Row, now: float) -> None:
