@@ -127,6 +127,41 @@ def test_cards_stay_where_they_are(still: Any, served: ServedPage) -> None:
     assert card(still, "arm-2").bounding_box() == before
 
 
+SEES = (*FORMS, *forms_of([{"name": "getPicture", "labels": {"direction": "read"}}]))
+
+
+@pytest.mark.parametrize(("view", "place"), [("History", ".lane"), ("Cameras", ".tile:has(.name[href])")])
+def test_rows_under_a_filter_stay_where_they_are(still: Any, served: ServedPage, view: str, place: str) -> None:
+    def moves(*numbers: int) -> None:
+        for number in range(4):
+            served.model.task("dc", f"arm-{number}", state="running" if number in numbers else "idle")
+
+    def seen() -> list[str]:
+        return [str(text) for text in still.locator(f"{place} a, {place} .lane-name").all_inner_texts()]
+
+    for number in range(4):
+        served.robot(f"arm-{number}", forms=SEES)
+    moves(1, 2, 3)
+    shows(still, "document.querySelectorAll('.card').length === 4")
+    still.select_option("#filter", "moving")
+    shows(still, "document.querySelectorAll('.card').length === 3")
+    still.locator("#views a", has_text=view).click()
+    eventually(lambda: seen() == ["arm-1", "arm-2", "arm-3"], what="the robots that move")
+    places = {each: still.locator(place, has_text=each).bounding_box() for each in ("arm-2", "arm-3")}
+    settle(still)
+    still.evaluate("window.shifts = []")
+    moves(2, 3)
+    eventually(lambda: [each for each in seen() if each] == ["arm-2", "arm-3"], what="arm-1 is not seen")
+    moves(3)
+    eventually(lambda: [each for each in seen() if each] == ["arm-3"], what="arm-2 is not seen")
+    moves(0, 2, 3)
+    eventually(lambda: [each for each in seen() if each] == ["arm-2", "arm-3", "arm-0"], what="arm-0 comes last")
+    assert {each: still.locator(place, has_text=each).bounding_box() for each in places} == places
+    unmoved(still, "robots pass the filter, and pass no more")
+    if view == "History":
+        assert still.locator(".lane").count() == 4
+
+
 def test_a_stop_and_its_answers_move_nothing(still: Any, served: ServedPage) -> None:
     link = served.feed.controller
     for number in range(4):

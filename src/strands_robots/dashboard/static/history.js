@@ -31,6 +31,7 @@ export class HistoryView {
     this.state = state;
     this.lanes = new Map();
     this.visible = new Set();
+    this.order = [];
     this.seconds = 300;
     this.filter = new Filter(fleet, kindText, () => { this.order = []; this.draw(); }, "history-");
     this.window = el("div", { class: "choices", role: "group", "aria-label": H.window });
@@ -168,24 +169,28 @@ export class HistoryView {
 
   draw() {
     if (!this.shown) return;
-    const rows = this.rows();
-    this.arrange(rows);
+    const rows = this.rows(), passing = new Set(rows.map((row) => row.key));
+    this.arrange(rows, passing);
     this.filter.tell(rows.length);
     setText(this.empty, rows.length ? "" : this.fleet.rows.size ? H.noMatch : H.none);
-    if (!this.key && rows.length) this.choose(this.order[0]);
+    if (!this.key && rows.length) this.choose(this.order.find((key) => passing.has(key)));
     this.drawLanes();
     this.drawCharts();
   }
 
-  // Rows keep their places while the view is open: one that comes stands last.
-  arrange(rows) {
-    const wanted = new Map(rows.map((row) => [row.key, row]));
-    const kept = (this.order || []).filter((key) => wanted.has(key)), known = new Set(kept);
-    const fresh = rows.filter((row) => !known.has(row.key)).sort((a, b) => byName.compare(a.id, b.id)).map((row) => row.key);
-    const order = kept.concat(fresh);
-    if (this.list.childElementCount === order.length && this.order.length === order.length && !fresh.length) return;
+  // Rows keep their places while the view is open and the filter is the same: one that comes stands last, and one that
+  // passes no more is only not seen.
+  arrange(rows, passing) {
+    const known = new Set(this.order);
+    const fresh = rows.filter((row) => !known.has(row.key)).sort((a, b) => byName.compare(a.id, b.id));
+    if (fresh.length || this.list.childElementCount !== this.order.length) this.place(fresh);
+    for (const key of this.order) setAttr(this.lanes.get(key).node, "data-passes", passing.has(key) ? "yes" : "no");
+  }
+
+  place(fresh) {
+    const order = this.order.concat(fresh.map((row) => row.key)), wanted = new Map(fresh.map((row) => [row.key, row])), kept = new Set(order);
     this.order = order;
-    for (const key of [...this.lanes.keys()]) if (!this.fleet.rows.has(key)) this.lanes.delete(key);
+    for (const key of [...this.lanes.keys()]) if (!kept.has(key) && !this.fleet.rows.has(key)) this.lanes.delete(key);
     this.observer.disconnect();
     this.visible.clear();
     this.list.replaceChildren(...order.map((key) => {
@@ -249,7 +254,7 @@ export class HistoryView {
   save(what) {
     if (!this.clock) return;
     const to = this.now(), from = to - this.seconds, offset = this.clock.wall - this.clock.now;
-    const states = this.order.map((key) => [this.fleet.rows.get(key), this.tracks.get(key)]).filter(([row, track]) => row && track)
+    const states = this.order.map((key) => [this.fleet.rows.get(key), this.tracks.get(key)]).filter(([row, track]) => row && track && this.filter.passes(row))
       .map(([row, track]) => ({ row, intervals: clipped(track, from, to).map(([state, begin, end]) => [state, begin + offset, end + offset]) }));
     let series = null;
     const row = this.key && this.fleet.rows.get(this.key);
