@@ -8,6 +8,8 @@ import { H } from "./history-strings.js";
 import { clipped, drawAxis, Lane } from "./lanes.js";
 
 const ASK_MS = 2000, KEPT_S = 3600, CHARTS_S = 900;
+// As many changes of a robot as the server keeps.
+const CHANGES_MAX = 1000;
 const TURN = 180 / Math.PI;
 
 async function* answerLines(address) {
@@ -134,7 +136,7 @@ export class HistoryView {
       const old = tracks.get(line.key) || { at: [], as: "" };
       const keep = old.at.filter((each) => each < line.at[0]).length;
       let track = { at: old.at.slice(0, keep).concat(line.at), as: old.as.slice(0, keep) + line.as };
-      const drop = track.at.filter((each) => each < head.now - KEPT_S).length - 1;
+      const drop = Math.max(track.at.filter((each) => each < head.now - KEPT_S).length - 1, track.at.length - CHANGES_MAX);
       if (drop > 0) track = { at: track.at.slice(drop), as: track.as.slice(drop) };
       tracks.set(line.key, track);
     }
