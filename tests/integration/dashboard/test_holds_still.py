@@ -32,6 +32,7 @@ new PerformanceObserver((list) => {
 """
 STATED = {"type": "string", "description": "Name of the object; empty to give its place"}
 READS = forms_of([{"name": name, "labels": {"direction": "read"}} for name in ("getObjects", "getPose")])
+SEES = (*FORMS, *forms_of([{"name": "getPicture", "labels": {"direction": "read"}}]))
 PICK = forms_of(
     [
         {
@@ -125,9 +126,12 @@ def test_cards_stay_where_they_are(still: Any, served: ServedPage) -> None:
     eventually(lambda: card(still, "arm-1").count() == 0, what="arm-1 is gone")
     unmoved(still, "a robot went")
     assert card(still, "arm-2").bounding_box() == before
-
-
-SEES = (*FORMS, *forms_of([{"name": "getPicture", "labels": {"direction": "read"}}]))
+    served.model.update("dc", "arm-2", forms=SEES, model="so101")
+    card(still, "arm-2").get_by_text("so101").wait_for()
+    unmoved(still, "a robot told that it has a camera")
+    assert card(still, "arm-2").bounding_box() == before
+    still.locator("#sort").click()
+    card(still, "arm-2").locator(".shot").wait_for()
 
 
 @pytest.mark.parametrize(("view", "place"), [("History", ".lane"), ("Cameras", ".tile:has(.name[href])")])
