@@ -284,7 +284,11 @@ def test_halt_ends_the_motion_of_one_robot_alone(still: Any, served: ServedPage)
     assert still.evaluate(radius.format("halt")) != still.evaluate(radius.format("stop-one"))
     served.feed.stop_answer = error("the bus is silent.", stopped=None)
     button.click()
-    card(still, "arm-2").get_by_text("DID NOT CONFIRM ITS HALT: the bus is silent.").wait_for()
+    said = card(still, "arm-2").get_by_text("NOT HALTED: press STOP. the bus is silent.")
+    said.wait_for()
+    box, around = said.bounding_box(), card(still, "arm-2").bounding_box()
+    assert box["y"] + box["height"] <= around["y"] + around["height"], "the answer is inside of the card"
+    picture(still, f"not-halted-{still.viewport_size['width']}")
     assert served.feed.controller.presses == []
     open_robot(still, "arm-2")
     box = still.locator("#robot .halt").bounding_box()

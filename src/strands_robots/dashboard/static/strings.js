@@ -14,7 +14,7 @@ export const S = {
   haltWhy: (id) => `Halt ${id}: ends its motion. No other robot stops, and nothing is locked.`,
   halting: "Halting...",
   halted: (at, ms) => `Halted at ${at}, in ${ms} ms.`,
-  notHalted: (text) => `DID NOT CONFIRM ITS HALT: ${text} Press STOP.`,
+  notHalted: (text) => `NOT HALTED: press STOP. ${text}`,
   haltNotSent: "NOT HALTED: the page is not connected. Use the hardware emergency stop.",
   connecting: "Connecting to the page's server...",
   connected: "Connected",
