@@ -17,7 +17,7 @@ from typing import Any
 
 from strands_robots.cli.lockout_report import LockoutReport
 from strands_robots.cli.output import plain
-from strands_robots.dashboard.history import OVERLAP_S, History, plain_values
+from strands_robots.dashboard.history import OVERLAP_S, WINDOW_S, History, plain_values
 from strands_robots.device_connect.telemetry import numbers
 
 ROBOTS_MAX = 2000
@@ -302,6 +302,12 @@ class FleetModel:
             number = self._next()
             self._timeline.append((number, json.dumps({**entry, "n": number}, allow_nan=False, default=str)))
 
+    def note_stop(self, event: str, facts: Mapping[str, Any], network: str = "", name: str = "") -> None:
+        """Add a press of STOP or a halt of a page to the timeline, and to the history, where no robot writes."""
+        self.note(network, name, event, facts)
+        with self._lock:
+            self.history.stops.append((event, round(time.time(), 3), key_of(network, name) if name else ""))
+
     def forget(self, key: str, longer_than_s: float) -> bool:
         """Remove a robot that was silent for so long; False where it was not."""
         with self._lock:
@@ -405,6 +411,12 @@ class FleetModel:
             if found is not None:
                 starts = [round(each, 2) for each in found[0]]
                 yield json.dumps({"key": key, "at": starts, "as": found[1]}, allow_nan=False)
+
+    def stops(self) -> list[tuple[str, float, str]]:
+        """Return the presses of STOP and the halts of the history's window: event, wall time, robot's key."""
+        since = time.time() - WINDOW_S
+        with self._lock:
+            return [each for each in self.history.stops if each[1] > since]
 
     def series(self, key: str, after: float) -> Iterator[str] | None:
         """Return the samples of a robot after a time, a line a series, or None."""

@@ -37,6 +37,7 @@ logger = logging.getLogger(__name__)
 STATIC = Path(__file__).parent / "static"
 TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
 
+STOP_PRESSED = "STOP pressed"
 HELLO_S = 5.0
 WRONG_TOKEN_S = 1.0
 LINK_S = 0.2
@@ -209,7 +210,7 @@ class Dashboard:
                     else:
                         self.stop.press_one(row.network, row.id)
                     button = f"{row.id} alone" if row is not None else who or "all robots"
-                    self.model.note("", "", "STOP pressed", {"button": button})
+                    self.model.note_stop(STOP_PRESSED, {"button": button})
                     await socket.send_text(json.dumps({"type": "pressed", "id": pressed.get("id")}, default=str))
         except (ValueError, RecursionError, KeyError, RuntimeError, WebSocketDisconnect) as gone:
             logger.debug("A page is gone, or sent no message of this page: %s", type(gone).__name__)
@@ -246,12 +247,13 @@ class Dashboard:
         if asked.get("ticket", "") not in self._sessions:
             return PlainTextResponse(NO_TICKET, 403)
         number, at = _number(asked.get("number")), _number(asked.get("at"))
-        head = {"number": self.model.history.number, "now": self.model.clock(), "wall": time.time()}
-        keys = [row.key for row in self.model.rows()]
+        model = self.model
+        head = {"number": model.history.number, "now": model.clock(), "wall": time.time(), "stops": model.stops()}
+        keys = [row.key for row in model.rows()]
 
         async def lines() -> AsyncIterator[str]:
             yield json.dumps(head) + "\n"
-            for line in self.model.states(keys, int(number), at):
+            for line in model.states(keys, int(number), at):
                 yield line + "\n"
                 await asyncio.sleep(0)
 

@@ -86,6 +86,8 @@ export class HistoryView {
     this.number = 0;
     this.at = 0;
     this.clock = null;
+    // Of the page's server: the timeline has what robots say, too, and less of the past.
+    this.stops = [];
     this.series = null;
   }
 
@@ -143,6 +145,7 @@ export class HistoryView {
     if (!head) return;
     this.number = head.number;
     this.at = head.now;
+    this.stops = head.stops;
     this.clock = { now: head.now, wall: head.wall, here: performance.now() };
   }
 
@@ -209,10 +212,10 @@ export class HistoryView {
   drawLanes() {
     if (!this.clock || !this.shown) return;
     const to = this.now(), from = to - this.seconds, offset = this.clock.wall - this.clock.now;
-    drawAxis(this.axis, from, to, offset, this.fleet.events.filter((each) => each.event === "STOP pressed").map((each) => each.at * 1000));
+    drawAxis(this.axis, from, to, offset, this.stops.filter(([event]) => event === "STOP pressed").map(([, at]) => at * 1000));
     for (const key of this.visible) {
       const row = this.fleet.rows.get(key);
-      if (row) this.lanes.get(key).draw(this.tracks.get(key), from, to, offset, this.fleet.attention(row) === 0);
+      if (row) this.lanes.get(key).draw(this.tracks.get(key), from, to, offset, this.fleet.attention(row) === 0, this.stops.filter(([event, , own]) => event === "halted here" && own === key).map(([, at]) => at));
     }
   }
 

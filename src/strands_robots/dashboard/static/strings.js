@@ -165,6 +165,7 @@ export const S = {
     "control released": "Control given back",
     "control changed": "Control taken over",
     "control taken here": "Control taken over, by this page",
+    "halted here": "Halt, by this page",
     emergencyStop: "Emergency stop",
     missedStops: "Asked which stops it missed",
     remote_estop_engaged: "Locked by an emergency stop",
