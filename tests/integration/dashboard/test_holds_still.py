@@ -233,6 +233,23 @@ def test_a_pad_stays_under_the_pointer(still: Any, served: ServedPage) -> None:
     picture(still, f"still-drive-{still.viewport_size['width']}")
 
 
+def test_pads_keep_their_places_when_other_joints_are_told(page: Any, served: ServedPage) -> None:
+    def titles() -> list[str]:
+        return [str(each) for each in page.locator(".pads legend").all_inner_texts()]
+
+    served.robot("arm-1")
+    served.model.observe("dc", "arm-1", {"pan": 0.1, "lift": 0.2})
+    button = take(page)
+    assert titles() == ["Joints", "Gripper's pose", "Gripper"]
+    hold(page, button)
+    eventually(lambda: served.feed.asked("moveJoints"), what="the jog")
+    served.model.observe("dc", "arm-1", {"pan": 0.1, "lift": 0.2, "wrist": 0.3})
+    page.locator("button.jog[aria-label='wrist +']").wait_for()
+    assert titles() == ["Joints", "Gripper's pose", "Gripper"]
+    page.locator(".drive .said", has_text="Stopped (").wait_for()
+    page.mouse.up()
+
+
 def test_events_and_results_are_read_in_their_own_places(still: Any, served: ServedPage) -> None:
     served.robot("arm-1", forms=(*FORMS, *READS, *PICK), cameras=("front", "wrist"))
     served.feed.answers["getObjects"] = [success("2 objects.", objects=OBJECTS)]
