@@ -255,6 +255,15 @@ def test_jog_out_of_its_domain_is_refused_by_name(change: dict[str, Any]) -> Non
         JogAxis.of({**JOG, **change})
 
 
+@pytest.mark.parametrize("name", ["rail", "rail.pos"])
+def test_slide_is_jogged_in_metres(name: str) -> None:
+    axis = JogAxis.of({**JOG, "axis": name, "direction": -1})
+    calls = axis.stretches({"rail": 0.2, "pan": 10.0}, {"rail": "metres", "rail.pos": "metres", "pan": "radians"})
+    assert [params["joints"]["rail"] for _, params in calls] == [0.2 - each for each in driving.METRES]
+    turning = JogAxis.of(JOG).stretches({"pan": 10.0}, {"rail": "metres", "pan": "radians"})
+    assert [params["joints"]["pan"] for _, params in turning] == [10.0 + each for each in driving.DEGREES]
+
+
 def test_base_is_driven_by_bounded_speeds() -> None:
     axis = JogAxis.of({"kind": "base", "axis": "angular", "direction": -1, "speed": 1})
     verb, params = axis.stretches({})[0]

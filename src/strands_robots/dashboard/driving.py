@@ -85,8 +85,15 @@ class JogAxis:
         part = text("part", message.get("part", ""), longest=128, empty=True)
         return cls(kind, name, int(direction), speed, part)
 
-    def stretches(self, joints: Mapping[str, float]) -> list[tuple[str, dict[str, Any]]]:
-        """Return the calls that move along the axis, from the longest stretch."""
+    def stretches(
+        self, joints: Mapping[str, float], units: Mapping[str, str] | None = None
+    ) -> list[tuple[str, dict[str, Any]]]:
+        """Return the calls that move along the axis, from the longest stretch.
+
+        Args:
+            joints: positions, in degrees or for a slide in metres.
+            units: of the robot's joints, as its features name them: ``metres`` is a slide.
+        """
         common: dict[str, Any] = {"robot_name": self.part} if self.part else {}
         if self.kind == "base":
             linear = self.direction * self.speed * LINEAR_M_S if self.name == "linear" else 0.0
@@ -102,7 +109,8 @@ class JogAxis:
         if name is None:
             raise ValidationError(f"axis must be one of {', '.join(joints)}, not {shown(self.name)}.")
         start = joints[name]
-        return [("moveJoints", {"joints": {name: start + self.direction * each}, **common}) for each in DEGREES]
+        lengths = METRES if (units or {}).get(self.name) == "metres" else DEGREES
+        return [("moveJoints", {"joints": {name: start + self.direction * each}, **common}) for each in lengths]
 
 
 @dataclass(slots=True)
@@ -120,9 +128,10 @@ class HeldRobot:
 
 @dataclass(slots=True)
 class Jogging:
-    """One jog: what it moves, its last beat, and whether it was released."""
+    """One jog: what it moves, the units of the joints, its last beat, and whether it was released."""
 
     axis: JogAxis
+    units: Mapping[str, str] = field(default_factory=dict)
     beat: float = field(default_factory=time.monotonic)
     released: asyncio.Event = field(default_factory=asyncio.Event)
     why: str = ""
@@ -195,7 +204,7 @@ class HandControl:
         self._forget(key)
         return await held.feed.call(held.robot, "releaseControl", self._lease_of(held), ANSWER_S)
 
-    def begin(self, key: str, message: Mapping[str, Any]) -> str:
+    def begin(self, key: str, message: Mapping[str, Any], units: Mapping[str, str] | None = None) -> str:
         """Begin a jog of a held robot; return the reason of a refusal, or ""."""
         held = self._held.get(key)
         if held is None:
@@ -206,7 +215,7 @@ class HandControl:
             axis = JogAxis.of(message)
         except ValidationError as refused:
             return str(refused)
-        jog = held.jog = Jogging(axis)
+        jog = held.jog = Jogging(axis, units or {})
         jog.task = asyncio.create_task(self._jog(key, held, jog))
         return ""
 
@@ -310,7 +319,7 @@ class HandControl:
                     return text_of(pose)
                 joints = pose["joints"] if isinstance(pose.get("joints"), Mapping) else {}
             problem = ""
-            for verb, params in jog.axis.stretches(joints):
+            for verb, params in jog.axis.stretches(joints, jog.units):
                 answer = await self._until_release(held, jog, verb, {**params, **self._lease_of(held)}, begun)
                 if answer is None:
                     return ""

@@ -286,7 +286,9 @@ class PageSession:
             self.tell({**details, "looked": looked})
 
     def _jog(self, key: str, message: Message) -> None:
-        why = "A viewer may not move robots." if self._role != OPERATOR else self._control.begin(key, message)
+        row = self._server.model.row(key)
+        units = row.units if row is not None else {}
+        why = "A viewer may not move robots." if self._role != OPERATOR else self._control.begin(key, message, units)
         if why:
             self.tell({"type": "jogged", "key": key, "refused": True, "stopped": None, "began": False, "why": why})
 

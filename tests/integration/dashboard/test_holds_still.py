@@ -356,14 +356,18 @@ def test_joints_are_told_in_degrees_with_their_ranges(page: Any, served: ServedP
     assert page.locator(".legend li").all_inner_texts() == ["pan"]
 
 
-def test_joints_of_a_motion_are_asked_for_in_degrees_each(page: Any, served: ServedPage) -> None:
-    described = {"joints": {"type": "object", "description": "Degrees by joint name; joints left out stay"}}
+def test_joints_of_a_motion_are_asked_for_in_their_units(page: Any, served: ServedPage) -> None:
+    described = {
+        "joints": {"type": "object", "description": "Degrees by joint name, metres for a slide; joints left out stay"}
+    }
     moves = {"name": "moveJoints", "labels": {"direction": "write"}}
     joints = forms_of([{**moves, "parameters": {"properties": described, "required": ["joints"]}}])
-    served.robot("arm-1", forms=(*joints, *READS))
+    served.robot("arm-1", forms=(*joints, *READS), units={"pan": "radians", "lift": "radians", "rail": "metres"})
     served.model.observe("dc", "arm-1", {"pan": 0.7854})
+    served.feed.answers["getPose"] = [success("here", joints={"pan": 45.0, "lift": 0.0, "rail": 0.1234})]
     open_robot(page)
     form = verb_form(page, "moveJoints")
+    assert form.get_by_label("rail, m").get_attribute("placeholder") == "stays at 0.123"
     form.get_by_label("lift, \u00b0").fill("12.5")
     form.get_by_role("button", name="Run").click()
     eventually(lambda: served.feed.asked("moveJoints"), what="the motion")

@@ -136,7 +136,7 @@ export const S = {
   more: (n) => `More: ${n} ${n === 1 ? "field" : "fields"}`,
   result: (verb) => `Answer to ${verb}`,
   notGiven: "(not given)",
-  jointAt: (degrees) => `stays at ${typeof degrees === "number" ? degrees.toFixed(1) : degrees}`,
+  jointAt: (at, digits) => `stays at ${typeof at === "number" ? at.toFixed(digits) : at}`,
   yes: "yes",
   no: "no",
   run: "Run",
