@@ -1,6 +1,6 @@
 // The fleet over time: a lane for each robot, charts of the chosen one, and files of both.
 import { Chart } from "./chart.js";
-import { el, setAttr, setText } from "./dom.js";
+import { el, own, setAttr, setText } from "./dom.js";
 import { bothJson, chartsCsv, save, statesCsv } from "./export.js";
 import { Filter } from "./filter.js";
 import { byName, kindText } from "./fleet.js";
@@ -49,7 +49,7 @@ export class HistoryView {
     this.said = el("p", { class: "history-said", role: "status" });
     this.files = el("div", { class: "choices", role: "group", "aria-label": H.exportLabel });
     for (const [what, text] of [["states", H.statesCsv], ["charts", H.chartsCsv], ["json", H.bothJson]]) {
-      const button = el("button", { type: "button", "data-file": what, text });
+      const button = el("button", { type: "button", "data-file": what, disabled: what === "charts", text });
       button.addEventListener("click", () => this.save(what));
       this.files.append(button);
     }
@@ -215,7 +215,7 @@ export class HistoryView {
     drawAxis(this.axis, from, to, offset, this.stops.filter(([event]) => event === "STOP pressed").map(([, at]) => at * 1000));
     for (const key of this.visible) {
       const row = this.fleet.rows.get(key);
-      if (row) this.lanes.get(key).draw(this.tracks.get(key), from, to, offset, this.fleet.attention(row) === 0, this.stops.filter(([event, , own]) => event === "halted here" && own === key).map(([, at]) => at));
+      if (row) this.lanes.get(key).draw(this.tracks.get(key), from, to, offset, this.fleet.attention(row) === 0, this.stops.filter(([event, , halted]) => event === "halted here" && halted === key).map(([, at]) => at));
     }
   }
 
@@ -227,7 +227,7 @@ export class HistoryView {
     for (const [name, given] of Object.entries(values)) {
       const joint = name.startsWith("joint:") ? name.slice(name.indexOf("/") + 1) : "";
       if (joint) {
-        const shown = parts.size > 1 ? `${name.slice(6, name.indexOf("/"))} ${joint}` : joint, unit = units[joint] || "";
+        const shown = parts.size > 1 ? `${name.slice(6, name.indexOf("/"))} ${joint}` : joint, unit = own(units, joint) || "";
         const angle = unit === "radians" || unit === "degrees";
         found[angle ? "joints" : "others"].push({ name: shown, unit: angle ? H.degrees : unit || H.notStated,
           values: unit === "radians" ? given.map((each) => (each === null ? null : Number((each * TURN).toFixed(3)))) : given });
@@ -244,6 +244,7 @@ export class HistoryView {
     const row = this.key && this.fleet.rows.get(this.key);
     setText(this.chartsTitle, H.charts(row ? row.id : ""));
     const found = this.columns();
+    this.files.querySelector("[data-file=charts]").disabled = !(row && this.series);
     setText(this.loadNote, this.series ? this.loadStated ? H.loadKnown : H.loadUnknown : "");
     if (!this.clock) return;
     const offset = this.clock.wall - this.clock.now, to = (this.now() + offset) * 1000;
