@@ -270,6 +270,29 @@ def test_press_is_sent_once_confirmed_and_answered_by_name(make: Make) -> None:
 
 
 @pytest.mark.parametrize(
+    ("scope", "pressed"),
+    [
+        ({"cell": "cell-1"}, "cell cell-1 and robots without a cell"),
+        ({"only": "dc:arm-1"}, "arm-1 only"),
+        ({}, ""),
+        ({"cell": "cell-1", "only": "dc:arm-1"}, ""),
+        ({"cell": "cell-9"}, ""),
+        ({"cell": 7}, ""),
+        ({"only": "dc:nobody"}, ""),
+    ],
+)
+def test_press_with_a_scope_that_is_not_known_is_for_all(make: Make, scope: dict[str, Any], pressed: str) -> None:
+    site = make()
+    site.model.update("dc", "arm-1", cell="cell-1")
+    with site.open("/stop") as stop:
+        for message in ({"type": "hello"}, {"type": "stop", "id": 1, **scope}):
+            stop.send_json(message)
+        received(stop, "pressed")
+        assert site.page.stop.state()["pressed_for"] == pressed
+    assert len(site.feed.controller.presses) == 1
+
+
+@pytest.mark.parametrize(
     ("answer", "stopped"),
     [
         (success("Stopped.", stopped=True), True),

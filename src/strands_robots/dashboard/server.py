@@ -202,14 +202,18 @@ class Dashboard:
                     # Before anything else is done with it.
                     named = pressed.get("robot")
                     who = named[:128] if isinstance(named, str) else ""
-                    key = pressed.get("only")
-                    # A robot that is not known here is no reason to stop none.
-                    row = self.model.row(key) if isinstance(key, str) else None
-                    if row is None:
-                        self.stop.press(who)
-                    else:
+                    only, cell = pressed.get("only"), pressed.get("cell")
+                    # A robot that is not known here is no reason to stop none; both are no scope.
+                    row = self.model.row(only) if isinstance(only, str) and cell is None else None
+                    button = who or "all robots"
+                    if row is not None:
                         self.stop.press_one(row.network, row.id)
-                    button = f"{row.id} alone" if row is not None else who or "all robots"
+                        button = f"{row.id} alone"
+                    elif isinstance(cell, str) and only is None:
+                        self.stop.press_cell(cell[:128])
+                        button = f"cell {cell[:128]}"
+                    else:
+                        self.stop.press(who)
                     self.model.note_stop(STOP_PRESSED, {"button": button})
                     await socket.send_text(json.dumps({"type": "pressed", "id": pressed.get("id")}, default=str))
         except (ValueError, RecursionError, KeyError, RuntimeError, WebSocketDisconnect) as gone:

@@ -284,7 +284,25 @@ def test_events_and_results_are_read_in_their_own_places(still: Any, served: Ser
         )
 
 
-# One robot, all robots.
+# One robot, one cell, all robots.
+
+
+def test_button_of_a_cell_is_there_where_the_robot_is_in_one(still: Any, served: ServedPage) -> None:
+    served.robot("arm-1", cell="cell-1")
+    served.robot("arm-2")
+    open_robot(still, "arm-2")
+    assert not still.locator(".stop-cell").is_visible()
+    served.model.update("dc", "arm-2", cell="cell-2")
+    unmoved(still, "the cell was told later")
+    still.locator("#robot .back a").click()
+    open_robot(still, "arm-1")
+    button = still.locator(".stop-cell")
+    picture(still, f"stop-cell-{still.viewport_size['width']}")
+    button.click()
+    scopes = served.feed.controller.scopes
+    eventually(lambda: [str(each) for each in scopes] == ["cell cell-1 and robots without a cell"], what="its stop")
+    still.locator("#stop").click()
+    eventually(lambda: len(scopes) == 2 and scopes[1].everything, what="the big button is that of all")
 
 
 def test_halt_ends_the_motion_of_one_robot_alone(still: Any, served: ServedPage) -> None:

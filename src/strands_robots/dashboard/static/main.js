@@ -15,7 +15,7 @@ const channel = new Channel("/stop");
 const stop = new Stop(channel, fleet);
 const state = new State();
 const view = new FleetView(fleet, state, (id) => stop.press(id));
-const robot = new RobotView(fleet, state, (id, only) => stop.press(id, only));
+const robot = new RobotView(fleet, state, (id, only, cell) => stop.press(id, only, cell));
 const history = new HistoryView(fleet, state);
 const cameras = new CamerasView(fleet, state);
 const others = { "#/history": history, "#/cameras": cameras };
