@@ -128,7 +128,11 @@ class HeldRobot:
 
 @dataclass(slots=True)
 class Jogging:
-    """One jog: what it moves, the units of the joints, its last beat, and whether it was released."""
+    """One jog: what it moves, its last beat, and whether it was released.
+
+    Attributes:
+        units: of the robot's joints, as its features name them.
+    """
 
     axis: JogAxis
     units: Mapping[str, str] = field(default_factory=dict)
@@ -339,7 +343,7 @@ class HandControl:
         return ""
 
     async def _under_way(self, held: HeldRobot, jog: Jogging, answer: Envelope) -> str:
-        """Wait for the end of a stretch, or for the release; return why the jog ends with it, or "".
+        """Wait for the end of a stretch or the release; return why the jog ends, or "".
 
         Only a stretch that was completed is followed by another one: any other end may be a halt, a stop or a contact.
         """

@@ -131,7 +131,10 @@ class FleetStop:
         }
 
     def _pressed_for(self) -> str:
-        """Return the scope of the latest press, empty where it is or has become every robot."""
+        """Return the scope of the latest press; empty for every robot.
+
+        A stop that was widened is one of every robot.
+        """
         scope, buttons = self._for
         latest = [each.progress if each.running else each.report for each in buttons]
         widened = any(each is not None and each.widened for each in latest)

@@ -308,7 +308,10 @@ class FleetModel:
             self._timeline.append((number, json.dumps({**entry, "n": number}, allow_nan=False, default=str)))
 
     def note_stop(self, event: str, facts: Mapping[str, Any], network: str = "", name: str = "") -> None:
-        """Add a press of STOP or a halt of a page to the timeline, and to the history, where no robot writes."""
+        """Add a page's STOP or halt to the timeline and to the history.
+
+        The timeline has what robots say, too; no robot writes into the history's stops.
+        """
         self.note(network, name, event, facts)
         with self._lock:
             self.history.stops.append((event, round(time.time(), 3), key_of(network, name) if name else ""))
@@ -422,7 +425,10 @@ class FleetModel:
                 yield json.dumps({"key": key, "at": starts, "as": found[1]}, allow_nan=False)
 
     def stops(self) -> list[tuple[str, float, str]]:
-        """Return the presses of STOP and the halts of the history's window: event, wall time, robot's key."""
+        """Return the presses of STOP and the halts of the history's window.
+
+        Each has its event, wall time and the robot's key, empty for all.
+        """
         since = time.time() - WINDOW_S
         with self._lock:
             return [each for each in self.history.stops if each[1] > since]
