@@ -177,6 +177,54 @@ async def test_blocked_way_is_tried_in_shorter_stretches_and_then_refused(page: 
     assert told is not None and told["refused"] and "126" in told["why"]
 
 
+@pytest.mark.parametrize(
+    "ended",
+    [
+        error("moveJoints stopped: it was stopped.", task_status="stopped"),
+        error("moveJoints error: the arm touches the table.", task_status="error"),
+        success("blocked", task_status="blocked"),
+        error("the robot did not answer"),
+    ],
+)
+async def test_motion_that_did_not_complete_ends_the_jog(page: Page, ended: Any) -> None:
+    page.feed.answers["wait"] = [success("under way", task_status="running"), ended]
+    await page.take()
+    await page.jog()
+    await page.beating(page.jogged)
+    told = page.jogged()
+    assert told is not None and told["refused"] and told["why"] == text_of(ended)
+    assert len(page.feed.asked("moveJoints")) == 1
+    assert page.feed.stops >= 1
+
+
+async def test_motion_that_is_ended_before_its_answer_is_not_tried_in_shorter_stretches(page: Page) -> None:
+    stopped = error("moveJoints stopped: it was stopped.", task_id="moveJoints-1", task_status="stopped")
+    page.feed.answers["moveJoints"] = [stopped]
+    await page.take()
+    await page.jog()
+    await page.beating(page.jogged)
+    assert len(page.feed.asked("moveJoints")) == 1
+
+
+async def test_motion_that_completed_is_followed_by_the_next_stretch(page: Page) -> None:
+    page.feed.answers["wait"] = [success("done", task_status="completed"), success("under way", task_status="running")]
+    await page.take()
+    await page.jog()
+    await page.beating(lambda: len(page.feed.asked("moveJoints")) == 2)
+    page.control.release(KEY)
+    await until(page.jogged)
+
+
+async def test_base_is_not_driven_again_when_its_drive_is_over(page: Page, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(driving, "DRIVE_S", 0.1)
+    await page.take()
+    await page.jog(kind="base", axis="linear")
+    await page.beating(page.jogged)
+    told = page.jogged()
+    assert told is not None and told["why"] == driving.DRIVEN
+    assert len(page.feed.asked("drive")) == 1
+
+
 async def test_lost_lease_ends_the_jog_and_is_told(page: Page) -> None:
     await page.take()
     await page.jog()
@@ -205,6 +253,15 @@ async def test_lost_lease_ends_the_jog_and_is_told(page: Page) -> None:
 def test_jog_out_of_its_domain_is_refused_by_name(change: dict[str, Any]) -> None:
     with pytest.raises(ValidationError, match="|".join(("kind", "direction", "speed", "axis", "part"))):
         JogAxis.of({**JOG, **change})
+
+
+@pytest.mark.parametrize("name", ["rail", "rail.pos"])
+def test_slide_is_jogged_in_metres(name: str) -> None:
+    axis = JogAxis.of({**JOG, "axis": name, "direction": -1})
+    calls = axis.stretches({"rail": 0.2, "pan": 10.0}, {"rail": "metres", "rail.pos": "metres", "pan": "radians"})
+    assert [params["joints"]["rail"] for _, params in calls] == [0.2 - each for each in driving.METRES]
+    turning = JogAxis.of(JOG).stretches({"pan": 10.0}, {"rail": "metres", "pan": "radians"})
+    assert [params["joints"]["pan"] for _, params in turning] == [10.0 + each for each in driving.DEGREES]
 
 
 def test_base_is_driven_by_bounded_speeds() -> None:

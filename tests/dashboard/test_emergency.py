@@ -172,3 +172,59 @@ def test_button_of_one_robot_stops_it_alone_and_shows_no_other_as_silent() -> No
     stop.press_one("dc", "arm 1")
     eventually(lambda: len(controller.scopes) >= 2 and not stop.running)
     assert set(controller.scopes[1:]) == {EVERY_ROBOT}
+
+
+def test_button_of_a_cell_stops_its_robots_and_those_without_a_cell() -> None:
+    model = FleetModel()
+    controller = ScopedController(StopReport("e" * 32, {}, {}, {}, (), True, 150.0))
+    cells = {"arm-1": "cell-1", "arm-2": "cell-2", "arm-3": "", "arm-4": None}
+    for name, cell in cells.items():
+        model.update("dc", name, expected=True, cell=cell)
+    stop = FleetStop(model, [Fed(controller)])  # type: ignore[list-item]
+    stop.press_cell("cell-1")
+    eventually(lambda: controller.scopes and not stop.running)
+    stop.refresh()
+    assert controller.scopes == [Scope(cell="cell-1")]
+    assert set(controller.expected) == {"arm-1", "arm-3", "arm-4"}
+    assert {row.id for row in model.rows() if row.stop is not None} == {"arm-1", "arm-3", "arm-4"}
+    assert stop.state()["pressed_for"] == "cell cell-1 and robots without a cell"
+
+
+def test_button_of_a_cell_sends_nothing_on_a_network_whose_robots_are_all_in_another() -> None:
+    model = FleetModel()
+    controllers = {name: ScopedController(StopReport("e" * 32, {}, {}, {}, (), True, 9.0)) for name in ("dc", "mesh")}
+    feeds = [Fed(each) for each in controllers.values()]
+    feeds[1].network = "mesh"
+    model.update("dc", "arm-1", expected=True, cell="cell-1")
+    model.update("mesh", "arm-2", expected=True, cell="cell-2")
+    stop = FleetStop(model, feeds)  # type: ignore[arg-type]
+    stop.press_cell("cell-1")
+    eventually(lambda: controllers["dc"].scopes and not stop.running)
+    assert controllers["mesh"].scopes == [], "there it would become a stop of all"
+
+
+@pytest.mark.parametrize("cell", ["cell-9", "", "cell 1", "*"])
+def test_button_of_no_cell_is_that_of_all(cell: str) -> None:
+    model = FleetModel()
+    controller = ScopedController(StopReport("e" * 32, {}, {}, {}, (), True, 9.0))
+    for name in ("arm-1", "arm-2"):
+        model.update("dc", name, expected=True, cell=f"cell-{name[-1]}")
+    stop = FleetStop(model, [Fed(controller)])  # type: ignore[list-item]
+    stop.press_cell(cell)
+    eventually(lambda: controller.scopes and not stop.running)
+    assert controller.scopes == [EVERY_ROBOT]
+    assert set(controller.expected) == {"arm-1", "arm-2"}
+    assert stop.state()["pressed_for"] == ""
+
+
+def test_stop_of_a_cell_that_became_one_of_all_expects_all() -> None:
+    model = FleetModel()
+    controller = ScopedController(StopReport("e" * 32, {}, {}, {}, (), True, 300.0, widened=True))
+    for name in ("arm-1", "arm-2"):
+        model.update("dc", name, expected=True, cell=f"cell-{name[-1]}")
+    stop = FleetStop(model, [Fed(controller)])  # type: ignore[list-item]
+    stop.press_cell("cell-1")
+    eventually(lambda: controller.scopes and not stop.running)
+    stop.refresh()
+    assert {row.id for row in model.rows() if row.stop is not None} == {"arm-1", "arm-2"}
+    assert stop.state()["pressed_for"] == ""

@@ -160,6 +160,16 @@ def test_samples_have_the_longest_silence_the_messages_and_the_joints() -> None:
     assert fleet.series(after=START)["lag"] == [1250.0]
 
 
+def test_sample_is_sent_once_whatever_the_digits_of_its_time() -> None:
+    fleet = Fleet()
+    for _ in range(20):
+        fleet.now += 2.0004567
+        fleet.sample()
+        last = fleet.series()["times"][-1]
+        assert fleet.series(after=last)["times"] == []
+    assert len(fleet.series(after=fleet.series()["times"][0])["times"]) == 19
+
+
 def test_silent_robot_has_no_joints_and_its_lag_grows() -> None:
     fleet = Fleet()
     fleet.model.observe("dc", "arm-1", {"pan": 0.5})

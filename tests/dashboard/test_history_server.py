@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -58,6 +59,25 @@ def test_states_of_all_robots_are_sent_once_and_then_what_changed(site: Site) ->
     assert len(site.lines("/history", **since)) == 1
     site.model.task("dc", "arm-2", state="running")
     assert [(row["key"], row["as"]) for row in site.lines("/history", **since)[1:]] == [("dc:arm-2", "sm")]
+
+
+def test_stops_are_those_of_the_pages_and_outlive_the_timeline(site: Site) -> None:
+    address = "ws://127.0.0.1:8800/{}"
+    with site.client.websocket_connect(address.format("stop"), headers={"origin": ORIGIN}) as stop:
+        for message in ({"type": "hello"}, {"type": "stop", "id": 1}):
+            stop.send_json(message)
+        while stop.receive_json()["type"] != "pressed":
+            pass
+    with site.client.websocket_connect(address.format("state"), headers={"origin": ORIGIN}) as socket:
+        for call in ({"type": "hello"}, {"type": "call", "id": 1, "key": "dc:arm-2", "verb": "stop"}):
+            socket.send_json(call)
+        eventually(lambda: len(site.lines("/history")[0]["stops"]) == 2, what="the halt")
+    for number in range(1200):
+        site.model.note("dc", "STOP pressed", "STOP pressed", {"button": number})
+        site.model.note("dc", "arm-2", "halted here", {"stopped": True})
+    stops = site.lines("/history")[0]["stops"]
+    assert [(event, key) for event, _, key in stops] == [("STOP pressed", ""), ("halted here", "dc:arm-2")]
+    assert time.time() - 60 < stops[0][1] <= stops[1][1] <= time.time()
 
 
 def test_samples_of_one_robot_are_sent_a_line_a_series(site: Site) -> None:

@@ -269,6 +269,48 @@ def test_press_is_sent_once_confirmed_and_answered_by_name(make: Make) -> None:
     assert len(site.feed.controller.presses) == 1
 
 
+@pytest.mark.parametrize(
+    ("scope", "pressed"),
+    [
+        ({"cell": "cell-1"}, "cell cell-1 and robots without a cell"),
+        ({"only": "dc:arm-1"}, "arm-1 only"),
+        ({}, ""),
+        ({"cell": "cell-1", "only": "dc:arm-1"}, ""),
+        ({"cell": "cell-9"}, ""),
+        ({"cell": 7}, ""),
+        ({"only": "dc:nobody"}, ""),
+    ],
+)
+def test_press_with_a_scope_that_is_not_known_is_for_all(make: Make, scope: dict[str, Any], pressed: str) -> None:
+    site = make()
+    site.model.update("dc", "arm-1", cell="cell-1")
+    with site.open("/stop") as stop:
+        for message in ({"type": "hello"}, {"type": "stop", "id": 1, **scope}):
+            stop.send_json(message)
+        received(stop, "pressed")
+        assert site.page.stop.state()["pressed_for"] == pressed
+    assert len(site.feed.controller.presses) == 1
+
+
+@pytest.mark.parametrize(
+    ("answer", "stopped"),
+    [
+        (success("Stopped.", stopped=True), True),
+        (error("no brakes", stopped=False), False),
+        (error("no answer", stopped=None), "unknown"),
+    ],
+)
+def test_halt_is_in_the_timeline_with_its_outcome_and_who_halted(make: Make, answer: Any, stopped: object) -> None:
+    site = make(Access(loopback_origins(8800), {}, VIEWER))
+    site.feed.stop_answer = answer
+    with site.open("/state") as socket:
+        hello(socket)
+        asked(socket, type="call", key="dc:arm-1", verb="stop", params={})
+    entry = json.loads(site.model.changes(0)[1])["events"][-1]
+    assert (entry["event"], entry["key"]) == ("halted here", "dc:arm-1")
+    assert entry["facts"] == {"by": "viewer, 127.0.0.1", "stopped": stopped}
+
+
 def test_page_is_told_five_times_a_second_that_its_stop_would_leave(make: Make) -> None:
     site = make()
     with site.open("/stop") as stop:

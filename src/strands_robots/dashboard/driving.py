@@ -36,6 +36,9 @@ METRES = (0.1, 0.04, 0.015, 0.005)
 """Lengths of one stretch of a jog, tried from the longest: the way of each is checked by the robot's planner."""
 
 DRIVE_S = 20.0
+DRIVEN = f"a drive ends after {DRIVE_S:g} s; press again to go on."
+"""A base does not say whether its drive was halted meanwhile, so no second one follows by itself."""
+
 LINEAR_M_S, ANGULAR_RAD_S = 0.3, 0.8
 """Speed of a base at full jog speed."""
 
@@ -82,8 +85,15 @@ class JogAxis:
         part = text("part", message.get("part", ""), longest=128, empty=True)
         return cls(kind, name, int(direction), speed, part)
 
-    def stretches(self, joints: Mapping[str, float]) -> list[tuple[str, dict[str, Any]]]:
-        """Return the calls that move along the axis, from the longest stretch."""
+    def stretches(
+        self, joints: Mapping[str, float], units: Mapping[str, str] | None = None
+    ) -> list[tuple[str, dict[str, Any]]]:
+        """Return the calls that move along the axis, from the longest stretch.
+
+        Args:
+            joints: positions, in degrees or for a slide in metres.
+            units: of the robot's joints, as its features name them: ``metres`` is a slide.
+        """
         common: dict[str, Any] = {"robot_name": self.part} if self.part else {}
         if self.kind == "base":
             linear = self.direction * self.speed * LINEAR_M_S if self.name == "linear" else 0.0
@@ -99,7 +109,8 @@ class JogAxis:
         if name is None:
             raise ValidationError(f"axis must be one of {', '.join(joints)}, not {shown(self.name)}.")
         start = joints[name]
-        return [("moveJoints", {"joints": {name: start + self.direction * each}, **common}) for each in DEGREES]
+        lengths = METRES if (units or {}).get(self.name) == "metres" else DEGREES
+        return [("moveJoints", {"joints": {name: start + self.direction * each}, **common}) for each in lengths]
 
 
 @dataclass(slots=True)
@@ -117,9 +128,14 @@ class HeldRobot:
 
 @dataclass(slots=True)
 class Jogging:
-    """One jog: what it moves, its last beat, and whether it was released."""
+    """One jog: what it moves, its last beat, and whether it was released.
+
+    Attributes:
+        units: of the robot's joints, as its features name them.
+    """
 
     axis: JogAxis
+    units: Mapping[str, str] = field(default_factory=dict)
     beat: float = field(default_factory=time.monotonic)
     released: asyncio.Event = field(default_factory=asyncio.Event)
     why: str = ""
@@ -192,7 +208,7 @@ class HandControl:
         self._forget(key)
         return await held.feed.call(held.robot, "releaseControl", self._lease_of(held), ANSWER_S)
 
-    def begin(self, key: str, message: Mapping[str, Any]) -> str:
+    def begin(self, key: str, message: Mapping[str, Any], units: Mapping[str, str] | None = None) -> str:
         """Begin a jog of a held robot; return the reason of a refusal, or ""."""
         held = self._held.get(key)
         if held is None:
@@ -203,7 +219,7 @@ class HandControl:
             axis = JogAxis.of(message)
         except ValidationError as refused:
             return str(refused)
-        jog = held.jog = Jogging(axis)
+        jog = held.jog = Jogging(axis, units or {})
         jog.task = asyncio.create_task(self._jog(key, held, jog))
         return ""
 
@@ -307,15 +323,18 @@ class HandControl:
                     return text_of(pose)
                 joints = pose["joints"] if isinstance(pose.get("joints"), Mapping) else {}
             problem = ""
-            for verb, params in jog.axis.stretches(joints):
+            for verb, params in jog.axis.stretches(joints, jog.units):
                 answer = await self._until_release(held, jog, verb, {**params, **self._lease_of(held)}, begun)
                 if answer is None:
                     return ""
                 problem = text_of(answer) if is_error(answer) else ""
                 if not problem:
-                    await self._under_way(held, jog, answer)
+                    ended = await self._under_way(held, jog, answer)
+                    if ended:
+                        return ended
                     break
-                if answer.get("code") is not None:
+                # A motion that had begun was ended by somebody: a shorter one would start the robot again.
+                if answer.get("code") is not None or "task_id" in answer:
                     return problem
             if problem:
                 return problem
@@ -323,18 +342,24 @@ class HandControl:
                 await jog.released.wait()
         return ""
 
-    async def _under_way(self, held: HeldRobot, jog: Jogging, answer: Envelope) -> None:
-        """Wait for the end of a stretch, or for the release."""
+    async def _under_way(self, held: HeldRobot, jog: Jogging, answer: Envelope) -> str:
+        """Wait for the end of a stretch or the release; return why the jog ends, or "".
+
+        Only a stretch that was completed is followed by another one: any other end may be a halt, a stop or a contact.
+        """
         task_id = answer.get("task_id")
         if not isinstance(task_id, str):
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(jog.released.wait(), DRIVE_S)
-            return
+            return "" if jog.released.is_set() or jog.axis.kind == "gripper" else DRIVEN
         params = {"task_id": task_id, "seconds": 5.0, **({"robot_name": jog.axis.part} if jog.axis.part else {})}
         while True:
             state = await self._until_release(held, jog, "wait", params, [])
-            if state is None or str(state.get("task_status", "")).lower() != "running":
-                return
+            status = "" if state is None else str(state.get("task_status", "")).lower()
+            if state is None or status == "completed":
+                return ""
+            if status != "running":
+                return text_of(state) or f"the motion ended as {shown(status)}"
 
     async def _until_release(
         self, held: HeldRobot, jog: Jogging, verb: str, params: Mapping[str, Any], begun: list[asyncio.Task[Envelope]]

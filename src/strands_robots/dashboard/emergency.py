@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from typing import Any
 
 from strands_robots.cli.output import plain
@@ -40,6 +40,7 @@ class FleetStop:
         self._seen: dict[tuple[str, Scope], tuple[object, bool, frozenset[str]]] = {}
         self._pressed_at: float | None = None
         self._by = ""
+        self._for: tuple[Scope, tuple[StopButton, ...]] = (EVERY_ROBOT, ())
 
     def press(self, who: str = "") -> None:
         """Stop every robot of every network; returns at once.
@@ -49,21 +50,39 @@ class FleetStop:
         """
         for button in self._buttons.values():
             button.press()
-        self._pressed_at, self._by = time.time(), who
+        self._pressed_at, self._by, self._for = time.time(), who, (EVERY_ROBOT, ())
 
     def press_one(self, network: str, robot: str) -> None:
         """Stop and lock one robot; returns at once. Every robot where it is none."""
-        feed = next((each for each in self._feeds if each.network == network), None)
+        feeds = [each for each in self._feeds if each.network == network]
         scope = Scope.named([robot])
-        if feed is None or scope.everything:
+        if not feeds or scope.everything:
             self.press(robot)
+        else:
+            self._press_some(feeds, scope, robot)
+
+    def press_cell(self, cell: str) -> None:
+        """Stop and lock the robots of a cell and those without one; returns at once.
+
+        It is sent on each network on which such a robot is known. Every robot stops where none is known in the cell.
+        """
+        scope = Scope.read({"cell": cell})
+        if scope.everything or all(row.cell != scope.cell for row in self._model.rows()):
+            self.press(cell)
             return
-        button = self._some.get((network, scope))
-        if button is None:
-            button = StopButton(feed.controller, lambda: scope.only, REASON, scope)
-            self._some = {**self._some, (network, scope): button}
-        button.press()
-        self._pressed_at, self._by = time.time(), robot
+        feeds = [each for each in self._feeds if self._model.expected(each.network, scope)]
+        self._press_some(feeds or self._feeds, scope, cell)
+
+    def _press_some(self, feeds: Iterable[FleetFeed], scope: Scope, who: str) -> None:
+        pressed = []
+        for feed in feeds:
+            button = self._some.get((feed.network, scope))
+            if button is None:
+                button = StopButton(feed.controller, _expected(self._model, feed.network, scope), REASON, scope)
+                self._some = {**self._some, (feed.network, scope): button}
+            button.press()
+            pressed.append(button)
+        self._pressed_at, self._by, self._for = time.time(), who, (scope, tuple(pressed))
 
     def close(self) -> None:
         """Give up a stop that waits for the link."""
@@ -83,8 +102,8 @@ class FleetStop:
             running, progress, report = button.running, button.progress, button.report
             outcome = button.outcome
             latest = report if report is not None and not running else progress
-            some = scope.only if latest is None or not latest.widened else ()
-            expected = frozenset(some or self._model.expected(network))
+            wider = EVERY_ROBOT if latest is not None and latest.widened else scope
+            expected = frozenset(_expected(self._model, network, wider)())
             seen = (latest, running, expected)
             if latest is None or self._seen.get((network, scope)) == seen:
                 continue
@@ -108,7 +127,18 @@ class FleetStop:
             "roster": {name: _roster(each.outcome) for name, each in self._buttons.items() if each.outcome is not None},
             "pressed_at": self._pressed_at,
             "pressed_by": self._by,
+            "pressed_for": self._pressed_for(),
         }
+
+    def _pressed_for(self) -> str:
+        """Return the scope of the latest press; empty for every robot.
+
+        A stop that was widened is one of every robot.
+        """
+        scope, buttons = self._for
+        latest = [each.progress if each.running else each.report for each in buttons]
+        widened = any(each is not None and each.widened for each in latest)
+        return "" if scope.everything or widened else str(scope)
 
     def _verdicts(
         self, latest: Progress | StopReport, expected: frozenset[str], outcome: StopOutcome | None
@@ -167,5 +197,5 @@ def _roster(outcome: StopOutcome) -> dict[str, Any]:
     }
 
 
-def _expected(model: FleetModel, network: str) -> Callable[[], tuple[str, ...]]:
-    return lambda: model.expected(network)
+def _expected(model: FleetModel, network: str, scope: Scope = EVERY_ROBOT) -> Callable[[], Collection[str]]:
+    return lambda: scope.only or model.expected(network, scope)

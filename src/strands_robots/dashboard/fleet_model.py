@@ -17,8 +17,9 @@ from typing import Any
 
 from strands_robots.cli.lockout_report import LockoutReport
 from strands_robots.cli.output import plain
-from strands_robots.dashboard.history import OVERLAP_S, History, plain_values
+from strands_robots.dashboard.history import OVERLAP_S, WINDOW_S, History, plain_values
 from strands_robots.device_connect.telemetry import numbers
+from strands_robots.safety.scope import EVERY_ROBOT, Scope
 
 ROBOTS_MAX = 2000
 """Rows; further names are not taken, so that invented ones use no memory."""
@@ -43,6 +44,7 @@ class RobotRow:
     """One robot of one network.
 
     Attributes:
+        cell: the cell that it is in, empty for none; None where it did not say, and stops with every cell.
         locked: None where it did not say, or where its answer does not count; ``doubt`` has the reason.
         heard: monotonic seconds of the last sign of life; None before the first.
         stop: its answer to the latest emergency stop, first given at ``stop_at``; ``freed`` once it is not locked by
@@ -61,6 +63,7 @@ class RobotRow:
     id: str
     kind: str = ""
     model: str = ""
+    cell: str | None = None
     task: dict[str, Any] = field(default_factory=dict)
     locked: bool | None = None
     lockouts: list[dict[str, Any]] = field(default_factory=list)
@@ -100,6 +103,7 @@ class RobotRow:
             "id": self.id,
             "kind": self.kind,
             "model": self.model,
+            "cell": self.cell,
             "task": self.task,
             "locked": self.locked,
             "lockouts": self.lockouts,
@@ -136,7 +140,7 @@ class FleetModel:
         self._timeline: deque[tuple[int, str]] = deque(maxlen=TIMELINE_MAX)
         self._number = 0
         self._gone: deque[tuple[int, str]] = deque(maxlen=TIMELINE_MAX)
-        self._expected: dict[str, tuple[str, ...]] = {}
+        self._expected: dict[str, tuple[tuple[str, str | None], ...]] = {}
 
     # Written by the feeds.
 
@@ -146,7 +150,7 @@ class FleetModel:
             row = self._row(network, name)
             if row is None:
                 return
-            changed = False
+            changed, cell = False, row.cell
             for field_name, value in facts.items():
                 if getattr(row, field_name) != value:
                     setattr(row, field_name, value)
@@ -154,7 +158,7 @@ class FleetModel:
             if changed:
                 row.changed = self._next()
                 self.history.changed(row, self.clock())
-            if "expected" in facts:
+            if "expected" in facts or row.cell != cell:
                 self._note_expected(network)
 
     def sign_of_life(self, network: str, name: str, link_ms: float | None = None) -> None:
@@ -232,6 +236,7 @@ class FleetModel:
             lockouts=[{name: _cut(value) for name, value in row.items()} for row in rows],
             doubt="",
             alarm=False,
+            cell=_cut(facts["cell"]) if isinstance(facts.get("cell"), str) else None,
             control=control,
             check_in=_check_in(facts.get("check_in")),
         )
@@ -302,6 +307,15 @@ class FleetModel:
             number = self._next()
             self._timeline.append((number, json.dumps({**entry, "n": number}, allow_nan=False, default=str)))
 
+    def note_stop(self, event: str, facts: Mapping[str, Any], network: str = "", name: str = "") -> None:
+        """Add a page's STOP or halt to the timeline and to the history.
+
+        The timeline has what robots say, too; no robot writes into the history's stops.
+        """
+        self.note(network, name, event, facts)
+        with self._lock:
+            self.history.stops.append((event, round(time.time(), 3), key_of(network, name) if name else ""))
+
     def forget(self, key: str, longer_than_s: float) -> bool:
         """Remove a robot that was silent for so long; False where it was not."""
         with self._lock:
@@ -316,9 +330,13 @@ class FleetModel:
 
     # Read by the pages.
 
-    def expected(self, network: str) -> tuple[str, ...]:
-        """Return the robots that must answer a stop; takes no lock."""
-        return self._expected.get(network, ())
+    def expected(self, network: str, scope: Scope = EVERY_ROBOT) -> tuple[str, ...]:
+        """Return the robots that must answer a stop of all or of a cell; takes no lock.
+
+        A robot that states no cell reads no scope, and stops whatever it is.
+        """
+        rows = self._expected.get(network, ())
+        return tuple(name for name, cell in rows if cell is None or scope.covers(name, {cell} - {""}))
 
     def row(self, key: str) -> RobotRow | None:
         """Return the row of a robot, or None."""
@@ -406,6 +424,15 @@ class FleetModel:
                 starts = [round(each, 2) for each in found[0]]
                 yield json.dumps({"key": key, "at": starts, "as": found[1]}, allow_nan=False)
 
+    def stops(self) -> list[tuple[str, float, str]]:
+        """Return the presses of STOP and the halts of the history's window.
+
+        Each has its event, wall time and the robot's key, empty for all.
+        """
+        since = time.time() - WINDOW_S
+        with self._lock:
+            return [each for each in self.history.stops if each[1] > since]
+
     def series(self, key: str, after: float) -> Iterator[str] | None:
         """Return the samples of a robot after a time, a line a series, or None."""
         with self._lock:
@@ -413,7 +440,7 @@ class FleetModel:
         if row is None or found is None:
             return None
         times, values = found
-        head = json.dumps({"key": key, "times": [round(each, 3) for each in times], "units": row.units}, default=str)
+        head = json.dumps({"key": key, "times": times, "units": row.units}, default=str)
         lines = (json.dumps({"name": name, "values": plain_values(each)}) for name, each in values.items())
         return chain((head,), lines)
 
@@ -426,7 +453,7 @@ class FleetModel:
         return row
 
     def _note_expected(self, network: str) -> None:
-        names = tuple(row.id for row in self._rows.values() if row.network == network and row.expected)
+        names = tuple((row.id, row.cell) for row in self._rows.values() if row.network == network and row.expected)
         self._expected = {**self._expected, network: names}
 
     def _next(self) -> int:

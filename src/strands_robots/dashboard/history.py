@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from array import array
 from bisect import bisect_right
+from collections import deque
 from typing import Protocol
 
 MOVING, STILL, LOCKED, LOCKED_MOVING, SILENT = "m", "s", "l", "x", "q"
@@ -34,6 +35,9 @@ ROBOT_JOINTS_MAX, JOINTS_MAX = 16, 8192
 
 JOINTS_OLD_S = 15.0
 """Age from which joints are not sampled; at rest they come once in 10 s."""
+
+STOPS_MAX = 1000
+"""Presses of STOP and halts that are kept."""
 
 OVERLAP_S = 30.0
 """Seconds that an update goes back: a silence is found after it began."""
@@ -129,9 +133,11 @@ class History:
     Attributes:
         silent_s: seconds without a sign of life after which a robot is silent.
         number: of the latest change of a state.
+        stops: presses of STOP and halts by the pages: event, wall time and the robot's key, empty for all.
     """
 
     def __init__(self) -> None:
+        self.stops: deque[tuple[str, float, str]] = deque(maxlen=STOPS_MAX)
         self.silent_s = SILENT_S
         self._states: dict[str, States] = {}
         self._series: dict[str, Series] = {}
@@ -166,7 +172,8 @@ class History:
 
     def begin_sample(self, now: float) -> None:
         """Begin the samples of a new time."""
-        self._times[self._count % SAMPLES] = now
+        # As it is sent: a page asks for what came after the last time that it got.
+        self._times[self._count % SAMPLES] = round(now, 3)
         self._count += 1
 
     def sample(self, row: Row, now: float) -> None:

@@ -25,12 +25,14 @@ from strands_robots.dashboard.pictures import SMALL, SMALL_HZ, Pictures
 from strands_robots.dashboard.verb_forms import LEFT_OUT
 from strands_robots.envelope import Envelope, error, is_error, jsonable, text_of
 from strands_robots.recording.cameras import OVERVIEW
+from strands_robots.safety.stopping import grade
 from strands_robots.safety.unheard import Unheard, unheard_now
 from strands_robots.utils import ValidationError, shown, text
 
 logger = logging.getLogger(__name__)
 
 STOPS = ("stop", "stopMotion")
+HALTED = "halted here"
 
 TICK_S, SLOW_TICKS = 0.05, 10
 """Seconds between two looks for changes, and looks between two updates of ages and steps."""
@@ -284,7 +286,9 @@ class PageSession:
             self.tell({**details, "looked": looked})
 
     def _jog(self, key: str, message: Message) -> None:
-        why = "A viewer may not move robots." if self._role != OPERATOR else self._control.begin(key, message)
+        row = self._server.model.row(key)
+        units = row.units if row is not None else {}
+        why = "A viewer may not move robots." if self._role != OPERATOR else self._control.begin(key, message, units)
         if why:
             self.tell({"type": "jogged", "key": key, "refused": True, "stopped": None, "began": False, "why": why})
 
@@ -312,7 +316,11 @@ class PageSession:
         if verb in STOPS:
             # Before anything else of the message is looked at.
             stopped, name = self._feed(key)
-            return await stopped.stop(name)
+            # Its next stretch may be on the way to a robot that stands between two of them.
+            self._control.release(key, "it was halted")
+            answer = await stopped.stop(name)
+            self._note_halt(stopped.network, name, grade(answer).stopped)
+            return answer
         if not isinstance(params, dict):
             raise ValidationError(f"params must be an object, not {shown(params)}.")
         feed, robot = self._feed(key)
@@ -324,6 +332,13 @@ class PageSession:
             self._may_drive()
             params = {**params, **self._control.lease(key)}
         return await feed.call(robot, verb, params, CALL_S + WAIT_S)
+
+    def _note_halt(self, network: str, robot: str, stopped: bool | None) -> None:
+        client = self._socket.client
+        by = f"{self._role}, {client.host}" if client is not None else self._role
+        self._server.model.note_stop(
+            HALTED, {"by": by, "stopped": "unknown" if stopped is None else stopped}, network, robot
+        )
 
     async def _take_control(self, key: str, message: Message) -> Envelope:
         self._may_drive()

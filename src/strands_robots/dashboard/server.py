@@ -37,6 +37,7 @@ logger = logging.getLogger(__name__)
 STATIC = Path(__file__).parent / "static"
 TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
 
+STOP_PRESSED = "STOP pressed"
 HELLO_S = 5.0
 WRONG_TOKEN_S = 1.0
 LINK_S = 0.2
@@ -201,15 +202,19 @@ class Dashboard:
                     # Before anything else is done with it.
                     named = pressed.get("robot")
                     who = named[:128] if isinstance(named, str) else ""
-                    key = pressed.get("only")
-                    # A robot that is not known here is no reason to stop none.
-                    row = self.model.row(key) if isinstance(key, str) else None
-                    if row is None:
-                        self.stop.press(who)
-                    else:
+                    only, cell = pressed.get("only"), pressed.get("cell")
+                    # A robot that is not known here is no reason to stop none; both are no scope.
+                    row = self.model.row(only) if isinstance(only, str) and cell is None else None
+                    button = who or "all robots"
+                    if row is not None:
                         self.stop.press_one(row.network, row.id)
-                    button = f"{row.id} alone" if row is not None else who or "all robots"
-                    self.model.note("", "", "STOP pressed", {"button": button})
+                        button = f"{row.id} alone"
+                    elif isinstance(cell, str) and only is None:
+                        self.stop.press_cell(cell[:128])
+                        button = f"cell {cell[:128]}"
+                    else:
+                        self.stop.press(who)
+                    self.model.note_stop(STOP_PRESSED, {"button": button})
                     await socket.send_text(json.dumps({"type": "pressed", "id": pressed.get("id")}, default=str))
         except (ValueError, RecursionError, KeyError, RuntimeError, WebSocketDisconnect) as gone:
             logger.debug("A page is gone, or sent no message of this page: %s", type(gone).__name__)
@@ -246,12 +251,13 @@ class Dashboard:
         if asked.get("ticket", "") not in self._sessions:
             return PlainTextResponse(NO_TICKET, 403)
         number, at = _number(asked.get("number")), _number(asked.get("at"))
-        head = {"number": self.model.history.number, "now": self.model.clock(), "wall": time.time()}
-        keys = [row.key for row in self.model.rows()]
+        model = self.model
+        head = {"number": model.history.number, "now": model.clock(), "wall": time.time(), "stops": model.stops()}
+        keys = [row.key for row in model.rows()]
 
         async def lines() -> AsyncIterator[str]:
             yield json.dumps(head) + "\n"
-            for line in self.model.states(keys, int(number), at):
+            for line in model.states(keys, int(number), at):
                 yield line + "\n"
                 await asyncio.sleep(0)
 

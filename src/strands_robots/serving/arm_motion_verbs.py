@@ -159,7 +159,7 @@ _VERBS = (
         Kind.MOTION,
         "Move joints to positions; the way is checked for limits and contacts before anything moves.",
         (
-            Parameter("joints", dict, "Degrees by joint name; joints left out stay", _positions),
+            Parameter("joints", dict, "Degrees by joint name, metres for a slide; joints left out stay", _positions),
             SPEED,
             WAIT,
             PICTURE,

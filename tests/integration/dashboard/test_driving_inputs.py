@@ -81,6 +81,20 @@ def test_gamepad_that_is_unplugged_stops_the_jog(cell: Any) -> None:
     eventually(lambda: not moving(arms), what="the arm stands")
 
 
+def test_jog_that_is_held_does_not_start_the_arm_again_after_a_halt(cell: Any) -> None:
+    arms = cell.serve_arms("arm-1")
+    server = cell.serve_page()
+    page, other = cell.open(server, robots=1), cell.open(server, robots=1)
+    hold_until(page, take(page), lambda: moving(arms), "the arm moves")
+    card(other, "arm-1").get_by_role("button", name="Halt arm-1").click()
+    card(other, "arm-1").get_by_text("Halted at").wait_for()
+    page.locator(".drive .said", has_text="It does not move").wait_for()
+    for _ in range(10):
+        assert not moving(arms), "the button is still held"
+        page.wait_for_timeout(100)
+    page.mouse.up()
+
+
 BASE = forms_of([{"name": name, "labels": {"direction": "write"}} for name in ("acquireControl", "drive", "stop")])
 
 
@@ -119,6 +133,26 @@ def test_gripper_is_moved_by_its_pose_and_opened(
     page.mouse.up()
     page.locator(".drive .said", has_text="Stopped (").wait_for()
     assert served.feed.stops >= 1
+
+
+@pytest.mark.parametrize("view", ["#/", "#/history", "#/cameras"])
+def test_keys_and_sticks_move_nothing_on_another_view(page: Any, served: ServedPage, view: str) -> None:
+    served.robot("arm-1")
+    served.model.observe("dc", "arm-1", {"pan": 0.1})
+    page.evaluate(PADS)
+    take(page)
+    page.evaluate(f"location.hash = {view!r}")
+    page.locator("#robot").wait_for(state="detached")
+    page.keyboard.down("q")
+    page.evaluate("window.pads = [{axes: [0.9, 0]}]")
+    page.wait_for_timeout(500)
+    assert not served.feed.asked("moveJoints")
+    page.keyboard.up("q")
+    page.evaluate("window.pads = []")
+    page.evaluate("location.hash = '#/robot/dc:arm-1'")
+    button = page.locator("button.jog[aria-label='pan +']")
+    hold_until(page, button, lambda: served.feed.asked("moveJoints"), "the key moves it again", "q")
+    page.keyboard.up("q")
 
 
 def test_robot_is_taken_from_an_agent_by_signature_and_given_back(cell: Any, tmp_path: Path) -> None:

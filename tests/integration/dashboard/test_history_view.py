@@ -173,6 +173,30 @@ def test_filter_never_hides_a_red_row_nor_stop(page: Any, served: ServedPage) ->
     assert page.locator("#history-hidden-count").inner_text() == "7 hidden"
 
 
+def test_halt_is_marked_in_the_lane_of_its_robot(page: Any, served: ServedPage) -> None:
+    for name in ("arm-1", "arm-2"):
+        served.robot(name)
+    page.get_by_role("button", name="Halt arm-1").click()
+    page.get_by_text("Halted at").wait_for()
+    served.model.note("dc", "arm-2", "halted here", {"stopped": True})
+    opened(page, "History")
+    page.locator(".lane[data-key='dc:arm-1'] canvas[aria-label$=', 1 halt']").wait_for()
+    picture(page, "history-halt")
+    assert "halt" not in page.locator(".lane[data-key='dc:arm-2'] canvas").get_attribute("aria-label")
+
+
+def test_kind_that_is_chosen_is_listed_once_without_a_robot_of_it(page: Any, served: ServedPage) -> None:
+    served.robot("arm-1", model="so101")
+    served.robot("arm-2")
+    shows(page, "document.querySelectorAll('.card').length === 2")
+    page.select_option("#filter-kind", "so101 · robot · Device Connect")
+    shows(page, "document.querySelectorAll('.card').length === 1")
+    assert served.model.forget("dc:arm-1", -1.0)
+    page.get_by_text("No robot matches.").wait_for()
+    page.wait_for_timeout(1000)
+    assert page.locator("#filter-kind option[value^='so101']").count() == 1
+
+
 def test_cameras_show_twelve_at_a_time_and_rest_while_nobody_looks(page: Any, served: ServedPage) -> None:
     encoded = io.BytesIO()
     Image.new("RGB", (320, 240), (40, 120, 160)).save(encoded, "JPEG")

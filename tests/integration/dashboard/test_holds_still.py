@@ -32,6 +32,7 @@ new PerformanceObserver((list) => {
 """
 STATED = {"type": "string", "description": "Name of the object; empty to give its place"}
 READS = forms_of([{"name": name, "labels": {"direction": "read"}} for name in ("getObjects", "getPose")])
+SEES = (*FORMS, *forms_of([{"name": "getPicture", "labels": {"direction": "read"}}]))
 PICK = forms_of(
     [
         {
@@ -125,6 +126,44 @@ def test_cards_stay_where_they_are(still: Any, served: ServedPage) -> None:
     eventually(lambda: card(still, "arm-1").count() == 0, what="arm-1 is gone")
     unmoved(still, "a robot went")
     assert card(still, "arm-2").bounding_box() == before
+    served.model.update("dc", "arm-2", forms=SEES, model="so101")
+    card(still, "arm-2").get_by_text("so101").wait_for()
+    unmoved(still, "a robot told that it has a camera")
+    assert card(still, "arm-2").bounding_box() == before
+    still.locator("#sort").click()
+    card(still, "arm-2").locator(".shot").wait_for()
+
+
+@pytest.mark.parametrize(("view", "place"), [("History", ".lane"), ("Cameras", ".tile:has(.name[href])")])
+def test_rows_under_a_filter_stay_where_they_are(still: Any, served: ServedPage, view: str, place: str) -> None:
+    def moves(*numbers: int) -> None:
+        for number in range(4):
+            served.model.task("dc", f"arm-{number}", state="running" if number in numbers else "idle")
+
+    def seen() -> list[str]:
+        return [str(text) for text in still.locator(f"{place} a, {place} .lane-name").all_inner_texts()]
+
+    for number in range(4):
+        served.robot(f"arm-{number}", forms=SEES)
+    moves(1, 2, 3)
+    shows(still, "document.querySelectorAll('.card').length === 4")
+    still.select_option("#filter", "moving")
+    shows(still, "document.querySelectorAll('.card').length === 3")
+    still.locator("#views a", has_text=view).click()
+    eventually(lambda: seen() == ["arm-1", "arm-2", "arm-3"], what="the robots that move")
+    places = {each: still.locator(place, has_text=each).bounding_box() for each in ("arm-2", "arm-3")}
+    settle(still)
+    still.evaluate("window.shifts = []")
+    moves(2, 3)
+    eventually(lambda: [each for each in seen() if each] == ["arm-2", "arm-3"], what="arm-1 is not seen")
+    moves(3)
+    eventually(lambda: [each for each in seen() if each] == ["arm-3"], what="arm-2 is not seen")
+    moves(0, 2, 3)
+    eventually(lambda: [each for each in seen() if each] == ["arm-2", "arm-3", "arm-0"], what="arm-0 comes last")
+    assert {each: still.locator(place, has_text=each).bounding_box() for each in places} == places
+    unmoved(still, "robots pass the filter, and pass no more")
+    if view == "History":
+        assert still.locator(".lane").count() == 4
 
 
 def test_a_stop_and_its_answers_move_nothing(still: Any, served: ServedPage) -> None:
@@ -194,6 +233,23 @@ def test_a_pad_stays_under_the_pointer(still: Any, served: ServedPage) -> None:
     picture(still, f"still-drive-{still.viewport_size['width']}")
 
 
+def test_pads_keep_their_places_when_other_joints_are_told(page: Any, served: ServedPage) -> None:
+    def titles() -> list[str]:
+        return [str(each) for each in page.locator(".pads legend").all_inner_texts()]
+
+    served.robot("arm-1")
+    served.model.observe("dc", "arm-1", {"pan": 0.1, "lift": 0.2})
+    button = take(page)
+    assert titles() == ["Joints", "Gripper's pose", "Gripper"]
+    hold(page, button)
+    eventually(lambda: served.feed.asked("moveJoints"), what="the jog")
+    served.model.observe("dc", "arm-1", {"pan": 0.1, "lift": 0.2, "wrist": 0.3})
+    page.locator("button.jog[aria-label='wrist +']").wait_for()
+    assert titles() == ["Joints", "Gripper's pose", "Gripper"]
+    page.locator(".drive .said", has_text="Stopped (").wait_for()
+    page.mouse.up()
+
+
 def test_events_and_results_are_read_in_their_own_places(still: Any, served: ServedPage) -> None:
     served.robot("arm-1", forms=(*FORMS, *READS, *PICK), cameras=("front", "wrist"))
     served.feed.answers["getObjects"] = [success("2 objects.", objects=OBJECTS)]
@@ -228,7 +284,25 @@ def test_events_and_results_are_read_in_their_own_places(still: Any, served: Ser
         )
 
 
-# One robot, all robots.
+# One robot, one cell, all robots.
+
+
+def test_button_of_a_cell_is_there_where_the_robot_is_in_one(still: Any, served: ServedPage) -> None:
+    served.robot("arm-1", cell="cell-1")
+    served.robot("arm-2")
+    open_robot(still, "arm-2")
+    assert not still.locator(".stop-cell").is_visible()
+    served.model.update("dc", "arm-2", cell="cell-2")
+    unmoved(still, "the cell was told later")
+    still.locator("#robot .back a").click()
+    open_robot(still, "arm-1")
+    button = still.locator(".stop-cell")
+    picture(still, f"stop-cell-{still.viewport_size['width']}")
+    button.click()
+    scopes = served.feed.controller.scopes
+    eventually(lambda: [str(each) for each in scopes] == ["cell cell-1 and robots without a cell"], what="its stop")
+    still.locator("#stop").click()
+    eventually(lambda: len(scopes) == 2 and scopes[1].everything, what="the big button is that of all")
 
 
 def test_halt_ends_the_motion_of_one_robot_alone(still: Any, served: ServedPage) -> None:
@@ -245,7 +319,11 @@ def test_halt_ends_the_motion_of_one_robot_alone(still: Any, served: ServedPage)
     assert still.evaluate(radius.format("halt")) != still.evaluate(radius.format("stop-one"))
     served.feed.stop_answer = error("the bus is silent.", stopped=None)
     button.click()
-    card(still, "arm-2").get_by_text("DID NOT CONFIRM ITS HALT: the bus is silent.").wait_for()
+    said = card(still, "arm-2").get_by_text("NOT HALTED: press STOP. the bus is silent.")
+    said.wait_for()
+    box, around = said.bounding_box(), card(still, "arm-2").bounding_box()
+    assert box["y"] + box["height"] <= around["y"] + around["height"], "the answer is inside of the card"
+    picture(still, f"not-halted-{still.viewport_size['width']}")
     assert served.feed.controller.presses == []
     open_robot(still, "arm-2")
     box = still.locator("#robot .halt").bounding_box()
@@ -296,14 +374,18 @@ def test_joints_are_told_in_degrees_with_their_ranges(page: Any, served: ServedP
     assert page.locator(".legend li").all_inner_texts() == ["pan"]
 
 
-def test_joints_of_a_motion_are_asked_for_in_degrees_each(page: Any, served: ServedPage) -> None:
-    described = {"joints": {"type": "object", "description": "Degrees by joint name; joints left out stay"}}
+def test_joints_of_a_motion_are_asked_for_in_their_units(page: Any, served: ServedPage) -> None:
+    described = {
+        "joints": {"type": "object", "description": "Degrees by joint name, metres for a slide; joints left out stay"}
+    }
     moves = {"name": "moveJoints", "labels": {"direction": "write"}}
     joints = forms_of([{**moves, "parameters": {"properties": described, "required": ["joints"]}}])
-    served.robot("arm-1", forms=(*joints, *READS))
+    served.robot("arm-1", forms=(*joints, *READS), units={"pan": "radians", "lift": "radians", "rail": "metres"})
     served.model.observe("dc", "arm-1", {"pan": 0.7854})
+    served.feed.answers["getPose"] = [success("here", joints={"pan": 45.0, "lift": 0.0, "rail": 0.1234})]
     open_robot(page)
     form = verb_form(page, "moveJoints")
+    assert form.get_by_label("rail, m").get_attribute("placeholder") == "stays at 0.123"
     form.get_by_label("lift, \u00b0").fill("12.5")
     form.get_by_role("button", name="Run").click()
     eventually(lambda: served.feed.asked("moveJoints"), what="the motion")

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from fixtures.page_driving import open_robot
 from fixtures.page_site import picture, shows
 from fixtures.served_page import ServedPage
 
@@ -42,6 +43,23 @@ def hostile_site() -> Iterator[str]:
     finally:
         server.shutdown()
         server.server_close()
+
+
+def test_names_that_every_object_has_are_only_names(page: Any, served: ServedPage) -> None:
+    problems: list[str] = []
+    page.on("pageerror", lambda error: problems.append(str(error)))
+    served.robot("arm-1", kind="constructor", model="toString")
+    served.model.observe("dc", "arm-1", {"constructor": 0.5, "valueOf": 0.25})
+    served.model.note("dc", "arm-1", "constructor", {"hasOwnProperty": "x"})
+    open_robot(page)
+    page.locator(".bar").first.wait_for()
+    assert page.locator("#robot .kind").inner_text() == "toString \u00b7 constructor \u00b7 Device Connect"
+    page.locator(".events li", has_text="constructor").wait_for()
+    assert "native code" not in page.locator("#robot").inner_text()
+    page.locator("#views a", has_text="History").click()
+    page.locator("button[data-file=charts]:enabled").wait_for()
+    shows(page, "document.querySelector('#chart-others canvas').ariaLabel.includes('valueOf')")
+    assert problems == []
 
 
 def test_hostile_page_in_the_same_browser_reaches_nothing(page: Any, served: ServedPage) -> None:

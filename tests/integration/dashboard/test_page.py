@@ -33,6 +33,29 @@ def alarms(page: Any, what: str) -> None:
     shows(page, f"document.getElementById('alarm').textContent.includes({what!r})", 30.0)
 
 
+# One cell.
+
+
+def test_button_of_a_cell_stops_its_robots_and_no_other(cell: Any) -> None:
+    first, second = (cell.serve_arms(f"arm-{each}", STRANDS_CELL=f"cell-{each}") for each in (1, 2))
+    page = cell.open(cell.serve_page(), robots=2)
+    for arms in (first, second):
+        arms.ask("move")
+    open_robot(page)
+    button = page.locator("#robot .stop-cell")
+    button.wait_for()
+    assert "cell-1" in button.get_attribute("aria-label")
+    picture(page, "stop-cell")
+    button.click()
+    answer(page, "arm-1", "stopped")
+    page.locator("#stop-said", has_text="for cell cell-1 and robots without a cell").wait_for()
+    assert not moving(first) and moving(second, "arm-2")
+    page.keyboard.press("Space")
+    answer(page, "arm-2", "stopped")
+    assert not moving(second, "arm-2")
+    assert page.problems == []
+
+
 # Looking.
 
 

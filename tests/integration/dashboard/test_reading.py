@@ -69,6 +69,26 @@ def test_timeline_shows_one_robot_and_is_filtered_by_kind_and_by_text(page: Any,
     eventually(lambda: events(page) == ["Started", "task paused"], 30.0, what="what comes is filtered, too")
 
 
+def test_timeline_that_somebody_reads_above_is_bounded(page: Any, served: ServedPage) -> None:
+    served.robot("arm-1")
+    open_robot(page)
+
+    def note(events: int) -> None:
+        for number in range(events):
+            served.model.note("dc", "arm-1", "policyComplete", {"steps": number})
+        served.model.note("dc", "arm-1", "paused", {"events": events})
+        page.locator(".events li", has_text=f"events: {events}").wait_for()
+
+    note(100)
+    page.evaluate("document.querySelector('.events').scrollTop = 0")
+    for more in (190, 191, 192, 193, 194, 195):
+        note(more)
+    assert page.locator(".events li").count() == 1000
+    page.evaluate("(() => { const list = document.querySelector('.events'); list.scrollTop = list.scrollHeight; })()")
+    note(5)
+    assert page.locator(".events li").count() == 200
+
+
 def test_pose_of_an_arm_without_a_picture_of_it_is_drawn_from_its_joints(page: Any, served: ServedPage) -> None:
     served.robot("arm-1", forms=READS_POSE)
     served.feed.answers["getPose"] = [success("here", **POSED)]

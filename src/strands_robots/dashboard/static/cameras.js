@@ -71,22 +71,23 @@ export class CamerasView {
   // Called while it is still shown.
   close() { this.asked = ""; this.state.send({ type: "thumbnails", keys: [] }); }
 
-  turn(by) { this.first += by; this.list(); }
+  turn(by) { this.first += by; this.list(true); }
 
-  // Robots keep their places while the view is open: one that comes stands last.
+  // Robots keep their places while the view is open and the filter is the same: one that comes stands last, and the
+  // tile of one that passes no more is only not seen.
   list(keep = false) {
     const rows = [...this.fleet.rows.values()].filter((row) => row.pictures && this.filter.passes(row));
-    const found = new Map(rows.map((row) => [row.key, row])), old = keep && this.order ? this.order.filter((key) => found.has(key)) : [];
+    const found = new Map(rows.map((row) => [row.key, row])), old = keep && this.order ? this.order : [];
     const known = new Set(old);
     this.order = old.concat(rows.filter((row) => !known.has(row.key)).sort((a, b) => byName.compare(a.id, b.id)).map((row) => row.key));
     this.first = Math.max(0, Math.min(this.first, Math.floor(Math.max(0, this.order.length - 1) / TILES) * TILES));
     const shown = this.order.slice(this.first, this.first + TILES);
     this.tiles.forEach((tile, index) => tile.show(found.get(shown[index])));
-    setText(this.which, H.page(this.first + 1, this.first + shown.length, this.order.length));
+    setText(this.which, H.page(this.first + 1, this.first + shown.length, found.size ? this.order.length : 0));
     this.previous.disabled = this.first === 0;
     this.next.disabled = this.first + TILES >= this.order.length;
     this.filter.tell([...this.fleet.rows.values()].filter((row) => this.filter.passes(row)).length);
-    this.keys = shown;
+    this.keys = shown.filter((key) => found.has(key));
     this.ask();
   }
 

@@ -37,7 +37,8 @@ class Card {
     setLine(this.kind, kindText(row));
     setLine(this.task, taskText(row));
     setAttr(this.task, "data-on", fleet.moving(row) ? "yes" : "no");
-    this.shot.hidden = !row.pictures;
+    // A card that is shown keeps its size until the cards are sorted.
+    if (!this.node.isConnected) this.shot.hidden = !row.pictures;
     setAttr(this.node, "data-attention", fleet.attention(row));
     setLine(this.lock, lockText(row));
     setAttr(this.lock, "data-tone", row.alarm ? "bad" : row.locked === false ? "quiet" : "warn");
@@ -89,17 +90,17 @@ export class FleetView {
     const rows = [...this.fleet.rows.values()].filter((row) => this.filter.passes(row));
     const worst = rows.filter((row) => this.fleet.attention(row) < 2).length;
     this.filter.tell(rows.length, worst ? S.worst(worst) : "");
+    if (this.anew) { this.list.replaceChildren(); this.observer.disconnect(); this.visible.clear(); }
     for (const row of rows) {
       let card = this.cards.get(row.key);
       if (!card) {
         card = new Card(row, this.state, this.onStop);
         this.cards.set(row.key, card);
       }
-      if (this.drawn.get(row.key) !== row || this.mineVersion !== this.fleet.mine.size) { card.show(this.fleet, row); this.drawn.set(row.key, row); }
+      if (this.anew || this.drawn.get(row.key) !== row || this.mineVersion !== this.fleet.mine.size) { card.show(this.fleet, row); this.drawn.set(row.key, row); }
       else if (this.visible.has(row.key)) { card.tick(this.fleet, row); setAttr(card.node, "data-attention", this.fleet.attention(row)); }
     }
     this.mineVersion = this.fleet.mine.size;
-    if (this.anew) { this.list.replaceChildren(); this.observer.disconnect(); this.visible.clear(); }
     this.place(this.anew ? this.fleet.sorted(rows) : rows);
     this.anew = false;
     const coming = this.list.querySelector(".coming") !== null;
@@ -114,12 +115,17 @@ export class FleetView {
       this.visible.delete(node.dataset.key);
       node.replaceWith(el("li", { class: "place", "aria-hidden": "true", "data-picture": node.querySelector(".shot").hidden ? "no" : "yes" }));
     }
-    for (const key of [...this.cards.keys()]) if (!this.fleet.rows.has(key)) { this.cards.delete(key); this.drawn.delete(key); }
+    for (const [key, card] of [...this.cards]) {
+      if (this.fleet.rows.has(key)) continue;
+      if (card.picture.src.startsWith("blob:")) URL.revokeObjectURL(card.picture.src);
+      this.cards.delete(key);
+      this.drawn.delete(key);
+    }
     const coming = rows.filter((row) => this.cards.get(row.key).node.parentNode !== this.list);
     for (const row of this.anew ? coming : coming.sort((a, b) => byName.compare(a.id, b.id))) {
-      const node = this.cards.get(row.key).node;
+      const { node, shot } = this.cards.get(row.key);
       const free = this.list.querySelector(`.coming[data-id="${CSS.escape(row.id)}"]`) ||
-        this.list.querySelector(`.place[data-picture="${row.pictures ? "yes" : "no"}"]`);
+        this.list.querySelector(`.place[data-picture="${shot.hidden ? "no" : "yes"}"]`);
       if (free) free.replaceWith(node); else this.list.append(node);
       this.observer.observe(node);
     }
@@ -137,7 +143,7 @@ export class FleetView {
   }
 
   askThumbnails() {
-    const keys = [...this.visible].filter((key) => this.fleet.rows.get(key)?.pictures).slice(0, 12);
+    const keys = [...this.visible].filter((key) => this.fleet.rows.get(key)?.pictures && !this.cards.get(key)?.shot.hidden).slice(0, 12);
     const wanted = this.node.isConnected && !document.hidden ? keys : [];
     if (wanted.join("\n") === this.asked) return;
     this.asked = wanted.join("\n");

@@ -1,6 +1,7 @@
 // Two WebSockets: one carries state, the other nothing but STOP and the proof that STOP would work.
 const SILENT_MS = 700;
 const AGAIN_MS = 400;
+const CONNECTING_MS = 10_000;
 
 const fragment = new URLSearchParams(location.hash.slice(1));
 if (fragment.get("token")) {
@@ -15,7 +16,7 @@ export class Channel extends EventTarget {
     super();
     this.path = path;
     this.refused = false;
-    this.heardAt = 0;
+    this.heardAt = this.openedAt = 0;
     this.connect();
   }
 
@@ -23,8 +24,12 @@ export class Channel extends EventTarget {
 
   connect() {
     const socket = this.socket = new WebSocket(address(this.path));
+    this.beganAt = performance.now();
     socket.binaryType = "arraybuffer";
-    socket.onopen = () => socket.send(JSON.stringify({ type: "hello", token: token() }));
+    socket.onopen = () => {
+      if (socket === this.socket) this.openedAt = performance.now();
+      socket.send(JSON.stringify({ type: "hello", token: token() }));
+    };
     socket.onmessage = (event) => {
       if (socket !== this.socket) return;
       this.heardAt = performance.now();
@@ -48,10 +53,21 @@ export class Channel extends EventTarget {
   // True while the server has been heard a moment ago; a server that hangs keeps its socket open.
   get alive() { return this.open && performance.now() - this.heardAt < SILENT_MS; }
 
-  // A socket that is open and says nothing is given up, so that a new one is tried.
+  // A new socket has as long for its first word as an old one between two.
+  get silentMs() { return performance.now() - Math.max(this.heardAt, this.openedAt); }
+
+  // A socket that is open and says nothing for so long is given up for a new one; so is one that does not open.
+  renewIfSilent(longestMs) {
+    const connecting = this.socket.readyState === WebSocket.CONNECTING;
+    if (this.open ? this.silentMs > longestMs : connecting && performance.now() - this.beganAt > CONNECTING_MS) this.renew();
+  }
+
+  // The close of the old socket may come late or never, so what waits for an answer is told here. The new socket is
+  // there before: who is told may look at the channel.
   renew() {
     const old = this.socket;
     this.connect();
+    this.dispatchEvent(new CustomEvent("lost"));
     old.close();
   }
 }

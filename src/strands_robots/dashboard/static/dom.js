@@ -11,6 +11,9 @@ export function el(tag, attributes = {}, ...children) {
   return node;
 }
 
+// An entry of a table, never what every object inherits: a robot may call a joint `constructor`.
+export const own = (table, name) => (table && Object.hasOwn(table, name) ? table[name] : undefined);
+
 export function setText(node, text) {
   if (node.textContent !== text) node.textContent = text;
 }

@@ -28,6 +28,7 @@ export class Drive {
   }
 
   open(key) {
+    this.close();
     this.jog.key = this.key = key;
     this.jog.axes = [];
     this.groups.clear();
@@ -36,7 +37,11 @@ export class Drive {
     this.say(S.jogHint, "quiet");
   }
 
-  close() { this.jog.end("hidden"); }
+  // Keys and sticks move nothing that is not seen; draw() enables them again.
+  close() {
+    this.jog.end("hidden");
+    this.jog.setEnabled(false);
+  }
 
   say(text, tone) {
     setText(this.said, text);
@@ -66,15 +71,25 @@ export class Drive {
     if (arm && names.has("moveBy")) wanted.set("tip", () => [S.jogTip, Object.entries(S.tip).map(([axis, ways]) => this.pair("tip", axis, ways, null))]);
     if (arm && names.has("setGripper")) wanted.set("gripper", () => [S.jogGripper, [this.pair("gripper", "", [S.closeGripper, S.openGripper], null)]]);
     if (names.has("drive")) wanted.set("base", () => [S.jogBase, [this.pair("base", "linear", S.base.linear, 0), this.pair("base", "angular", S.base.angular, 1)]]);
-    for (const [id, group] of this.groups) if (!wanted.has(id)) { group.node.remove(); this.groups.delete(id); }
+    const ofJoints = (id) => id.startsWith("joints "), joints = [...wanted.keys()].find(ofJoints);
+    for (const [id, group] of this.groups) if (!wanted.has(id) && !(joints && ofJoints(id))) { group.node.remove(); this.groups.delete(id); }
     for (const [id, make] of wanted) {
       if (this.groups.has(id)) continue;
       this.jog.axes = [];
       const [title, pairs] = make();
       const group = { node: el("fieldset", {}, el("legend", { text: title }), ...pairs), axes: this.jog.axes };
-      this.groups.set(id, group);
-      this.pads.append(group.node);
+      const old = ofJoints(id) ? [...this.groups.keys()].find(ofJoints) : undefined;
+      if (old === undefined) {
+        this.groups.set(id, group);
+        this.pads.append(group.node);
+      } else {
+        // Other joints of the same robot take the place of those before.
+        this.groups.get(old).node.replaceWith(group.node);
+        this.groups = new Map([...this.groups].map(([each, own]) => each === old ? [id, group] : [each, own]));
+      }
     }
+    // Nobody can let go of a button that is gone.
+    if (this.jog.now && this.jog.now.node && !this.jog.now.node.isConnected) this.jog.end("released");
     this.jog.axes = [...this.groups.values()].flatMap((group) => group.axes);
     this.node.hidden = !names.has("acquireControl") && wanted.size === 0;
   }

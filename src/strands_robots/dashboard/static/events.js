@@ -1,4 +1,5 @@
 // Events in words: names as one says them, times as a clock shows them, and nothing that only a program reads.
+import { own } from "./dom.js";
 import { S } from "./strings.js";
 
 const TIME = /^(t|at|ts|since|until|time|timestamp)$|_at$/;
@@ -6,7 +7,7 @@ const LEFT_OUT = /^(epoch|estop_id|id|n|nonce|loop|robot_name|seq|statement|sign
 const EARLIEST = 1e9, LATEST = 4e9;
 const CODE = /^[0-9a-f]{16,}$/i;
 
-export const labelOf = (name) => S.labels[name] ||
+export const labelOf = (name) => own(S.labels, name) ||
   name.replace(/_(mm|ms|hz|deg)$/, ", $1").replace(/_s$/, ", s").replace(/([a-z\d])([A-Z])(?=[a-z])/g, (_, before, letter) => `${before} ${letter.toLowerCase()}`).replace(/_/g, " ").replace(/^[A-Z](?=[a-z])/, (letter) => letter.toLowerCase());
 
 export function textOf(name, value) {
@@ -31,7 +32,7 @@ function factText(name, given) {
   return value === "" || value === null || (typeof value === "string" && CODE.test(value)) ? "" : textOf(name, value);
 }
 
-export const eventText = (event) => S.events[event] || labelOf(event);
+export const eventText = (event) => own(S.events, event) || labelOf(event);
 
 export function factsText(each) {
   return Object.entries(each.facts)

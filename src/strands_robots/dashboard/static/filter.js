@@ -39,7 +39,8 @@ export class Filter {
       this.listed = listed;
       this.kind.replaceChildren(el("option", { value: "", text: H.allKinds }), ...kinds.map((text) => el("option", { value: text, text })));
     }
-    if (chosen.kind && !kinds.includes(chosen.kind)) this.kind.append(el("option", { value: chosen.kind, text: chosen.kind }));
+    const known = [...this.kind.options].some((each) => each.value === chosen.kind);
+    if (!known) this.kind.append(el("option", { value: chosen.kind, text: chosen.kind }));
     if (this.kind.value !== chosen.kind) this.kind.value = chosen.kind;
   }
 

@@ -1,4 +1,5 @@
 // The rows of all robots, and what is said of one.
+import { own } from "./dom.js";
 import { S } from "./strings.js";
 
 // Made once: a comparison that makes its own collator costs a hundred times as much.
@@ -101,7 +102,7 @@ export function lockText(row) {
 }
 
 export function kindText(row) {
-  return [row.model, S.kinds[row.kind] || row.kind, S.network[row.network] || row.network].filter(Boolean).join(" · ");
+  return [row.model, own(S.kinds, row.kind) || row.kind, S.network[row.network] || row.network].filter(Boolean).join(" · ");
 }
 
 export function taskText(row) {

@@ -55,8 +55,8 @@ class Field {
   makeJoints(pose, shown) {
     const names = Object.keys(pose);
     if (!names.length || shown) return;
-    this.each = names.map((name) => [name, el("input", { id: `${this.input.id}-${name}`, type: "text", inputmode: "decimal", autocomplete: "off", placeholder: S.jointAt(pose[name]) })]);
-    this.joints.replaceChildren(...this.each.flatMap(([name, input]) => [el("label", { for: input.id, text: `${name}, \u00b0` }), input]));
+    this.each = names.map((name) => [name, el("input", { id: `${this.input.id}-${name}`, type: "text", inputmode: "decimal", autocomplete: "off", placeholder: S.jointAt(pose[name], this.robot.slides(name) ? 3 : 1) })]);
+    this.joints.replaceChildren(...this.each.flatMap(([name, input]) => [el("label", { for: input.id, text: `${name}, ${this.robot.slides(name) ? "m" : "\u00b0"}` }), input]));
     this.input.hidden = true;
     this.node.firstChild.removeAttribute("for");
   }

@@ -7,6 +7,8 @@ export const H = {
   letters: { m: "M", s: "", l: "L", x: "!", q: "?" },
   legend: "States",
   stopMark: "STOP",
+  haltMark: "Halt",
+  halts: (n) => (n ? `, ${n} ${n === 1 ? "halt" : "halts"}` : ""),
   unknown: "not seen yet",
   lanes: "States of each robot",
   lane: (id, parts) => `${id}: ${parts}`,

@@ -1,6 +1,6 @@
 // The fleet over time: a lane for each robot, charts of the chosen one, and files of both.
 import { Chart } from "./chart.js";
-import { el, setAttr, setText } from "./dom.js";
+import { el, own, setAttr, setText } from "./dom.js";
 import { bothJson, chartsCsv, save, statesCsv } from "./export.js";
 import { Filter } from "./filter.js";
 import { byName, kindText } from "./fleet.js";
@@ -8,6 +8,8 @@ import { H } from "./history-strings.js";
 import { clipped, drawAxis, Lane } from "./lanes.js";
 
 const ASK_MS = 2000, KEPT_S = 3600, CHARTS_S = 900;
+// As many changes of a robot as the server keeps.
+const CHANGES_MAX = 1000;
 const TURN = 180 / Math.PI;
 
 async function* answerLines(address) {
@@ -31,6 +33,7 @@ export class HistoryView {
     this.state = state;
     this.lanes = new Map();
     this.visible = new Set();
+    this.order = [];
     this.seconds = 300;
     this.filter = new Filter(fleet, kindText, () => { this.order = []; this.draw(); }, "history-");
     this.window = el("div", { class: "choices", role: "group", "aria-label": H.window });
@@ -46,7 +49,7 @@ export class HistoryView {
     this.said = el("p", { class: "history-said", role: "status" });
     this.files = el("div", { class: "choices", role: "group", "aria-label": H.exportLabel });
     for (const [what, text] of [["states", H.statesCsv], ["charts", H.chartsCsv], ["json", H.bothJson]]) {
-      const button = el("button", { type: "button", "data-file": what, text });
+      const button = el("button", { type: "button", "data-file": what, disabled: what === "charts", text });
       button.addEventListener("click", () => this.save(what));
       this.files.append(button);
     }
@@ -83,6 +86,8 @@ export class HistoryView {
     this.number = 0;
     this.at = 0;
     this.clock = null;
+    // Of the page's server: the timeline has what robots say, too, and less of the past.
+    this.stops = [];
     this.series = null;
   }
 
@@ -133,13 +138,14 @@ export class HistoryView {
       const old = tracks.get(line.key) || { at: [], as: "" };
       const keep = old.at.filter((each) => each < line.at[0]).length;
       let track = { at: old.at.slice(0, keep).concat(line.at), as: old.as.slice(0, keep) + line.as };
-      const drop = track.at.filter((each) => each < head.now - KEPT_S).length - 1;
+      const drop = Math.max(track.at.filter((each) => each < head.now - KEPT_S).length - 1, track.at.length - CHANGES_MAX);
       if (drop > 0) track = { at: track.at.slice(drop), as: track.as.slice(drop) };
       tracks.set(line.key, track);
     }
     if (!head) return;
     this.number = head.number;
     this.at = head.now;
+    this.stops = head.stops;
     this.clock = { now: head.now, wall: head.wall, here: performance.now() };
   }
 
@@ -168,24 +174,28 @@ export class HistoryView {
 
   draw() {
     if (!this.shown) return;
-    const rows = this.rows();
-    this.arrange(rows);
+    const rows = this.rows(), passing = new Set(rows.map((row) => row.key));
+    this.arrange(rows, passing);
     this.filter.tell(rows.length);
     setText(this.empty, rows.length ? "" : this.fleet.rows.size ? H.noMatch : H.none);
-    if (!this.key && rows.length) this.choose(this.order[0]);
+    if (!this.key && rows.length) this.choose(this.order.find((key) => passing.has(key)));
     this.drawLanes();
     this.drawCharts();
   }
 
-  // Rows keep their places while the view is open: one that comes stands last.
-  arrange(rows) {
-    const wanted = new Map(rows.map((row) => [row.key, row]));
-    const kept = (this.order || []).filter((key) => wanted.has(key)), known = new Set(kept);
-    const fresh = rows.filter((row) => !known.has(row.key)).sort((a, b) => byName.compare(a.id, b.id)).map((row) => row.key);
-    const order = kept.concat(fresh);
-    if (this.list.childElementCount === order.length && this.order.length === order.length && !fresh.length) return;
+  // Rows keep their places while the view is open and the filter is the same: one that comes stands last, and one that
+  // passes no more is only not seen.
+  arrange(rows, passing) {
+    const known = new Set(this.order);
+    const fresh = rows.filter((row) => !known.has(row.key)).sort((a, b) => byName.compare(a.id, b.id));
+    if (fresh.length || this.list.childElementCount !== this.order.length) this.place(fresh);
+    for (const key of this.order) setAttr(this.lanes.get(key).node, "data-passes", passing.has(key) ? "yes" : "no");
+  }
+
+  place(fresh) {
+    const order = this.order.concat(fresh.map((row) => row.key)), wanted = new Map(fresh.map((row) => [row.key, row])), kept = new Set(order);
     this.order = order;
-    for (const key of [...this.lanes.keys()]) if (!this.fleet.rows.has(key)) this.lanes.delete(key);
+    for (const key of [...this.lanes.keys()]) if (!kept.has(key) && !this.fleet.rows.has(key)) this.lanes.delete(key);
     this.observer.disconnect();
     this.visible.clear();
     this.list.replaceChildren(...order.map((key) => {
@@ -202,10 +212,10 @@ export class HistoryView {
   drawLanes() {
     if (!this.clock || !this.shown) return;
     const to = this.now(), from = to - this.seconds, offset = this.clock.wall - this.clock.now;
-    drawAxis(this.axis, from, to, offset, this.fleet.events.filter((each) => each.event === "STOP pressed").map((each) => each.at * 1000));
+    drawAxis(this.axis, from, to, offset, this.stops.filter(([event]) => event === "STOP pressed").map(([, at]) => at * 1000));
     for (const key of this.visible) {
       const row = this.fleet.rows.get(key);
-      if (row) this.lanes.get(key).draw(this.tracks.get(key), from, to, offset, this.fleet.attention(row) === 0);
+      if (row) this.lanes.get(key).draw(this.tracks.get(key), from, to, offset, this.fleet.attention(row) === 0, this.stops.filter(([event, , halted]) => event === "halted here" && halted === key).map(([, at]) => at));
     }
   }
 
@@ -217,7 +227,7 @@ export class HistoryView {
     for (const [name, given] of Object.entries(values)) {
       const joint = name.startsWith("joint:") ? name.slice(name.indexOf("/") + 1) : "";
       if (joint) {
-        const shown = parts.size > 1 ? `${name.slice(6, name.indexOf("/"))} ${joint}` : joint, unit = units[joint] || "";
+        const shown = parts.size > 1 ? `${name.slice(6, name.indexOf("/"))} ${joint}` : joint, unit = own(units, joint) || "";
         const angle = unit === "radians" || unit === "degrees";
         found[angle ? "joints" : "others"].push({ name: shown, unit: angle ? H.degrees : unit || H.notStated,
           values: unit === "radians" ? given.map((each) => (each === null ? null : Number((each * TURN).toFixed(3)))) : given });
@@ -234,6 +244,7 @@ export class HistoryView {
     const row = this.key && this.fleet.rows.get(this.key);
     setText(this.chartsTitle, H.charts(row ? row.id : ""));
     const found = this.columns();
+    this.files.querySelector("[data-file=charts]").disabled = !(row && this.series);
     setText(this.loadNote, this.series ? this.loadStated ? H.loadKnown : H.loadUnknown : "");
     if (!this.clock) return;
     const offset = this.clock.wall - this.clock.now, to = (this.now() + offset) * 1000;
@@ -249,7 +260,7 @@ export class HistoryView {
   save(what) {
     if (!this.clock) return;
     const to = this.now(), from = to - this.seconds, offset = this.clock.wall - this.clock.now;
-    const states = this.order.map((key) => [this.fleet.rows.get(key), this.tracks.get(key)]).filter(([row, track]) => row && track)
+    const states = this.order.map((key) => [this.fleet.rows.get(key), this.tracks.get(key)]).filter(([row, track]) => row && track && this.filter.passes(row))
       .map(([row, track]) => ({ row, intervals: clipped(track, from, to).map(([state, begin, end]) => [state, begin + offset, end + offset]) }));
     let series = null;
     const row = this.key && this.fleet.rows.get(this.key);

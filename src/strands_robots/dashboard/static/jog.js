@@ -16,7 +16,7 @@ export class Jog {
     this.enabled = false;
     this.now = null;
     this.axes = [];
-    this.timer = 0;
+    this.timer = this.frame = 0;
     this.padAxis = "";
     document.addEventListener("visibilitychange", () => { if (document.hidden) this.end("hidden"); });
     for (const name of ["blur", "pagehide", "freeze"]) window.addEventListener(name, () => this.end("hidden"));
@@ -31,6 +31,7 @@ export class Jog {
     this.enabled = enabled;
     if (!enabled) this.end("released");
     for (const button of document.querySelectorAll("button.jog")) button.disabled = !enabled;
+    cancelAnimationFrame(this.frame);
     if (enabled) this.pollPad();
   }
 
@@ -115,6 +116,6 @@ export class Jog {
         if (axis) this.begin(axis, "gamepad", axis.node);
       }
     }
-    requestAnimationFrame(() => this.pollPad());
+    this.frame = requestAnimationFrame(() => this.pollPad());
   }
 }

@@ -41,13 +41,13 @@ export class Lane {
   }
 
   // Times are seconds of the server's clock.
-  draw(track, from, to, wallOffset, red) {
+  draw(track, from, to, wallOffset, red, halts) {
     const last = track && track.as.length ? track.as[track.as.length - 1] : "";
     setText(this.now, H.states[last] || H.unknown);
     setAttr(this.now, "data-state", last);
     setAttr(this.node, "data-red", red ? "yes" : "no");
     const intervals = track ? clipped(track, from, to) : [];
-    setAttr(this.canvas, "aria-label", H.lane(this.id, summary(intervals)));
+    setAttr(this.canvas, "aria-label", H.lane(this.id, summary(intervals) + H.halts(halts.filter((at) => at - wallOffset > from).length)));
     const made = pen(this.canvas);
     if (!made) return;
     const [draw, width, height, style] = made;
@@ -59,6 +59,15 @@ export class Lane {
     }
     draw.textBaseline = "middle";
     for (const state of ORDER) for (const [each, begin, end] of intervals) if (each === state) this.block(draw, style, state, x(begin), Math.max(2, x(end) - x(begin)), height);
+    draw.font = "bold 11px system-ui, sans-serif";
+    for (const place of halts.map((at) => x(at - wallOffset)).filter((each) => each >= 0)) {
+      const wide = draw.measureText(H.haltMark).width + 6, left = place > width - wide ? place - wide : place;
+      draw.fillStyle = style.getPropertyValue("--ink");
+      draw.fillRect(place - 1, 0, 2, height);
+      draw.fillRect(left, 0, wide, 14);
+      draw.fillStyle = style.getPropertyValue("--card");
+      draw.fillText(H.haltMark, left + 3, 7.5);
+    }
   }
 
   block(draw, style, state, left, width, height) {

@@ -15,7 +15,7 @@ const channel = new Channel("/stop");
 const stop = new Stop(channel, fleet);
 const state = new State();
 const view = new FleetView(fleet, state, (id) => stop.press(id));
-const robot = new RobotView(fleet, state, (id, only) => stop.press(id, only));
+const robot = new RobotView(fleet, state, (id, only, cell) => stop.press(id, only, cell));
 const history = new HistoryView(fleet, state);
 const cameras = new CamerasView(fleet, state);
 const others = { "#/history": history, "#/cameras": cameras };
@@ -114,5 +114,5 @@ document.addEventListener("visibilitychange", () => { view.askThumbnails(); came
 window.addEventListener("hashchange", route);
 // Ages grow also when nothing arrives.
 setInterval(draw, 250);
-setInterval(() => { if (state.open && state.heardAt && performance.now() - state.heardAt > 5000) state.renew(); }, 1000);
+setInterval(() => state.renewIfSilent(5000), 1000);
 route();

@@ -28,6 +28,8 @@ export class RobotView {
     this.stop.addEventListener("click", () => onStop(this.row() ? this.row().id : ""));
     this.stopAlone = el("button", { type: "button", class: "stop-one", text: S.stopAloneShort });
     this.stopAlone.addEventListener("click", () => { const row = this.row(); if (row) onStop(row.id, row.key); });
+    this.stopCell = el("button", { type: "button", class: "stop-one stop-cell", text: S.stopCellShort });
+    this.stopCell.addEventListener("click", () => { const row = this.row(); if (row) onStop(row.id, null, row.cell); });
     this.forget = el("button", { type: "button", class: "plain forget", text: S.forget, title: S.forgetHint });
     this.forget.addEventListener("click", () => this.state.ask({ type: "forget", key: this.key }));
     this.pictures = new Pictures();
@@ -44,7 +46,7 @@ export class RobotView {
         el("div", { class: "head" }, el("div", { class: "who" }, this.title, this.kind), this.halt.button),
         this.halt.said,
         el("div", { class: "now", role: "group", "aria-label": S.state, tabindex: 0 }, this.task, this.lock, this.age, this.verdict),
-        el("div", { class: "stop-own" }, this.stop, this.stopAlone, el("p", { class: "small", text: S.stopOneWhy }))),
+        el("div", { class: "stop-own" }, this.stop, this.stopCell, this.stopAlone, el("p", { class: "small", text: S.stopOneWhy }))),
       this.opening, this.parts);
     state.addEventListener("pose", ({ detail }) => { if (detail.key === this.key) this.pictures.showPose(detail.why); });
     state.addEventListener("robot", ({ detail }) => { if (detail.key === this.key) this.details(detail); });
@@ -63,6 +65,7 @@ export class RobotView {
     if (key === this.key) return;
     this.close();
     this.key = key;
+    this.placed = false;
     for (const part of [this.pictures, this.joints, this.drive, this.verbs]) part.open(key);
     this.ready(false);
     this.waiting = setTimeout(() => this.ready(true), READY_MS);
@@ -109,6 +112,11 @@ export class RobotView {
       setAttr(button, "aria-label", says);
       setAttr(button, "title", says);
     }
+    // The button has its place from the first look on, where the robot is in a cell.
+    if (!this.placed) { this.placed = true; this.stopCell.hidden = !row.cell; }
+    setShown(this.stopCell, Boolean(row.cell));
+    setAttr(this.stopCell, "aria-label", S.stopCell(row.cell));
+    setAttr(this.stopCell, "title", S.stopCell(row.cell));
     setLine(this.task, taskText(row));
     setAttr(this.task, "data-on", this.fleet.moving(row) ? "yes" : "no");
     setLine(this.lock, lockText(row) + (row.lockouts.length ? ` \u00b7 ${S.epoch} ${row.lockouts[0].epoch.slice(0, 8)}` : ""));

@@ -34,10 +34,10 @@ export class Stop {
     setInterval(() => this.look(), 100);
   }
 
-  // only: the key of the one robot that stops; without it all do.
-  press(robot, only) {
+  // only: the key of the one robot that stops; cell: the cell that does; without either all do.
+  press(robot, only, cell) {
     const id = ++this.id;
-    if (this.channel.send(only ? { type: "stop", robot, only, id } : { type: "stop", robot, id })) {
+    if (this.channel.send({ type: "stop", robot, id, ...(only ? { only } : {}), ...(cell ? { cell } : {}) })) {
       this.notSent = "";
       this.unconfirmed.set(id, performance.now());
     } else {
@@ -59,7 +59,7 @@ export class Stop {
   }
 
   look() {
-    if (this.channel.open && this.channel.heardAt && performance.now() - this.channel.heardAt > 3000) this.channel.renew();
+    this.channel.renewIfSilent(3000);
     const late = [...this.unconfirmed.values()].some((at) => performance.now() - at > CONFIRM_MS);
     const problem = [this.problem(), this.notSent, late ? S.sentUnconfirmed : ""].filter(Boolean).join(" ");
     setText(this.alarm, problem);
@@ -77,7 +77,8 @@ export class Stop {
     this.pressedAt = latest;
     const ready = answers.length === 0 && document.body.dataset.canStop === "yes" ? this.fleet.rows.size : 0;
     const rosters = latest && this.link && !this.link.running ? Object.values(this.link.roster || {}) : [];
-    const signature = JSON.stringify([ready, latest, rosters, this.link && this.link.running, answers.map((row) => [row.key, row.stop])]);
+    this.pressedFor = this.link ? this.link.pressed_for : this.pressedFor;
+    const signature = JSON.stringify([ready, latest, this.pressedFor, rosters, this.link && this.link.running, answers.map((row) => [row.key, row.stop])]);
     if (signature === this.signature) return;
     this.signature = signature;
     const groups = new Map(ORDER.map((state) => [state, []]));
@@ -93,7 +94,7 @@ export class Stop {
     else if (!bad && !running && !someFreed) summary = `${S.allStopped(groups.get("stopped").length)} ${S.nowLocked}`;
     const tone = !latest && answers.length === 0 ? "quiet" : bad || answers.length === 0 ? "bad" : running ? "warn" : someFreed ? "quiet" : "good";
     setAttr(this.head, "data-tone", tone);
-    this.head.replaceChildren(el("strong", { text: latest ? `${S.pressed(S.when(new Date(latest * 1000)))}: ` : "" }), summary);
+    this.head.replaceChildren(el("strong", { text: latest ? `${S.pressed(S.when(new Date(latest * 1000)), this.pressedFor)}: ` : "" }), summary);
     // Once all are free the cards say the rest.
     this.drawAnswers(freed ? [] : ORDER.flatMap((state) => groups.get(state)).slice(0, NAMES_MAX));
     const notes = el("div", {}, ...rosters.flatMap((each) => [each.sentence, ...each.notes]).map((text) => el("p", { class: "small", text })));

@@ -3,7 +3,7 @@ import { el, setText } from "./dom.js";
 import { eventText, factsText } from "./events.js";
 import { S } from "./strings.js";
 
-const SHOWN_MAX = 200;
+const SHOWN_MAX = 200, READ_MAX = 1000;
 const NEAR_PX = 24;
 
 export class Timeline {
@@ -38,11 +38,9 @@ export class Timeline {
       el("li", { "data-audit": each.audit ? "yes" : "no" }, el("time", { datetime: new Date(each.at * 1000).toISOString(), text: S.when(new Date(each.at * 1000)) }), " ",
         el("strong", { text: eventText(each.event), title: each.event }), ` ${each.robot} `, el("small", { text: factsText(each) })));
     if (anew) this.list.replaceChildren(...lines); else this.list.append(...lines);
-    // While somebody reads above, the oldest stay as well.
-    if (below) {
-      while (this.list.childElementCount > SHOWN_MAX) this.list.firstChild.remove();
-      this.list.scrollTop = this.list.scrollHeight;
-    }
+    // While somebody reads above, more of the oldest stay as well.
+    while (this.list.childElementCount > (below ? SHOWN_MAX : READ_MAX)) this.list.firstChild.remove();
+    if (below) this.list.scrollTop = this.list.scrollHeight;
     setText(this.none, this.list.childElementCount ? "" : S.nothing);
   }
 }

@@ -1,4 +1,6 @@
 // Positions in the unit that the verbs take: degrees for an angle.
+import { own } from "./dom.js";
+
 const DEGREES = 180 / Math.PI;
 const UNITS = {
   radians: { text: "\u00b0", factor: DEGREES, digits: 1 },
@@ -9,7 +11,7 @@ const UNITS = {
 };
 const NONE = { text: "", factor: 1, digits: 2 };
 
-export const unitOf = (units, name) => UNITS[units && units[name]] || NONE;
+export const unitOf = (units, name) => own(UNITS, own(units, name)) || NONE;
 
 export function shownIn(unit, value) {
   const number = (value * unit.factor).toFixed(unit.digits).replace(/^-(?=[0.]+$)/, "");
@@ -18,9 +20,10 @@ export function shownIn(unit, value) {
 
 // Where a robot tells no limits: a turn of a joint that is told as an angle, else what is seen.
 export function limitsOf(limits, units, name) {
-  if (limits && limits[name]) return limits[name];
-  if (units && units[name] === "degrees") return [-180, 180];
-  if (units && units[name] === "percent") return [0, 100];
-  if (units && units[name] === "normalized") return [-100, 100];
+  const told = own(limits, name), unit = own(units, name);
+  if (told) return told;
+  if (unit === "degrees") return [-180, 180];
+  if (unit === "percent") return [0, 100];
+  if (unit === "normalized") return [-100, 100];
   return [-Math.PI, Math.PI];
 }

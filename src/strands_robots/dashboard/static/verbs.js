@@ -19,12 +19,14 @@ export class Verbs {
     this.signature = "";
     this.names = new Set();
     this.cameras = [];
+    this.units = {};
     this.parts = [];
     this.show([]);
   }
 
   details(detail) {
     this.cameras = detail.cameras;
+    this.units = detail.units;
     this.parts = [...new Set(detail.history.flatMap(([, joints]) => Object.keys(joints)))].filter(Boolean);
     // Cameras are choices of the forms; a form that is open is made anew only where they changed.
     const signature = JSON.stringify([detail.forms, this.cameras, this.parts, this.hello && this.hello.role]);
@@ -70,6 +72,7 @@ export class Verbs {
       has: (verb) => this.names.has(verb),
       cameras: () => this.cameras,
       parts: () => this.parts,
+      slides: (joint) => this.units[joint] === "metres",
       objects: async () => { const { objects } = await read("getObjects"); return Array.isArray(objects) ? objects.map((each) => String(each.name)) : Object.keys(objects || {}); },
       pose: async () => { const { joints } = await read("getPose"); return joints && typeof joints === "object" ? joints : {}; },
     };
