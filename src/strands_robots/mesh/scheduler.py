@@ -309,7 +309,11 @@ class Scheduler:
 
 
 def repeat(name: str, hz: float, run: Callable[[], None]) -> Callable[[], None]:
-    """Run a quick job for all peers of the process; return its end, which waits for nothing."""
+    """Run a quick job for all peers of the process.
+
+    Returns:
+        Its end, which waits for nothing.
+    """
     scheduler = Scheduler(name)
     scheduler.every(name, hz, run, quick=True)
     scheduler.start()

@@ -70,7 +70,7 @@ def stop_scope(only: object, cell: object) -> tuple[Scope, str]:
 
 
 def robot_of_world(given: Mapping[str, Any]) -> tuple[str, str]:
-    """Return ``robot_name``, the robot of a device's world that a stop means, empty for all of it, and a note."""
+    """Return the robot of a device's world that a stop means, empty for all, and a note."""
     # A command that stops all leaves before the verbs are loaded.
     from strands_robots.serving.robot_verbs import WORLD_VERBS  # noqa: PLC0415
 
