@@ -27,7 +27,15 @@ from strands_robots.safety.statements import ALARM
 from strands_robots.safety.stop_roster import StopOutcome, StopRoster, robots_known_at
 from strands_robots.safety.stopping import explain, grade
 from strands_robots.tools.mesh_roster import MeshReports, mesh_network
-from strands_robots.tools.roster_verdict import OnOutcome, combined_verdict, measured, roster_verdict, unanswered
+from strands_robots.tools.roster_verdict import (
+    OnOutcome,
+    combined_verdict,
+    measured,
+    roster_verdict,
+    unanswered,
+    with_plain_stops,
+    with_reasons,
+)
 from strands_robots.utils import MissingExtraError, ValidationError, finite
 
 if TYPE_CHECKING:
@@ -409,21 +417,18 @@ def stop_and_lock(fleet: FleetClient, reason: str, scope: Scope = EVERY_ROBOT) -
             sending = replace(controller.sending, left=report.link)
         finally:
             controller.close()
-    failed = {**report.not_stopped, **report.refused}
+    heard = {**report.stopped, **report.not_stopped, **report.refused}
     inside = EVERY_ROBOT if report.widened else scope
     peers = [peer.id for peer in seen.result() if peer.stop_verb and inside.covers(peer.id, {peer.cell or ""} - {""})]
-    rest = [name for name in peers if name not in failed and name not in report.stopped]
-    answers: dict[str, Envelope] = {name: success("locked and still", stopped=True) for name in report.stopped}
-    answers |= {name: error(answer.why, stopped=False) for name, answer in failed.items()}
-    answers |= fleet.stop_each(rest, STOP_S) if rest else {}
+    rest = [name for name in peers if name not in heard]
     roster = search.roster
     outcome = roster.outcome(report, sending)
-    outcome = measured(answers, roster, sending, estop_id) if rest else outcome
+    if rest:
+        answers = fleet.stop_each(rest, STOP_S)
+        outcome = with_reasons(roster.outcome(with_plain_stops(report, outcome, answers), sending), answers)
     outcome.record(fleet.source)
     roster.remember(report)
-    if rest:
-        return {**roster_verdict(answers, outcome), "not_locked": rest, "estop_id": estop_id}
-    return outcome_envelope(outcome)
+    return outcome_envelope(outcome, rest)
 
 
 def _peer_list(rows: list[dict[str, Any]], stale: str = "") -> Envelope:
