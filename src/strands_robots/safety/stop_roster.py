@@ -50,6 +50,7 @@ class StopOutcome:
         unproven: robots that controllers without a known signature say they miss, and who says so.
         reasons: of silent robots.
         problems: why the roster may lack robots; with one of them no exit code is 0.
+        unsigned: the answers are those to a plain stop, which no robot signs on Device Connect.
     """
 
     report: StopReport
@@ -60,10 +61,11 @@ class StopOutcome:
     reasons: Mapping[str, str] = field(default_factory=dict)
     problems: tuple[str, ...] = ()
     sending: Sending = field(default_factory=Sending)
+    unsigned: bool = False
 
     @property
     def ok(self) -> bool:
-        """True when every robot of the roster is known to stand still."""
+        """True when every robot of the roster is known to stand still, or said so where ``unsigned``."""
         return self.report.ok and not self.problems
 
     @property
@@ -73,12 +75,16 @@ class StopOutcome:
 
     @property
     def sentence(self) -> str:
-        """The number of robots that are known to stand still, in a sentence."""
+        """The number of robots that are known to stand still, or say so, in a sentence."""
         still, size = len(self.report.stopped), self.size
         some = not (self.report.scope.everything or self.report.widened)
         which = "that this stop was for" if some else "of the roster"
         if not size:
             return "The roster has no robot."
+        if self.unsigned:
+            many = f"The one robot {which} said that it stands" if size == still == 1 else ""
+            many = many or f"{still} of the {size} robots {which} said that they stand"
+            return f"{many} still; answers to a plain stop are not signed."
         if size == 1:
             return f"The one robot {which} is {'' if still else 'not '}known to stand still."
         if still == size:
@@ -103,6 +109,7 @@ class StopOutcome:
             "no_stop": list(self.no_stop[:NAMED_MAX]),
             "others": _others(self),
             "problems": list(self.problems),
+            **({"unsigned": True} if self.unsigned else {}),
         }
 
     def record(self, controller: str) -> None:

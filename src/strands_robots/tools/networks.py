@@ -386,7 +386,7 @@ def stop_found(fleet: FleetClient, seconds: float) -> tuple[dict[str, Envelope],
     roster.find(dict.fromkeys(answers, True))
     roster.read()
     sending = Sending(tells=fleet.link.transport == "nats")
-    return answers, measured(answers, roster, sending, problem=fleet.stale.rstrip("."))
+    return answers, replace(measured(answers, roster, sending, problem=fleet.stale.rstrip(".")), unsigned=True)
 
 
 def silence_of(fleet: FleetClient, device: str) -> str:
