@@ -24,7 +24,7 @@ from strands_robots.safety.roster_search import RosterSearch, stop_and_search
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.safety.silence import Sending
 from strands_robots.safety.statements import ALARM
-from strands_robots.safety.stop_roster import StopOutcome, StopRoster, robots_known_at
+from strands_robots.safety.stop_roster import READ_WITHIN_S, StopOutcome, StopRoster, robots_known_at
 from strands_robots.safety.stopping import explain, grade
 from strands_robots.tools.mesh_roster import MeshReports, mesh_network
 from strands_robots.tools.roster_verdict import (
@@ -216,29 +216,43 @@ def _stop_all(mesh: Mesh, stop: Callable[[], list[dict[str, Any]]], roster: Stop
         roster: read once it has left, and given the peers in reach.
     """
     seen: set[str] = set()
+    replies: dict[str, dict[str, Any]] = {}
     answers: dict[str, Envelope] = {}
+    keys: list[Mapping[str, bytes] | None] = []
     sent = time.monotonic()
+
+    def read() -> None:
+        try:
+            keys.append(enrolled_peers())
+        finally:
+            roster.read()
 
     def send() -> None:
         nonlocal sent
         sent = time.monotonic()
-        replies, keys = stop(), enrolled_peers()
-        for reply in replies:
-            name = reply["responder_id"]
-            if name != mesh.peer_id:
-                answers[name] = _stop_answer(name, reply, keys, locks=roster.scope.only)
+        replies.update({each["responder_id"]: each for each in stop() if each["responder_id"] != mesh.peer_id})
+
+    def graded() -> dict[str, Envelope]:
+        while keys and replies:
+            name, reply = replies.popitem()
+            answers[name] = _stop_answer(name, reply, keys[0], locks=roster.scope.only)
+        return answers
 
     def unconfirmed() -> bool:
         seen.update(name for name in _in_reach(mesh) if roster.scope.covers(name, _cells(mesh, name)))
-        return any(not answers.get(name, {}).get("stopped") for name in seen)
+        return any(not graded().get(name, {}).get("stopped") for name in seen)
 
     send()
-    roster.read()
+    # On a thread: a disk that hangs delays no further sending.
+    reading = threading.Thread(target=read, name="stop roster", daemon=True)
+    reading.start()
     discover(mesh, lambda: send() if unconfirmed() and time.monotonic() - sent >= AGAIN_S else None)
     if unconfirmed():
         send()
+    reading.join(READ_WITHIN_S)
+    keys.append(None)  # not read in time: no answer counts as proven
     roster.find(dict.fromkeys(seen, True), {name: next(iter(_cells(mesh, name)), "") for name in seen})
-    return {name: unanswered(name) for name in seen} | answers
+    return {name: unanswered(name) for name in seen} | graded()
 
 
 def _cells(mesh: Mesh, peer: str) -> frozenset[str]:
@@ -386,7 +400,8 @@ def stop_found(fleet: FleetClient, seconds: float) -> tuple[dict[str, Envelope],
     roster.find(dict.fromkeys(answers, True))
     roster.read()
     sending = Sending(tells=fleet.link.transport == "nats")
-    return answers, replace(measured(answers, roster, sending, problem=fleet.stale.rstrip(".")), unsigned=True)
+    outcome = replace(measured(answers, roster, sending, problem=fleet.stale.rstrip(".")), unsigned=True)
+    return answers, outcome
 
 
 def silence_of(fleet: FleetClient, device: str) -> str:
