@@ -14,6 +14,7 @@ from device_connect_edge.messaging import MessagingError
 from tests.cli.conftest import FakeFleet, Run
 
 from strands_robots import device_connect
+from strands_robots.audit import read_audit_log
 from strands_robots.cli.network import Network
 from strands_robots.cli.output import Exit, Screen
 from strands_robots.cli.running_stop import RunningStop
@@ -170,6 +171,8 @@ def test_stop_of_all_names_a_silent_robot_of_the_roster_as_an_emergency_stop_doe
     said = json.loads(run("stop", "--all", "--json").stdout)
     assert (said["devices"]["arm-2"]["stopped"], said["roster"]["size"]) == (None, 2)
     assert "last heard" in said["reasons"]["arm-2"]
+    recorded = [each["payload"] for each in read_audit_log() if each["event"] == "stop_outcome"]
+    assert "last heard" in recorded[-1]["silent"]["arm-2"]
 
 
 def test_unsigned_answers_to_a_stop_of_all_are_not_called_knowledge(run: Run, fleet: FakeFleet) -> None:

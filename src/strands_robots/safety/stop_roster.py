@@ -113,14 +113,14 @@ class StopOutcome:
         }
 
     def record(self, controller: str) -> None:
-        """Write the outcome into this console's own audit; one bounded record a stop."""
+        """Write the outcome into this console's own audit; one bounded record a stop, plain or emergency."""
         report = self.report
         moving = {**report.not_stopped, **report.refused}
         queue_safety_event(
-            "estop_outcome",
+            "estop_outcome" if report.estop_id else "stop_outcome",
             controller,
             {
-                "estop_id": report.estop_id,
+                **({"estop_id": report.estop_id} if report.estop_id else {}),
                 "roster": self.size,
                 "stopped": len(report.stopped),
                 "not_stopped": {name: moving[name].why[:200] for name in sorted(moving)[:NAMED_MAX]},

@@ -147,6 +147,7 @@ class NativeMesh:
             roster = StopRoster(mesh_network())
             answers = _stop_all(mesh, lambda: mesh.broadcast(command, ESTOP_S), roster)
             outcome = measured(answers, roster, Sending())
+            outcome.record(mesh.peer_id)
             on_outcome(outcome)
             return roster_verdict(answers, outcome)
 
@@ -401,6 +402,7 @@ def stop_found(fleet: FleetClient, seconds: float) -> tuple[dict[str, Envelope],
     roster.read()
     sending = Sending(tells=fleet.link.transport == "nats")
     outcome = replace(measured(answers, roster, sending, problem=fleet.stale.rstrip(".")), unsigned=True)
+    outcome.record(fleet.source)
     return answers, outcome
 
 
