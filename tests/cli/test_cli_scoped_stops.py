@@ -15,6 +15,7 @@ from strands_robots.cli.safety_controller import FleetScreen, StopButton, StopBu
 from strands_robots.cli.stop_report import exit_code
 from strands_robots.safety.answers import Answer
 from strands_robots.safety.controller import Progress, StopReport
+from strands_robots.safety.identity import EnrolledKeys
 from strands_robots.safety.lockout import Lockout, LockoutState
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.persistence import LockoutStore, StoredLockout, hardware_key
@@ -171,6 +172,13 @@ def test_machine_knows_the_robots_of_its_roster() -> None:
     assert not known(Scope.named(["arm-9"]))
     # A robot without a cell stops with each, and makes none of them known.
     assert not known(Scope(cell="cell-9"))
+
+
+def test_machine_knows_an_enrolled_robot_in_the_cell_of_its_enrolment() -> None:
+    EnrolledKeys().enroll({"arm-1": b"1" * 32}, network=NETWORK, cells={"arm-1": "cell-1"})
+    known = robots_known_at(lambda: NETWORK)
+    assert known(Scope(cell="cell-1"))
+    assert not known(Scope(cell="cell-2"))
 
 
 def test_lockout_table_shows_the_scope(run: Run) -> None:

@@ -393,7 +393,7 @@ def robots_known_at(network: Callable[[], NetworkKey]) -> Remembers:
 
     def remembers(scope: Scope) -> bool:
         roster = Roster.of(network())
-        return any(scope.names(row.name, row.cell) for row in roster.rows if counts(roster, row))
+        return any(scope.names(row.name, row.last_cell) for row in roster.rows if counts(roster, row))
 
     return remembers
 
