@@ -154,7 +154,7 @@ def _on_mesh(network: Network, wanted: list[str], seconds: float) -> tuple[list[
 
 
 def _signed_cell(report: LockoutReport, key: bytes | None) -> str | None:
-    """Return the cell that a robot signed within the minute; None counts for every cell.
+    """Return the cell that a robot signed within the minute; None is in every cell.
 
     An unsigned one may be a stranger's, which would take the robot out of later stops of its cell.
     """

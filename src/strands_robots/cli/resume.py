@@ -320,7 +320,7 @@ def _clear_locally(screen: Screen, wanted: list[str]) -> None:
 
 
 def _unheard_here(names: list[str]) -> Unheard:
-    """Return who was not heard since; a file that cannot be read hinders no running robot's clearing."""
+    """Return who was not heard since, or why that cannot be read."""
     try:
         return unheard_since(names, _stored_file())
     except CliError as unreadable:

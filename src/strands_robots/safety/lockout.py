@@ -172,7 +172,7 @@ class LockoutLatch:
         return self._crowd
 
     def crowd_on(self, received: float) -> None:
-        """Take a further stop, received at this moment, among those of the overflow; lock nothing."""
+        """Count a stop that was received then among those of the overflow."""
         since, until = self._crowd
         self._crowd = since, max(until, received + SKEW_S)
 
@@ -247,7 +247,7 @@ class LockoutLatch:
 
 
 def with_cleared(cleared: tuple[Span, ...], state: LockoutState, crowd: Span) -> tuple[Span, ...]:
-    """Return the spans with that of an overflow that is cleared now, if there is one.
+    """Return the spans with that of an overflow that is cleared now, if any.
 
     It ends with the last stop that was received: a later one, which the robot missed, still counts.
     """

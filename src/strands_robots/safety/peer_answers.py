@@ -37,7 +37,7 @@ def with_stop_statement(
 def with_lockout_statement(
     identity: SigningIdentity | None, peer_id: str, facts: Mapping[str, Any], nonce: str = ""
 ) -> dict[str, Any]:
-    """Return ``locked``, ``epochs`` and ``cell`` with their signed part, if there is a key.
+    """Return a lockout state with its signed part, if there is a key.
 
     Args:
         nonce: of the question, so that a recorded answer fits no other one.

@@ -127,7 +127,7 @@ class Registered:
 
     @property
     def crowd_unsaved(self) -> bool:
-        """True while the disk lacks the time of a stop that its overflow stands for."""
+        """True while the disk lacks the latest time of a flood."""
         return bool(self.key) and self.crowded and self.latch.crowd is not self.crowd_on_disk
 
     @property

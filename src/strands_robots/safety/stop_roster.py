@@ -65,7 +65,10 @@ class StopOutcome:
 
     @property
     def ok(self) -> bool:
-        """True when every robot of the roster is known to stand still, or said so where ``unsigned``."""
+        """True when every robot of the roster is known to stand still.
+
+        Where the answers are ``unsigned``, each one said so.
+        """
         return self.report.ok and not self.problems
 
     @property
@@ -75,7 +78,7 @@ class StopOutcome:
 
     @property
     def sentence(self) -> str:
-        """The number of robots that are known to stand still, or say so, in a sentence."""
+        """The number of robots that stand still, known or said, in a sentence."""
         still, size = len(self.report.stopped), self.size
         some = not (self.report.scope.everything or self.report.widened)
         which = "that this stop was for" if some else "of the roster"
@@ -113,7 +116,7 @@ class StopOutcome:
         }
 
     def record(self, controller: str) -> None:
-        """Write the outcome into this console's own audit; one bounded record a stop, plain or emergency."""
+        """Write the outcome into this console's own audit; one bounded record a stop."""
         report = self.report
         moving = {**report.not_stopped, **report.refused}
         queue_safety_event(
