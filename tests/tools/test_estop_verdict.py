@@ -33,13 +33,15 @@ class PlainFleet:
     link = LinkConfig(mode="peer", connect=("tcp/127.0.0.1:7447",), multicast=False)
 
     def __init__(self, plain: dict[str, Envelope]) -> None:
-        self.plain, self.asked = plain, list[str]()
+        self.plain, self.asked, self.measured = plain, list[str](), False
 
     def peers(self) -> list[Any]:
         return [SimpleNamespace(id=name, stop_verb="stop", cell="") for name in self.plain]
 
     def stop_each(self, devices: list[str], seconds: float) -> dict[str, Envelope]:
         self.asked += devices
+        # What has not stopped yet does not wait for the disk.
+        assert not self.measured
         return {name: self.plain[name] for name in devices}
 
 
@@ -67,7 +69,14 @@ def press(monkeypatch: pytest.MonkeyPatch) -> Press:
             search.roster.find(dict.fromkeys(plain, True))
             return report
 
+        measure = stop_roster.StopRoster.outcome
+
+        def measured(self: stop_roster.StopRoster, *given: Any) -> stop_roster.StopOutcome:
+            fleet.measured = True
+            return measure(self, *given)
+
         monkeypatch.setattr(networks, "stop_and_search", searched)
+        monkeypatch.setattr(stop_roster.StopRoster, "outcome", measured)
         answer = networks.stop_and_lock(fleet, "test")  # type: ignore[arg-type]
         assert fleet.asked == [name for name in plain if name not in stopped]
         return answer

@@ -438,11 +438,12 @@ def stop_and_lock(fleet: FleetClient, reason: str, scope: Scope = EVERY_ROBOT) -
     inside = EVERY_ROBOT if report.widened else scope
     peers = [peer.id for peer in seen.result() if peer.stop_verb and inside.covers(peer.id, {peer.cell or ""} - {""})]
     rest = [name for name in peers if name not in heard]
+    answers = fleet.stop_each(rest, STOP_S) if rest else {}
     roster = search.roster
     outcome = roster.outcome(report, sending)
     if rest:
-        answers = fleet.stop_each(rest, STOP_S)
-        outcome = with_reasons(roster.outcome(with_plain_stops(report, outcome, answers), sending), answers)
+        outcome = roster.outcome(with_plain_stops(report, outcome, answers), sending)
+        outcome = with_reasons(outcome, answers, plain=True)
     outcome.record(fleet.source)
     roster.remember(report)
     return outcome_envelope(outcome, rest)

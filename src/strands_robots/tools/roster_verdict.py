@@ -77,12 +77,18 @@ def measured(
     return with_reasons(roster.outcome(report, sending, problem), answers)
 
 
-def with_reasons(outcome: StopOutcome, answers: Mapping[str, Envelope]) -> StopOutcome:
-    """Return the outcome with what silent robots said of themselves."""
+def with_reasons(outcome: StopOutcome, answers: Mapping[str, Envelope], *, plain: bool = False) -> StopOutcome:
+    """Return the outcome with what silent robots said of themselves.
+
+    Args:
+        outcome: of the stop.
+        answers: by robot.
+        plain: they are answers to a plain stop after an emergency stop.
+    """
     reasons = dict(outcome.reasons)
     for name in outcome.report.silent:
         said = text_of(answers[name]).rstrip(".") if name in answers else ""
-        if name in answers and stop_outcome(answers[name])[0]:
+        if plain and name in answers and stop_outcome(answers[name])[0]:
             said = "a plain stop was answered in its name, which proves nothing of a robot with a key"
         if said and said != text_of(unanswered(name)).rstrip("."):
             reasons[name] = f"{said}: {reasons[name]}" if name in reasons else said
