@@ -636,7 +636,7 @@ class SafetyPlane:
         new = {each: each.resumed for each in self._robots.values() if each.unrecorded}
         if (due or new) and time.monotonic() >= self._keep_at:
             self._keep_at = time.monotonic() + KEEP_AGAIN_S
-            with contextlib.suppress(OSError):  # reported when it failed first
+            with contextlib.suppress(OSError):  # a lockout that is not written was reported at first
                 self._keep(due, crowds=True)
                 self._record_new(new)
 
