@@ -68,6 +68,20 @@ def test_a_number_is_finite_and_between_its_bounds(value: float, low: float, hig
             utils.number("x", value, low=low, high=high)
 
 
+def test_number_that_is_not_finite_is_named_at_any_level() -> None:
+    utils.finite("x", {"a": [1.0, {"b": (2.0, None)}], "c": "nan"})
+    with pytest.raises(ValidationError, match=r"x\.a\[1\]\.b\[0\] must be finite"):
+        utils.finite("x", {"a": [1.0, {"b": (math.nan, math.inf)}]})
+
+
+def test_value_of_thousands_of_levels_is_refused() -> None:
+    deep: list[object] = []
+    for _ in range(5000):
+        deep = [deep]
+    with pytest.raises(ValidationError, match="x must be nested at most"):
+        utils.finite("x", deep)
+
+
 def test_above_leaves_its_bound_out_and_the_others_include_theirs() -> None:
     assert utils.number("x", 1, low=1, high=1) == 1.0
     with pytest.raises(ValidationError, match="above 0"):

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import os
 import socket
+import threading
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
+from fixtures.waiting import eventually
 
 from strands_robots import zenoh_sockets
-from strands_robots.zenoh_sockets import LINGER, close_in_background
+from strands_robots.zenoh_sockets import LINGER, change_links, close_in_background
 
 
 @pytest.fixture
@@ -32,23 +35,47 @@ def linger(each: socket.socket) -> tuple[int, int]:
 
 def test_a_link_with_zenohs_linger_is_closed_in_the_background(open_sockets: ExitStack) -> None:
     link = made(open_sockets, 1, 10)
-    assert close_in_background() == 1
+    assert change_links() >= 1
     assert linger(link)[0] == 0
     assert link.fileno() >= 0
-    assert close_in_background() == 0
 
 
 @pytest.mark.parametrize(("on", "seconds"), [(0, 10), (1, 0), (1, 5), (1, 30)])
 def test_a_socket_with_a_linger_of_its_own_keeps_it(open_sockets: ExitStack, on: int, seconds: int) -> None:
     own = made(open_sockets, on, seconds)
     before = linger(own)
-    assert close_in_background() == 0
+    change_links()
     assert linger(own) == before
+
+
+def test_search_leaves_sockets_blocking_where_the_process_has_a_default_timeout(open_sockets: ExitStack) -> None:
+    link, other = made(open_sockets, 1, 10), made(open_sockets, 0, 0)
+    before = socket.getdefaulttimeout()
+    socket.setdefaulttimeout(5.0)
+    try:
+        change_links()
+    finally:
+        socket.setdefaulttimeout(before)
+    assert os.get_blocking(link.fileno()) and os.get_blocking(other.fileno())
+
+
+def test_links_that_come_up_together_cost_one_search_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    searches = list[int]()
+    monkeypatch.setattr(zenoh_sockets, "GATHER_S", 0.5)
+    monkeypatch.setattr(zenoh_sockets, "change_links", lambda: searches.append(threading.get_ident()))
+    for _ in range(100):
+        close_in_background()
+    assert searches == []
+    eventually(lambda: searches)
+    assert len(searches) == 1 and searches[0] != threading.get_ident()
+    close_in_background()
+    eventually(lambda: len(searches) == 2)
 
 
 def test_a_system_without_a_folder_of_descriptors_changes_nothing(
     open_sockets: ExitStack, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made(open_sockets, 1, 10)
+    link = made(open_sockets, 1, 10)
     monkeypatch.setattr(zenoh_sockets, "DESCRIPTORS", Path("/nowhere"))
-    assert close_in_background() == 0
+    assert change_links() == 0
+    assert linger(link) == (1, 10)

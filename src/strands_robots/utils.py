@@ -91,6 +91,10 @@ def is_loopback_host(host: str) -> bool:
         return host == "localhost"
 
 
+NESTED_MAX = 100
+"""Levels of lists and objects in a value that a call takes."""
+
+
 def shown(value: object) -> str:
     """Return ``repr(value)``, short enough for a log or a reply."""
     if isinstance(value, str | bytes) and len(value) > _SHOWN_MAX:
@@ -143,19 +147,24 @@ def number(
 
 
 def finite(name: str, value: object) -> None:
-    """Refuse NaN and infinity in a JSON value, at any depth.
+    """Refuse NaN and infinity in a JSON value of at most :data:`NESTED_MAX` levels.
 
     Raises:
         ValidationError: naming the place, such as ``joints.pan`` or ``path[2]``.
     """
-    if isinstance(value, Mapping):
-        for key, each in value.items():
-            finite(f"{name}.{key}", each)
-    elif isinstance(value, list | tuple):
-        for index, each in enumerate(value):
-            finite(f"{name}[{index}]", each)
-    elif isinstance(value, float) and not math.isfinite(value):
-        raise ValidationError(f"{name} must be finite, not {value}.")
+    left: list[tuple[str, object, int]] = [(name, value, 0)]
+    while left:
+        place, each, depth = left.pop()
+        inside: list[tuple[str, object]] = []
+        if isinstance(each, Mapping):
+            inside = [(f"{place}.{key}", one) for key, one in each.items()]
+        elif isinstance(each, list | tuple):
+            inside = [(f"{place}[{index}]", one) for index, one in enumerate(each)]
+        elif isinstance(each, float) and not math.isfinite(each):
+            raise ValidationError(f"{place} must be finite, not {each}.")
+        if inside and depth == NESTED_MAX:
+            raise ValidationError(f"{name} must be nested at most {NESTED_MAX} levels deep.")
+        left += [(where, one, depth + 1) for where, one in reversed(inside)]
 
 
 def whole(name: str, value: object, *, low: int | None = None, high: int | None = None) -> int:

@@ -8,11 +8,15 @@ the other half for 10 s a link.
 
 from __future__ import annotations
 
-import os
+import _thread
+import ctypes
+import functools
 import socket
-import stat
 import struct
+import threading
+import time
 from pathlib import Path
+from typing import Any
 
 LINGER = struct.Struct("ii")
 """``struct linger``: on or off, and seconds."""
@@ -20,33 +24,53 @@ LINGER = struct.Struct("ii")
 ZENOHS = LINGER.pack(1, 10)
 DESCRIPTORS = Path("/dev/fd")
 
+GATHER_S = 0.1
+"""Seconds in which further links come up before their sockets are looked for."""
 
-def close_in_background() -> int:
-    """Have the kernel close Zenoh's links in the background; return how many changed.
+_due = threading.Lock()
+"""Held while a search is due that has not begun."""
+
+
+def close_in_background() -> None:
+    """Have the kernel close Zenoh's links in the background; return at once.
+
+    Call it when a link has come up: Zenoh offers neither an option nor the descriptor of a link. Many links that come
+    up together cost one search, on a thread that ends with it.
+    """
+    if _due.acquire(blocking=False):
+        # Unlike Thread.start, this does not wait for the new thread: it is Zenoh's receiving thread that calls.
+        _thread.start_new_thread(_gather, ())
+
+
+def change_links() -> int:
+    """Change each link of Zenoh's now; return how many.
 
     What was sent is still delivered where the other host is there. Only sockets with Zenoh's own ten seconds are
-    changed. Call it when a link has come up: Zenoh offers neither an option nor the descriptor of a link.
+    changed.
     """
-    changed = 0
     try:
         descriptors = [int(each.name) for each in DESCRIPTORS.iterdir()]
     except OSError:  # no such folder on this system
         return 0
-    for descriptor in descriptors:
-        try:
-            if stat.S_ISSOCK(os.fstat(descriptor).st_mode):
-                changed += _in_background(descriptor)
-        except OSError:  # closed meanwhile
-            continue
-    return changed
+    return sum(map(_in_background, descriptors))
+
+
+def _gather() -> None:
+    time.sleep(GATHER_S)
+    _due.release()
+    change_links()
 
 
 def _in_background(descriptor: int) -> bool:
-    link = socket.socket(fileno=descriptor)
-    try:
-        if link.getsockopt(socket.SOL_SOCKET, socket.SO_LINGER, LINGER.size) != ZENOHS:
-            return False
-        link.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, LINGER.pack(0, 0))
-        return True
-    finally:
-        link.detach()
+    """Change one descriptor; False where it is no link of Zenoh's, or closed."""
+    # A socket object of Python's would change the socket: it applies the process's default timeout to it.
+    libc, option = _libc(), (socket.SOL_SOCKET, socket.SO_LINGER)
+    value, length = ctypes.create_string_buffer(LINGER.size), ctypes.c_uint32(LINGER.size)
+    if libc.getsockopt(descriptor, *option, value, ctypes.byref(length)) or value.raw != ZENOHS:
+        return False
+    return not libc.setsockopt(descriptor, *option, LINGER.pack(0, 0), LINGER.size)
+
+
+@functools.cache
+def _libc() -> Any:
+    return ctypes.CDLL(None)

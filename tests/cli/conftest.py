@@ -33,7 +33,7 @@ class FakeFleet:
     """A fleet that answers what the test sets."""
 
     def __init__(self) -> None:
-        self.link = loopback_config()
+        self.link, self.source = loopback_config(), "cli"
         self.found: list[Peer] = []
         self.answer: Envelope | Exception = success("done")
         self.stops: dict[str, Envelope] = {}

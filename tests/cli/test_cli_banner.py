@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from fixtures.certificates import Authority
 from rich.console import Console
 
 from strands_robots.cli.banner import ServedRobot, commands, flags_elsewhere, show_banner
@@ -94,6 +95,24 @@ def test_a_grant_names_the_state_directory_of_the_robot(monkeypatch: pytest.Monk
 )
 def test_flags_reach_the_link_without_our_environment(link: LinkConfig, flags: str) -> None:
     assert flags_elsewhere(link) == flags
+
+
+@pytest.mark.parametrize(
+    ("hosts", "reached"),
+    [
+        (("robot.lab", "127.0.0.1"), "127.0.0.1"),
+        (("robot.lab", "localhost"), "localhost"),
+        (("robot.lab", "10.1.2.3"), "robot.lab"),
+        (("*.lab", "10.1.2.3"), "10.1.2.3"),
+    ],
+)
+def test_listener_on_every_address_is_reached_by_a_host_of_its_certificate(
+    tmp_path: Path, hosts: tuple[str, ...], reached: str
+) -> None:
+    own = Authority(tmp_path).issue("arm-1", hosts)
+    files = {"ca": str(own.ca), "cert": str(own.cert), "key": str(own.key)}
+    link = LinkConfig(mode="peer", listen=("tls/0.0.0.0:7448",), **files)
+    assert flags_elsewhere(link).startswith(f" --connect tls/{reached}:7448")
 
 
 def test_certificates_and_credentials_are_named_by_absolute_paths(

@@ -40,6 +40,7 @@ class SigningFleet:
         self.locked = True
         self.stale = ""
         self.signs: dict[str, Any] = {}
+        self.states: dict[str, Any] = {}
 
     def peers(self, timeout: float = 2.0) -> list[Peer]:
         return [Peer("arm-1", functions=({"name": "resume"},))]
@@ -57,7 +58,7 @@ class SigningFleet:
             purpose = Purpose.RESUME_ANSWER
             fields = {"locked": self.locked, "status": "success", "nonce": params["assertion"]["nonce"]}
         statement = signed(self.identity, purpose, device, {**fields, **self.signs})
-        answer = success("done", locked=self.locked, lockout=rows)
+        answer = success("done", locked=self.locked, lockout=rows, **self.states)
         # As a robot does: it signs what it is asked to sign.
         return {**answer, "statement": statement} if function == "resume" or "nonce" in params else answer
 
@@ -98,6 +99,24 @@ def test_a_robot_is_enrolled_with_its_fingerprint(run: Run, fleet: SigningFleet,
     assert "strands-robots doctor" in result.stdout
     assert EnrolledKeys().load() == {"arm-1": robot.public}
     assert json.loads(run("enroll", "arm-1", "--json").stdout)["devices"]["arm-1"]["outcome"] == "known"
+
+
+def test_only_a_signed_cell_is_enrolled(run: Run, fleet: SigningFleet) -> None:
+    fleet.states = {"cell": "elsewhere"}
+    run("enroll")
+    assert EnrolledKeys().robots()["arm-1"].cell is None
+    fleet.signs = {"cell": "cell-1"}
+    run("enroll")
+    assert EnrolledKeys().robots()["arm-1"].cell == "cell-1"
+
+
+def test_cell_of_a_recorded_statement_is_not_enrolled(
+    run: Run, fleet: SigningFleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fleet.signs = {"cell": "cell-1"}
+    monkeypatch.setattr(statements, "STATED_WITHIN_S", -1.0)
+    run("enroll")
+    assert EnrolledKeys().robots()["arm-1"].cell is None
 
 
 def test_a_changed_key_is_an_alarm_and_changes_nothing(

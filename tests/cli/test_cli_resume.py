@@ -129,6 +129,19 @@ def test_local_resume_names_who_was_not_heard_since_the_stop(run: Run, fleet: Fa
     assert result.stdout.index("NOT HEARD: arm-2.") < result.stdout.index("cleared")
 
 
+def test_unreadable_lockout_file_hinders_no_running_robots_clearing(
+    run: Run, fleet: FakeFleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hold = Lockout(A, "desk", "a hand", time.time())
+    LockoutStore().save({"k": StoredLockout(LockoutState((hold,)), name="arm-1")})
+    (LockoutStore().directory / "other.json").write_text("no json", encoding="utf-8")
+    (LockoutStore().directory / "other.json").chmod(0o600)
+    monkeypatch.setattr(resume, "clear_here", lambda who, names: dict.fromkeys(names, "cleared"))
+    result = run("resume", "--local", "arm-1")
+    assert result.exit_code == 0, result.output
+    assert "NOT KNOWN who was not heard: The lockout file of this machine cannot be read" in result.stdout
+
+
 def test_robots_still_locked_are_named_with_exit_1(run: Run, fleet: FakeFleet, signed: tuple[str, ...]) -> None:
     fleet.lockouts = {"stubborn": [A], "mute": [A], "full": [OVERFLOW], "good": [A]}
     fleet.silent, fleet.refuses = {"mute"}, {"stubborn"}

@@ -15,8 +15,9 @@ from strands_robots.cli.safety_controller import FleetScreen, StopButton, StopBu
 from strands_robots.cli.stop_report import exit_code
 from strands_robots.safety.answers import Answer
 from strands_robots.safety.controller import Progress, StopReport
+from strands_robots.safety.identity import EnrolledKeys
 from strands_robots.safety.lockout import Lockout, LockoutState
-from strands_robots.safety.network_key import NetworkKey
+from strands_robots.safety.network_key import MESH, NetworkKey
 from strands_robots.safety.persistence import LockoutStore, StoredLockout, hardware_key
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.safety.sightings import sightings
@@ -171,6 +172,23 @@ def test_machine_knows_the_robots_of_its_roster() -> None:
     assert not known(Scope.named(["arm-9"]))
     # A robot without a cell stops with each, and makes none of them known.
     assert not known(Scope(cell="cell-9"))
+
+
+def test_machine_knows_an_enrolled_robot_in_the_cell_of_its_enrolment() -> None:
+    EnrolledKeys().enroll({"arm-1": b"1" * 32}, network=NETWORK, cells={"arm-1": "cell-1"})
+    known = robots_known_at(lambda: NETWORK)
+    assert known(Scope(cell="cell-1"))
+    assert not known(Scope(cell="cell-2"))
+
+
+def test_stop_of_named_robots_on_the_mesh_reaches_no_other_one() -> None:
+    mesh = StopRoster(NetworkKey.of(MESH, ["tcp/127.0.0.1:7447"]), scope=ONLY)
+    mesh.read()
+    (said,) = [note for note in stop_notes(mesh.outcome(report("arm-1", scope=ONLY))) if "This stop was for" in note]
+    assert said == "This stop was for arm-1 only."
+    remember(arm_1="")
+    notes = stop_notes(roster(ONLY).outcome(report("arm-1", scope=ONLY)))
+    assert any("stop all the same" in note for note in notes)
 
 
 def test_lockout_table_shows_the_scope(run: Run) -> None:

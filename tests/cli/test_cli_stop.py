@@ -14,6 +14,7 @@ from device_connect_edge.messaging import MessagingError
 from tests.cli.conftest import FakeFleet, Run
 
 from strands_robots import device_connect
+from strands_robots.audit import read_audit_log
 from strands_robots.cli.network import Network
 from strands_robots.cli.output import Exit, Screen
 from strands_robots.cli.running_stop import RunningStop
@@ -165,11 +166,23 @@ def test_stop_of_all_names_a_silent_robot_of_the_roster_as_an_emergency_stop_doe
     fleet.stops = {"arm-1": success("Stopped.", stopped=True)}
     result = run("stop", "--all")
     assert result.exit_code == 3
-    assert "1 of the 2 robots of the roster is known to stand still." in result.stdout
+    assert "1 of the 2 robots of the roster said that they stand still" in result.stdout
     assert result.stderr == "NO ANSWER: arm-2.\n"
     said = json.loads(run("stop", "--all", "--json").stdout)
     assert (said["devices"]["arm-2"]["stopped"], said["roster"]["size"]) == (None, 2)
     assert "last heard" in said["reasons"]["arm-2"]
+    recorded = [each["payload"] for each in read_audit_log() if each["event"] == "stop_outcome"]
+    assert "last heard" in recorded[-1]["silent"]["arm-2"]
+
+
+def test_unsigned_answers_to_a_stop_of_all_are_not_called_knowledge(run: Run, fleet: FakeFleet) -> None:
+    fleet.stops = {"arm-1": success("Stopped.", stopped=True)}
+    result = run("stop", "--all")
+    assert result.exit_code == 0
+    said = "The one robot of the roster said that it stands still; answers to a plain stop are not signed."
+    assert said in " ".join(result.stdout.split())
+    assert "known to stand still" not in result.stdout
+    assert json.loads(run("stop", "--all", "--json").stdout)["unsigned"] is True
 
 
 def test_stop_of_a_silent_robot_says_why(run: Run, fleet: FakeFleet) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,6 +14,7 @@ from strands_robots.cli.mesh_controller import MeshController
 from strands_robots.cli.resume_mesh import ask_peers
 from strands_robots.cli.stop_report import exit_code, style_of
 from strands_robots.mesh import topics
+from strands_robots.mesh.safety_adapter import SafetyAdapter
 from strands_robots.safety.identity import ROBOTS, EnrolledKeys, KeyFile, robot_identity
 from strands_robots.safety.orders import new_epoch
 from strands_robots.safety.peer_answers import (
@@ -23,6 +25,8 @@ from strands_robots.safety.peer_answers import (
     stop_distrust,
     with_stop_statement,
 )
+from strands_robots.safety.persistence import LockoutStore
+from strands_robots.safety.plane import SafetyPlane
 
 STOP = {"action": "stop"}
 
@@ -174,3 +178,14 @@ def test_robots_of_an_enrolled_world_answer_with_its_key(peers: Fleet) -> None:
     parent = console.send("sim-1", {"action": "status"}, 20)["result"]
     assert "ALARM" in lockout_distrust(child, parent, [], keys), "the answer of one is none of another"
     assert "only claimed" in stop_distrust({"responder_id": child, "turn_id": "t", "result": {"ok": True}}, keys)
+
+
+def test_answer_of_a_robot_to_a_question_signs_its_cell(tmp_path: Path) -> None:
+    adapter = SafetyAdapter("arm-1", Arm("one"), None, SafetyPlane(LockoutStore(tmp_path)), cell="cell-1")
+    enroll("arm-1")
+    answer = adapter.report(nonce="a" * 32)
+    assert answer["cell"] == answer["statement"]["cell"] == "cell-1"
+    assert not lockout_distrust("arm-1", answer, [], EnrolledKeys().load(), "a" * 32)
+    moved = {**answer, "statement": {**answer["statement"], "cell": "cell-2"}}
+    assert lockout_distrust("arm-1", moved, [], EnrolledKeys().load(), "a" * 32).startswith("ALARM")
+    adapter.close()

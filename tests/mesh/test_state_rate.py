@@ -84,6 +84,11 @@ def test_state_that_tells_of_a_motion_keeps_the_rate(robot: Rated, body: dict[st
     assert robot.rate.active
 
 
+def test_flag_in_place_of_a_position_is_no_motion(robot: Rated) -> None:
+    robot.rate.published({"joints": {"pan": 0.5, "enabled": True}})
+    assert not robot.rate.active
+
+
 def test_noise_of_a_joint_is_no_motion_and_slow_motion_adds_up(robot: Rated) -> None:
     robot.rate.published({"joints": {"pan": 0.5005}})
     assert not robot.rate.active

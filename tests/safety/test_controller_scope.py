@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import threading
 import time
 from collections.abc import Callable, Iterable
@@ -11,6 +12,7 @@ from typing import Any
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from fixtures.estop_orders import order_of
+from fixtures.waiting import eventually
 
 from strands_robots.device_connect.safety_controller import envelope
 from strands_robots.envelope import is_error, text_of
@@ -18,7 +20,7 @@ from strands_robots.safety import ed25519
 from strands_robots.safety.controller import Progress, SafetyController
 from strands_robots.safety.estop_listener import ESTOP, VERDICT, notification
 from strands_robots.safety.orders import StopOrder, StopRules
-from strands_robots.safety.scope import EVERY_ROBOT, WIDEN_S, Scope
+from strands_robots.safety.scope import EVERY_ROBOT, WIDEN_S, KnownRobots, Scope
 
 
 class Fleet:
@@ -122,13 +124,23 @@ def test_answers_of_robots_without_a_cell_do_not_hide_a_mistyped_one(stop: Calla
     assert fleet.scopes.count(EVERY_ROBOT) > 1
 
 
-def test_disk_that_takes_its_time_widens_no_stop_of_a_robot_that_is_known(stop: Callable[..., Any]) -> None:
+def test_disk_that_has_not_answered_in_time_knows_no_robot() -> None:
+    answers = threading.Event()
+    known = KnownRobots(Scope(cell="cell-1"), lambda asked: answers.wait(60))
+    assert known.widens_after_s == WIDEN_S
+    answers.set()
+    eventually(lambda: known.widens_after_s == math.inf)
+
+
+def test_disk_that_answers_once_every_robot_was_stopped_undoes_nothing(stop: Callable[..., Any]) -> None:
+    fleet = Fleet({"free-1": ""})
+
     def read_slowly(asked: Scope) -> bool:
-        threading.Event().wait(2 * WIDEN_S)
+        eventually(lambda: EVERY_ROBOT in fleet.scopes)
         return True
 
-    report = stop(Fleet({"free-1": ""}), Scope(cell="cell-1"), ("free-1",), deadline_s=20, remembers=read_slowly)
-    assert report.ok and not report.widened
+    report = stop(fleet, Scope(cell="cell-1"), ("free-1",), deadline_s=20, remembers=read_slowly)
+    assert report.widened and not report.ok
 
 
 def test_disk_that_hangs_widens_the_stop_all_the_same(stop: Callable[..., Any]) -> None:

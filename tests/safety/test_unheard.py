@@ -54,6 +54,16 @@ def test_robot_of_this_machine_has_to_have_acted_on_the_stop() -> None:
     assert not unheard_since(["arm-1"], locked() | resumed)
 
 
+def test_every_record_of_a_name_counts() -> None:
+    serve("arm-1")
+    serve("arm-2")
+    twice = {
+        "hardware:arm:arm-2": StoredLockout(seen=(EPOCH,), name="arm-2"),
+        "simulation:arm-2": StoredLockout(name="arm-2"),
+    }
+    assert not unheard_since(["arm-1"], locked() | twice)
+
+
 def test_robots_that_the_stop_was_not_for_are_not_named() -> None:
     serve("arm-1")
     heard("far-1", 2 * PRESSED_AGO_S, ELSEWHERE)

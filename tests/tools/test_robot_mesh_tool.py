@@ -3,6 +3,7 @@ from __future__ import annotations
 import base64
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import Any
@@ -16,7 +17,10 @@ from strands_robots.mesh import init_mesh, safety
 from strands_robots.mesh.session import clear_peers
 from strands_robots.mesh.transport import zenoh_config
 from strands_robots.mesh.transport.zenoh_config import Posture
+from strands_robots.safety import stop_roster
+from strands_robots.safety.roster import Roster
 from strands_robots.tools import networks, robot_mesh
+from strands_robots.tools.mesh_roster import mesh_network
 from strands_robots.tools.networks import DeviceConnect, NativeMesh
 from strands_robots.tools.roster_verdict import combined_verdict
 
@@ -264,6 +268,10 @@ class TimedMesh:
 
     def sleep(self, seconds: float) -> None:
         self.now += seconds
+        for thread in threading.enumerate():
+            if thread.name == "stop roster":
+                # This clock is faster than the disk.
+                thread.join(0.05)
 
     @property
     def peers_by_id(self) -> dict[str, dict[str, Any]]:
@@ -296,6 +304,27 @@ def test_loopback_estop_is_sent_at_once_and_again_when_a_robot_appears(timed_mes
     assert len(mesh.stops) == 2
     assert mesh.stops[0] == 0.0
     assert mesh.now < 1.5
+
+
+@pytest.mark.parametrize("hangs", ["roster", "keys"])
+def test_hung_disk_delays_no_further_sending(
+    timed_mesh: Callable[..., TimedMesh], monkeypatch: pytest.MonkeyPatch, hangs: str
+) -> None:
+    mesh, ended, waited = timed_mesh({"arm-1": 0.4}), threading.Event(), list[bool]()
+
+    def hang(*_: object) -> Any:
+        waited.append(ended.wait(10.0))
+        return {} if hangs == "keys" else Roster(mesh_network())
+
+    where, name = {"roster": (stop_roster.Roster, "of"), "keys": (networks, "enrolled_peers")}[hangs]
+    monkeypatch.setattr(where, name, hang)
+    try:
+        verdict = NativeMesh().emergency_stop("")
+        assert waited == []
+    finally:
+        ended.set()
+    assert len(mesh.stops) >= 2
+    assert verdict["status"] == "error"
 
 
 def test_robot_that_connects_late_to_a_listener_is_stopped(

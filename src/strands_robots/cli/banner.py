@@ -89,7 +89,8 @@ def flags_elsewhere(link: LinkConfig) -> str:
     if link.transport == "nats":
         words += [word for url in link.connect for word in ("--nats", redacted(url))]
     else:
-        words += [word for each in link.connect or link.listen for word in ("--connect", _reachable(each))]
+        endpoints = link.connect or tuple(_reachable(link, each) for each in link.listen)
+        words += [word for each in endpoints for word in ("--connect", each)]
         words += ["--multicast"] if link.uses_multicast and not words else []
     if link.meet_port is not None and str(link.meet_port) != settings.default("STRANDS_DC_PORT"):
         words += ["--port", str(link.meet_port)]
@@ -121,8 +122,15 @@ def _state() -> str:
     return f"STRANDS_STATE_DIR={shlex.quote(str(Path(stated).expanduser().absolute()))} " if stated else ""
 
 
-def _reachable(endpoint: str) -> str:
+def _reachable(link: LinkConfig, endpoint: str) -> str:
     """Return the endpoint of a listener as this machine reaches it."""
+    if not any(f"/{host}:" in endpoint for host in _ANYWHERE):
+        return endpoint
+    here = "127.0.0.1"
+    if endpoint.startswith("tls/") and link.verify_hostname:
+        from strands_robots.cli.certificates import own_host  # noqa: PLC0415 - its package is loaded when it is used
+
+        here = own_host(link) or here
     for host in _ANYWHERE:
-        endpoint = endpoint.replace(f"/{host}:", "/127.0.0.1:")
+        endpoint = endpoint.replace(f"/{host}:", f"/{here}:")
     return endpoint

@@ -36,6 +36,15 @@ def valid_until(link: LinkConfig) -> str:
     return _certificates(link.cert or link.ca)[0].not_valid_after_utc.date().isoformat()
 
 
+def own_host(link: LinkConfig) -> str:
+    """Return the host in a link's own certificate that this machine reaches it by."""
+    try:
+        names = _hosts(_certificates(link.cert)[0]) if link.cert else []
+    except (OSError, _UnusableError, IndexError):
+        return ""
+    return next((each for each in ("127.0.0.1", "localhost") if each in names), names[0] if names else "")
+
+
 class _UnusableError(ValueError):
     """A file that holds something else."""
 
@@ -51,6 +60,15 @@ def _misfit(link: LinkConfig, chain: list[x509.Certificate], authorities: list[x
     if not any(_issued(chain[-1], each) for each in authorities):
         return f"{_named(link.cert)} was not issued by {_named(link.ca)}: peers that trust that authority refuse it"
     return ""
+
+
+def _hosts(certificate: x509.Certificate) -> list[str]:
+    try:
+        names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    except (x509.ExtensionNotFound, ValueError):
+        return []
+    stated = [*names.get_values_for_type(x509.DNSName), *map(str, names.get_values_for_type(x509.IPAddress))]
+    return [each for each in stated if not set("*:/") & set(each)]
 
 
 def _issued(certificate: x509.Certificate, authority: x509.Certificate) -> bool:

@@ -19,7 +19,7 @@ from strands_robots.safety.consoles import enrolled_consoles
 from strands_robots.safety.identity import DEFAULT_TENANT, EnrolledKeys, KeyFileError, fingerprint, local_name
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.roster_report import CELL_MAX
-from strands_robots.safety.statements import Purpose, own_key
+from strands_robots.safety.statements import Purpose, distrust, own_key
 from strands_robots.utils import device_id, number, shown
 
 COMPARE = "Compare each with the fingerprint that `strands-robots doctor` shows at the robot's own machine."
@@ -77,8 +77,8 @@ def _enroll_robots(
         known = file.load()
         outcome: dict[str, tuple[str, str]] = {}
         fresh: dict[str, bytes] = {}
-        stated = {local_name(tenant, each.name): each.facts.get("cell") for each in reports}
-        cells = {name: cell for name, cell in stated.items() if isinstance(cell, str) and len(cell) <= CELL_MAX}
+        stated = {local_name(tenant, each.name): _signed_cell(each, keys[each.name]) for each in reports}
+        cells = {name: cell for name, cell in stated.items() if cell is not None}
         for name, public in keys.items():
             local = local_name(tenant, name)
             if public is None:
@@ -151,6 +151,18 @@ def _on_mesh(network: Network, wanted: list[str], seconds: float) -> tuple[list[
     from strands_robots.mesh import session  # noqa: PLC0415 - loaded when a network is used
 
     return ask_mesh(network, seconds, wanted), session.network(), "It was looked for on the native mesh."
+
+
+def _signed_cell(report: LockoutReport, key: bytes | None) -> str | None:
+    """Return the cell that a robot signed within the minute; None is in every cell.
+
+    An unsigned one may be a stranger's, which would take the robot out of later stops of its cell.
+    """
+    statement = _statement(report.facts)
+    cell = statement.get("cell")
+    if key is None or not isinstance(cell, str) or len(cell) > CELL_MAX:
+        return None
+    return None if distrust(Purpose.LOCKOUT_STATE, report.name, statement, key, {}) else cell
 
 
 def _statement(facts: Mapping[str, object]) -> Mapping[str, object]:

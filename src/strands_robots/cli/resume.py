@@ -309,7 +309,7 @@ def _clear_locally(screen: Screen, wanted: list[str]) -> None:
     if not names:
         why = state_problem() or "This machine's file has no lockout; name the robots whose process runs here."
         raise CliError(why, devices={})
-    unheard = unheard_since(names, _stored_file())
+    unheard = _unheard_here(names)
     _warn(screen, unheard)
     try:
         cleared = clear_here(operator(), names)
@@ -317,6 +317,14 @@ def _clear_locally(screen: Screen, wanted: list[str]) -> None:
         raise CliError(f"Nothing was cleared: {exc}") from exc
     outcome = {name: (said.startswith("cleared"), said) for name, said in cleared.items()}
     _report(screen, outcome, unheard, f"Recorded in the audit as cleared by {operator()}.")
+
+
+def _unheard_here(names: list[str]) -> Unheard:
+    """Return who was not heard since, or why that cannot be read."""
+    try:
+        return unheard_since(names, _stored_file())
+    except CliError as unreadable:
+        return Unheard(problem=unreadable.reason.rstrip("."))
 
 
 def resume_robots(

@@ -110,7 +110,7 @@ def estop(
         list[str] | None,
         typer.Option(
             "--only",
-            help="Stop this robot alone; may be repeated. Bare devices and earlier releases stop all the same.",
+            help="Stop this robot alone; may be repeated. Without --mesh, bare devices and earlier releases stop, too.",
             metavar="ROBOT",
         ),
     ] = None,

@@ -225,7 +225,7 @@ class SafetyRegistration:
         }
         if not nonce:
             return facts
-        fields = {**self._lock_fields(), "check_in": check_in, "nonce": nonce}
+        fields = {**self._lock_fields(), "check_in": check_in, "cell": self.cell, "nonce": nonce}
         return {**facts, "statement": signed(self.identity, Purpose.LOCKOUT_STATE, self.device_id, fields)}
 
     def _lock_fields(self) -> dict[str, Any]:

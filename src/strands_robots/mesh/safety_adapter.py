@@ -144,8 +144,9 @@ class SafetyAdapter:
     def report(self, peer_id: str = "", nonce: str = "") -> dict[str, Any]:
         """Return lockouts and check-in; of a robot of its world by its id."""
         check_in = self._plane.checkin.fields(time.monotonic())
-        facts = with_lockout_statement(self.identity, peer_id or self._peer_id, self.facts(), nonce)
-        return {**facts, "lockout": self.lockouts(), "check_in": check_in, "cell": self._cell}
+        stated = {**self.facts(), "cell": self._cell}
+        facts = with_lockout_statement(self.identity, peer_id or self._peer_id, stated, nonce)
+        return {**facts, "lockout": self.lockouts(), "check_in": check_in}
 
     def stop_refusal(self, source: str, body: Mapping[str, Any]) -> str | None:
         """The reason why an e-stop of ``source`` does not count, or None."""

@@ -130,6 +130,6 @@ def _positions(joints: object) -> list[tuple[str, float]]:
     found = []
     for name, entry in joints.items() if isinstance(joints, Mapping) else ():
         at = entry.get("position") if isinstance(entry, Mapping) else entry
-        if isinstance(at, int | float):
+        if isinstance(at, int | float) and not isinstance(at, bool):
             found.append((str(name), float(at)))
     return found

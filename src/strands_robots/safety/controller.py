@@ -38,7 +38,6 @@ from strands_robots.safety.roster_inbox import OnReport, RosterInbox
 from strands_robots.safety.roster_report import STOP_ROSTER
 from strands_robots.safety.scope import (
     EVERY_ROBOT,
-    READ_S,
     WIDEN_S,
     KnownRobots,
     Remembers,
@@ -573,7 +572,7 @@ class _Running:
         """Monotonic s at which it widens, unless a robot in its scope answers."""
         if self.left is None or self.scope.everything or self.widened:
             return float("inf")
-        return self.left + (READ_S if self.known is None else self.known.widens_after_s)
+        return self.left + (WIDEN_S if self.known is None else self.known.widens_after_s)
 
     @property
     def settled_scope(self) -> bool:

@@ -7,6 +7,7 @@ signed resume can name and only an operator at the machine clears.
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
@@ -41,6 +42,9 @@ OVERFLOW = "overflow"
 
 Span = tuple[float, float]
 """Two moments in seconds since boot."""
+
+ANY_TIME: Span = (LONG_AGO, math.inf)
+"""Times of the stops that an overflow stands for, where none is known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,13 +134,14 @@ class LockoutLatch:
         resumed: Iterable[str] = (),
         *,
         cleared: tuple[Span, ...] = (),
-        crowded: float = LONG_AGO,
+        crowd: Span = ANY_TIME,
     ) -> None:
         self.robot_id = robot_id
         self._state = state or LockoutState()
         self._seen: dict[str, None] = dict.fromkeys([*seen, *self._state.resumable])
         self._resumed = dict.fromkeys(resumed)
-        self._cleared, self._crowded_since = cleared, crowded
+        # What comes from now on is noted, so that no later stop counts among those of an unknown time.
+        self._cleared, self._crowd = cleared, (crowd[0], min(crowd[1], uptime()))
         self._clock = clock
         self._writing = threading.Lock()
 
@@ -162,9 +167,14 @@ class LockoutLatch:
         return self._cleared
 
     @property
-    def crowded_since(self) -> float:
-        """Seconds since boot from which on the overflow stands for stops."""
-        return self._crowded_since
+    def crowd(self) -> Span:
+        """First and last moment of the stops that the overflow stands for."""
+        return self._crowd
+
+    def crowd_on(self, received: float) -> None:
+        """Count a stop that was received then among those of the overflow."""
+        since, until = self._crowd
+        self._crowd = since, max(until, received + SKEW_S)
 
     def cleared_of(self, received: float) -> bool:
         """Return True for a stop of this moment that may be one it was cleared of."""
@@ -187,10 +197,23 @@ class LockoutLatch:
             crowded = self._state.overflow is not None
             self._state = self._state.engage(Lockout(epoch, source, reason, self._clock(), scope))
             if self._state.overflow is not None and not crowded:
-                # An overflow that is taken over stands for stops of which no time is known.
-                self._crowded_since = LONG_AGO if epoch == OVERFLOW else uptime() - SKEW_S
+                self._crowd = uptime() - SKEW_S, uptime() + SKEW_S
             self._forget()
             return True
+
+    def inherit(self, state: LockoutState, crowd: Span) -> None:
+        """Take over lockouts, except what was resumed here since.
+
+        Args:
+            state: with them.
+            crowd: first and last moment of the stops that its overflow stands for.
+        """
+        own = self._crowd if self._state.overflow is not None else crowd
+        for each in state.all:
+            self.engage(each.epoch, each.source, each.reason, each.scope)
+        if state.overflow is not None:
+            with self._writing:
+                self._crowd = min(own[0], crowd[0]), max(own[1], crowd[1])
 
     def resume(self, epoch: str) -> None:
         """Clear ``epoch`` after its resume was verified."""
@@ -201,7 +224,7 @@ class LockoutLatch:
     def clear(self) -> tuple[Lockout, ...]:
         """Clear every lockout, for an operator at this machine; return them."""
         with self._writing:
-            self._cleared = with_cleared(self._cleared, self._state, self._crowded_since)
+            self._cleared = with_cleared(self._cleared, self._state, self._crowd)
             cleared, self._state = self._state.all, LockoutState()
             self._add_resumed(self._seen)
             return cleared
@@ -223,11 +246,14 @@ class LockoutLatch:
         del self._seen[oldest]
 
 
-def with_cleared(cleared: tuple[Span, ...], state: LockoutState, since: float) -> tuple[Span, ...]:
-    """Return the spans with that of an overflow that is cleared now, if there is one."""
+def with_cleared(cleared: tuple[Span, ...], state: LockoutState, crowd: Span) -> tuple[Span, ...]:
+    """Return the spans with that of an overflow that is cleared now, if any.
+
+    It ends with the last stop that was received: a later one, which the robot missed, still counts.
+    """
     if state.overflow is None:
         return cleared
-    spans = (*cleared, (since, uptime()))
+    spans = (*cleared, (crowd[0], min(crowd[1], uptime())))
     return spans if len(spans) <= CLEARED_MAX else ((spans[0][0], spans[1][1]), *spans[2:])
 
 

@@ -37,14 +37,14 @@ def with_stop_statement(
 def with_lockout_statement(
     identity: SigningIdentity | None, peer_id: str, facts: Mapping[str, Any], nonce: str = ""
 ) -> dict[str, Any]:
-    """Return ``locked`` and ``epochs`` with their signed part, if there is a key.
+    """Return a lockout state with its signed part, if there is a key.
 
     Args:
         nonce: of the question, so that a recorded answer fits no other one.
     """
     if identity is None:
         return dict(facts)
-    fields = {"device_id": peer_id, "locked": facts["locked"], "epochs": facts["epochs"]}
+    fields = {"device_id": peer_id, **{name: facts[name] for name in ("locked", "epochs", "cell") if name in facts}}
     fields |= {"nonce": nonce} if nonce else {}
     return {**facts, "statement": signed(identity, Purpose.LOCKOUT_STATE, peer_id, fields)}
 

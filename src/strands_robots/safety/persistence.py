@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import math
 import os
 import re
 import threading
@@ -22,6 +23,7 @@ from typing import Any
 
 from strands_robots.safety.approval import state_dir
 from strands_robots.safety.lockout import (
+    ANY_TIME,
     LONG_AGO,
     MAX_EPOCHS,
     OVERFLOW,
@@ -79,7 +81,7 @@ class StoredLockout:
     Attributes:
         originals: the stops that lock it, as they arrived.
         resumed: None where there is no record yet; a lockout that is saved without leaves it as it is.
-        crowded_since: seconds since boot from which on the overflow stands for stops.
+        crowd: first and last moment, in seconds since boot, of the stops that the overflow stands for.
     """
 
     state: LockoutState = field(default_factory=LockoutState)
@@ -87,13 +89,13 @@ class StoredLockout:
     name: str = ""
     originals: tuple[Original, ...] = ()
     resumed: ResumedEpochs | None = None
-    crowded_since: float = LONG_AGO
+    crowd: Span = ANY_TIME
 
     def freed(self) -> StoredLockout:
         """Return the record after an operator cleared the robot."""
         state, resumed = self.state, self.resumed or ResumedEpochs()
         epochs = with_resumed(dict(resumed.epochs), [*self.seen, *state.resumable])
-        spans = with_cleared(resumed.cleared, state, self.crowded_since)
+        spans = with_cleared(resumed.cleared, state, self.crowd)
         freed = replace(resumed, epochs=epochs, cleared=spans)
         return replace(self, state=LockoutState(), originals=(), resumed=freed)
 
@@ -308,10 +310,16 @@ def _record(kept: StoredLockout) -> dict[str, Any]:
         "name": kept.name,
         "holds": [_fields(each) for each in kept.state.lockouts],
         "overflow": _fields(kept.state.overflow) if kept.state.overflow else None,
-        **({"crowded": moment(kept.crowded_since)} if kept.state.overflow else {}),
+        **(_crowd_fields(kept.crowd) if kept.state.overflow else {}),
         "seen": list(kept.seen),
         **({"originals": [each.record() for each in _fitting(kept.originals)]} if kept.originals else {}),
     }
+
+
+def _crowd_fields(crowd: Span) -> dict[str, Any]:
+    since, until = crowd
+    last = {"crowded_until": moment(until)} if math.isfinite(until) else {}
+    return {"crowded": moment(since), **last}
 
 
 def _fitting(originals: tuple[Original, ...]) -> list[Original]:
@@ -337,9 +345,12 @@ def _stored(record: Mapping[str, Any]) -> StoredLockout:
         raise ValueError("more epochs than a robot tells apart, or one of them twice")
     seen = tuple(each for each in record["seen"] if is_epoch(each))
     originals = tuple(Original.of(each) for each in record.get("originals", ()))
-    crowded = since_boot(record["crowded"]) if "crowded" in record else LONG_AGO
+    since, until = ANY_TIME
+    since = since_boot(record["crowded"]) if "crowded" in record else since
+    # Earlier releases kept no end.
+    until = since_boot(record["crowded_until"]) if "crowded_until" in record else until
     state, name = LockoutState(lockouts, overflow), str(record.get("name", ""))
-    return StoredLockout(state, seen, name, originals, crowded_since=crowded)
+    return StoredLockout(state, seen, name, originals, crowd=(since, until))
 
 
 def _lockout(data: Mapping[str, Any]) -> Lockout:

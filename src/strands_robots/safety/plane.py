@@ -18,7 +18,7 @@ from strands_robots.envelope import Envelope, error, success
 from strands_robots.safety.checkin import CheckIn
 from strands_robots.safety.clearance import CLEARED, LEFT, NOT_KEPT, NOT_LOCKED, ClearanceInbox
 from strands_robots.safety.gate import MotionGate
-from strands_robots.safety.lockout import Lockout, LockoutLatch, LockoutState
+from strands_robots.safety.lockout import Lockout, LockoutLatch
 from strands_robots.safety.orders import LISTENER, MISSED, RobotReport, StopOrder, new_epoch
 from strands_robots.safety.originals import Original, Originals
 from strands_robots.safety.persistence import LockoutStore, ResumedEpochs, StoredLockout
@@ -83,9 +83,9 @@ class Registered:
         self.gates: tuple[MotionGate, ...] = (robot.gate,)
         resumed = kept.resumed or ResumedEpochs()
         self.latch = LockoutLatch(
-            wire_id, kept.state, kept.seen, resumed=resumed.epochs, cleared=resumed.cleared, crowded=kept.crowded_since
+            wire_id, kept.state, kept.seen, resumed=resumed.epochs, cleared=resumed.cleared, crowd=kept.crowd
         )
-        self.on_disk = kept.state
+        self.on_disk, self.crowd_on_disk = kept.state, self.latch.crowd
         self.registered_before = kept.resumed is not None
         self._recorded_since, self._here_since = resumed.since, uptime()
         self.resumed_on_disk = None if kept.resumed is None else self.resumed
@@ -126,6 +126,11 @@ class Registered:
         return bool(self.key) and (self.latch.state is not self.on_disk or self.resumed_unsaved)
 
     @property
+    def crowd_unsaved(self) -> bool:
+        """True while the disk lacks the latest time of a flood."""
+        return bool(self.key) and self.crowded and self.latch.crowd is not self.crowd_on_disk
+
+    @property
     def unrecorded(self) -> bool:
         """True until the disk says since when there is this robot."""
         return bool(self.key) and self.resumed_on_disk is None
@@ -149,12 +154,7 @@ class Registered:
         if kept.resumed is not None:
             self.registered_before, self._recorded_since = True, kept.resumed.since
             self.latch.forgo(kept.resumed.epochs, kept.resumed.cleared)
-        self.inherit(kept.state)
-
-    def inherit(self, state: LockoutState) -> None:
-        """Take over the lockouts of another entry, except what was resumed here since."""
-        for each in state.all:
-            self.latch.engage(each.epoch, each.source, each.reason, each.scope)
+        self.latch.inherit(kept.state, kept.crowd)
 
     def returned(self) -> bool:
         """Count as a robot that was here before its process; False without a record."""
@@ -184,11 +184,13 @@ class Registered:
         A stop is known, or one of a flood that locks nothing more: the latest halt answers for it. A missed one may be
         from before its time.
         """
-        if order.path == MISSED and not self._missed(uptime() - order.age_s - (time.monotonic() - order.received)):
+        received = uptime() - order.age_s - (time.monotonic() - order.received)
+        if order.path == MISSED and not self._missed(received):
             return False
         lock = functools.partial(self.latch.engage, order.epoch, order.source, order.reason, order.scope)
         if not self.crowded:
             return lock()
+        self.latch.crowd_on(received)
         if order.received - self._halted_at < HALT_AGAIN_S or not lock():
             return False
         self._halted_at = order.received
@@ -364,7 +366,7 @@ class SafetyPlane:
         living = [each.latch for each in self._robots.values()]
         for latch in entry.robot.gate.latches:
             if isinstance(latch, LockoutLatch) and latch is not entry.latch and latch not in living:
-                entry.inherit(latch.state)
+                entry.latch.inherit(latch.state, latch.crowd)
                 entry.robot.gate.detach(latch)
 
     def _bequeath(self, entry: Registered) -> None:
@@ -375,7 +377,7 @@ class SafetyPlane:
         for gate in entry.gates:
             heirs = [each for each in self._robots.values() if gate in each.gates]
             for heir in heirs:
-                heir.inherit(entry.latch.state)
+                heir.latch.inherit(entry.latch.state, entry.latch.crowd)
             if heirs or not entry.locked:
                 gate.detach(entry.latch)
 
@@ -582,10 +584,10 @@ class SafetyPlane:
             learnt = order.path == MISSED
             self._originals.add(Original(order.epoch, order.source, order.original, order.network, received, learnt))
 
-    def _keep(self, entries: Iterable[Registered]) -> None:
+    def _keep(self, entries: Iterable[Registered], *, crowds: bool = False) -> None:
         # One at a time, so that no older state is written over a newer one.
         with self._keeping:
-            due = [each for each in entries if each.unsaved]
+            due = [each for each in entries if each.unsaved or (crowds and each.crowd_unsaved)]
             self._originals.keep(self._held(due))
             kept = {each: self._record_of(each) for each in due}
             try:
@@ -596,7 +598,7 @@ class SafetyPlane:
                     entry.keep_again = True
                 raise
             for entry, record in kept.items():
-                entry.on_disk = record.state
+                entry.on_disk, entry.crowd_on_disk = record.state, record.crowd
                 if record.resumed is not None:
                     entry.resumed_on_disk = record.resumed
                 if entry.keep_again:
@@ -613,7 +615,7 @@ class SafetyPlane:
             entry.wire_id,
             tuple(self._originals.of(frozenset(state.resumable))),
             entry.resumed if entry.resumed_unsaved else None,
-            latch.crowded_since,
+            latch.crowd,
         )
 
     def _held(self, leaving: Iterable[Registered] = ()) -> frozenset[str]:
@@ -630,12 +632,12 @@ class SafetyPlane:
 
     def _keep_again(self) -> None:
         """Write what could not be written; the log and the audit say when it is."""
-        due = [each for each in self._robots.values() if each.keep_again]
+        due = [each for each in self._robots.values() if each.keep_again or each.crowd_unsaved]
         new = {each: each.resumed for each in self._robots.values() if each.unrecorded}
         if (due or new) and time.monotonic() >= self._keep_at:
             self._keep_at = time.monotonic() + KEEP_AGAIN_S
-            with contextlib.suppress(OSError):  # reported when it failed first
-                self._keep(due)
+            with contextlib.suppress(OSError):  # a lockout that is not written was reported at first
+                self._keep(due, crowds=True)
                 self._record_new(new)
 
     def _record_new(self, resumed: Mapping[Registered, ResumedEpochs]) -> None:

@@ -104,10 +104,10 @@ class Scope:
 EVERY_ROBOT = Scope()
 
 WIDEN_S = 0.2
-"""Seconds after which a stop of some robots becomes one of every robot, where none of them answered or is known."""
+"""Seconds after which a stop of some robots becomes one of every robot, where none of them answered or is known.
 
-READ_S = 1.0
-"""Seconds that this waits at most for the robots that are known here to be read; a disk that hangs knows none."""
+Robots that are not read from the disk by then are not known: where it is not sure, every robot stops.
+"""
 
 Remembers = Callable[[Scope], bool]
 """Says whether this machine knows a robot that a scope means; it may read the disk."""
@@ -125,11 +125,10 @@ class KnownRobots:
 
     Attributes:
         known: a robot in the scope was found.
-        read: the search has ended.
     """
 
     def __init__(self, scope: Scope, remembers: Remembers) -> None:
-        self.known = self.read = False
+        self.known = False
         self._scope, self._remembers = scope, remembers
         threading.Thread(target=self._ask, name="stop scope", daemon=True).start()
 
@@ -138,12 +137,11 @@ class KnownRobots:
             self.known = self._remembers(self._scope)
         except Exception:
             logger.critical("The robots known here cannot be read, so none counts as known.", exc_info=True)
-        self.read = True
 
     @property
     def widens_after_s(self) -> float:
         """Seconds from the stop to its widening; infinite where a robot is known."""
-        return math.inf if self.known else WIDEN_S if self.read else READ_S
+        return math.inf if self.known else WIDEN_S
 
 
 def report_widened(epoch: str, scope: Scope) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from strands_robots.safety.network_key import MESH
 from strands_robots.safety.roster import RosterRow
 from strands_robots.safety.silence import UNTOLD, cannot_answer, described
 from strands_robots.safety.stop_roster import StopOutcome
@@ -16,7 +17,9 @@ FEW = 5
 def stop_notes(outcome: StopOutcome) -> list[str]:
     """Return sentences on problems, the roster's limit, groups, other networks."""
     scoped = not (outcome.report.scope.everything or outcome.report.widened)
-    notes = [f"This stop was for {outcome.report.scope}. {STOPS_ANYWAY}"] if scoped else []
+    # On the mesh a stop of named robots is sent to these alone.
+    alone = bool(outcome.report.scope.only) and outcome.roster.network.kind == MESH
+    notes = [f"This stop was for {outcome.report.scope}.{'' if alone else f' {STOPS_ANYWAY}'}"] if scoped else []
     notes += [problem_sentence(each) for each in outcome.problems]
     notes += [outcome.worth] if outcome.worth else []
     notes += [each for each in (_others(outcome), _unproven(outcome), _no_stop(outcome), _exempt(outcome)) if each]

@@ -50,6 +50,7 @@ class StopOutcome:
         unproven: robots that controllers without a known signature say they miss, and who says so.
         reasons: of silent robots.
         problems: why the roster may lack robots; with one of them no exit code is 0.
+        unsigned: the answers are those to a plain stop, which no robot signs on Device Connect.
     """
 
     report: StopReport
@@ -60,10 +61,14 @@ class StopOutcome:
     reasons: Mapping[str, str] = field(default_factory=dict)
     problems: tuple[str, ...] = ()
     sending: Sending = field(default_factory=Sending)
+    unsigned: bool = False
 
     @property
     def ok(self) -> bool:
-        """True when every robot of the roster is known to stand still."""
+        """True when every robot of the roster is known to stand still.
+
+        Where the answers are ``unsigned``, each one said so.
+        """
         return self.report.ok and not self.problems
 
     @property
@@ -73,12 +78,16 @@ class StopOutcome:
 
     @property
     def sentence(self) -> str:
-        """The number of robots that are known to stand still, in a sentence."""
+        """The number of robots that stand still, known or said, in a sentence."""
         still, size = len(self.report.stopped), self.size
         some = not (self.report.scope.everything or self.report.widened)
         which = "that this stop was for" if some else "of the roster"
         if not size:
             return "The roster has no robot."
+        if self.unsigned:
+            many = f"The one robot {which} said that it stands" if size == still == 1 else ""
+            many = many or f"{still} of the {size} robots {which} said that they stand"
+            return f"{many} still; answers to a plain stop are not signed."
         if size == 1:
             return f"The one robot {which} is {'' if still else 'not '}known to stand still."
         if still == size:
@@ -103,6 +112,7 @@ class StopOutcome:
             "no_stop": list(self.no_stop[:NAMED_MAX]),
             "others": _others(self),
             "problems": list(self.problems),
+            **({"unsigned": True} if self.unsigned else {}),
         }
 
     def record(self, controller: str) -> None:
@@ -110,10 +120,10 @@ class StopOutcome:
         report = self.report
         moving = {**report.not_stopped, **report.refused}
         queue_safety_event(
-            "estop_outcome",
+            "estop_outcome" if report.estop_id else "stop_outcome",
             controller,
             {
-                "estop_id": report.estop_id,
+                **({"estop_id": report.estop_id} if report.estop_id else {}),
                 "roster": self.size,
                 "stopped": len(report.stopped),
                 "not_stopped": {name: moving[name].why[:200] for name in sorted(moving)[:NAMED_MAX]},
@@ -386,7 +396,7 @@ def robots_known_at(network: Callable[[], NetworkKey]) -> Remembers:
 
     def remembers(scope: Scope) -> bool:
         roster = Roster.of(network())
-        return any(scope.names(row.name, row.cell) for row in roster.rows if counts(roster, row))
+        return any(scope.names(row.name, row.last_cell) for row in roster.rows if counts(roster, row))
 
     return remembers
 

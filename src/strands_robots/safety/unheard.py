@@ -59,7 +59,10 @@ def unheard_since(freed: Collection[str], stored: Mapping[str, StoredLockout]) -
     for each in stored.values():
         for lockout in each.state.lockouts if each.name in freed else ():
             locked.setdefault(lockout, set()).add(each.name)
-    acted = {each.name: {*each.seen, *each.state.epochs} for each in stored.values()}
+    acted: dict[str, set[str]] = {}
+    for each in stored.values():
+        # A robot may have been served as a simulation and as hardware, under one name.
+        acted.setdefault(each.name, set()).update(each.seen, each.state.epochs)
     names: dict[str, None] = {}
     try:
         for lockout, robots in locked.items():

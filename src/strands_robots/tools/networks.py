@@ -24,10 +24,18 @@ from strands_robots.safety.roster_search import RosterSearch, stop_and_search
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.safety.silence import Sending
 from strands_robots.safety.statements import ALARM
-from strands_robots.safety.stop_roster import StopOutcome, StopRoster, robots_known_at
+from strands_robots.safety.stop_roster import READ_WITHIN_S, StopOutcome, StopRoster, robots_known_at
 from strands_robots.safety.stopping import explain, grade
 from strands_robots.tools.mesh_roster import MeshReports, mesh_network
-from strands_robots.tools.roster_verdict import OnOutcome, combined_verdict, measured, roster_verdict, unanswered
+from strands_robots.tools.roster_verdict import (
+    OnOutcome,
+    combined_verdict,
+    measured,
+    roster_verdict,
+    unanswered,
+    with_plain_stops,
+    with_reasons,
+)
 from strands_robots.utils import MissingExtraError, ValidationError, finite
 
 if TYPE_CHECKING:
@@ -139,6 +147,7 @@ class NativeMesh:
             roster = StopRoster(mesh_network())
             answers = _stop_all(mesh, lambda: mesh.broadcast(command, ESTOP_S), roster)
             outcome = measured(answers, roster, Sending())
+            outcome.record(mesh.peer_id)
             on_outcome(outcome)
             return roster_verdict(answers, outcome)
 
@@ -208,29 +217,43 @@ def _stop_all(mesh: Mesh, stop: Callable[[], list[dict[str, Any]]], roster: Stop
         roster: read once it has left, and given the peers in reach.
     """
     seen: set[str] = set()
+    replies: dict[str, dict[str, Any]] = {}
     answers: dict[str, Envelope] = {}
+    keys: list[Mapping[str, bytes] | None] = []
     sent = time.monotonic()
+
+    def read() -> None:
+        try:
+            keys.append(enrolled_peers())
+        finally:
+            roster.read()
 
     def send() -> None:
         nonlocal sent
         sent = time.monotonic()
-        replies, keys = stop(), enrolled_peers()
-        for reply in replies:
-            name = reply["responder_id"]
-            if name != mesh.peer_id:
-                answers[name] = _stop_answer(name, reply, keys, locks=roster.scope.only)
+        replies.update({each["responder_id"]: each for each in stop() if each["responder_id"] != mesh.peer_id})
+
+    def graded() -> dict[str, Envelope]:
+        while keys and replies:
+            name, reply = replies.popitem()
+            answers[name] = _stop_answer(name, reply, keys[0], locks=roster.scope.only)
+        return answers
 
     def unconfirmed() -> bool:
         seen.update(name for name in _in_reach(mesh) if roster.scope.covers(name, _cells(mesh, name)))
-        return any(not answers.get(name, {}).get("stopped") for name in seen)
+        return any(not graded().get(name, {}).get("stopped") for name in seen)
 
     send()
-    roster.read()
+    # On a thread: a disk that hangs delays no further sending.
+    reading = threading.Thread(target=read, name="stop roster", daemon=True)
+    reading.start()
     discover(mesh, lambda: send() if unconfirmed() and time.monotonic() - sent >= AGAIN_S else None)
     if unconfirmed():
         send()
+    reading.join(READ_WITHIN_S)
+    keys.append(None)  # not read in time: no answer counts as proven
     roster.find(dict.fromkeys(seen, True), {name: next(iter(_cells(mesh, name)), "") for name in seen})
-    return {name: unanswered(name) for name in seen} | answers
+    return {name: unanswered(name) for name in seen} | graded()
 
 
 def _cells(mesh: Mesh, peer: str) -> frozenset[str]:
@@ -378,7 +401,9 @@ def stop_found(fleet: FleetClient, seconds: float) -> tuple[dict[str, Envelope],
     roster.find(dict.fromkeys(answers, True))
     roster.read()
     sending = Sending(tells=fleet.link.transport == "nats")
-    return answers, measured(answers, roster, sending, problem=fleet.stale.rstrip("."))
+    outcome = replace(measured(answers, roster, sending, problem=fleet.stale.rstrip(".")), unsigned=True)
+    outcome.record(fleet.source)
+    return answers, outcome
 
 
 def silence_of(fleet: FleetClient, device: str) -> str:
@@ -409,21 +434,19 @@ def stop_and_lock(fleet: FleetClient, reason: str, scope: Scope = EVERY_ROBOT) -
             sending = replace(controller.sending, left=report.link)
         finally:
             controller.close()
-    failed = {**report.not_stopped, **report.refused}
+    heard = {**report.stopped, **report.not_stopped, **report.refused}
     inside = EVERY_ROBOT if report.widened else scope
     peers = [peer.id for peer in seen.result() if peer.stop_verb and inside.covers(peer.id, {peer.cell or ""} - {""})]
-    rest = [name for name in peers if name not in failed and name not in report.stopped]
-    answers: dict[str, Envelope] = {name: success("locked and still", stopped=True) for name in report.stopped}
-    answers |= {name: error(answer.why, stopped=False) for name, answer in failed.items()}
-    answers |= fleet.stop_each(rest, STOP_S) if rest else {}
+    rest = [name for name in peers if name not in heard]
+    answers = fleet.stop_each(rest, STOP_S) if rest else {}
     roster = search.roster
     outcome = roster.outcome(report, sending)
-    outcome = measured(answers, roster, sending, estop_id) if rest else outcome
+    if rest:
+        outcome = roster.outcome(with_plain_stops(report, outcome, answers), sending)
+        outcome = with_reasons(outcome, answers, plain=True)
     outcome.record(fleet.source)
     roster.remember(report)
-    if rest:
-        return {**roster_verdict(answers, outcome), "not_locked": rest, "estop_id": estop_id}
-    return outcome_envelope(outcome)
+    return outcome_envelope(outcome, rest)
 
 
 def _peer_list(rows: list[dict[str, Any]], stale: str = "") -> Envelope:

@@ -9,6 +9,7 @@ from typing import Any
 from strands_robots.envelope import Envelope, error, is_error, success, text_of
 from strands_robots.safety.answers import Answer
 from strands_robots.safety.controller import StopReport
+from strands_robots.safety.sightings import Known
 from strands_robots.safety.silence import Sending
 from strands_robots.safety.stop_notes import stop_notes
 from strands_robots.safety.stop_roster import StopOutcome, StopRoster
@@ -73,13 +74,49 @@ def measured(
         sending.left,
         0.0,
     )
-    outcome = roster.outcome(report, sending, problem)
+    return with_reasons(roster.outcome(report, sending, problem), answers)
+
+
+def with_reasons(outcome: StopOutcome, answers: Mapping[str, Envelope], *, plain: bool = False) -> StopOutcome:
+    """Return the outcome with what silent robots said of themselves.
+
+    Args:
+        outcome: of the stop.
+        answers: by robot.
+        plain: they are answers to a plain stop after an emergency stop.
+    """
     reasons = dict(outcome.reasons)
     for name in outcome.report.silent:
         said = text_of(answers[name]).rstrip(".") if name in answers else ""
+        if plain and name in answers and stop_outcome(answers[name])[0]:
+            said = "a plain stop was answered in its name, which proves nothing of a robot with a key"
         if said and said != text_of(unanswered(name)).rstrip("."):
             reasons[name] = f"{said}: {reasons[name]}" if name in reasons else said
     return replace(outcome, reasons=reasons)
+
+
+def with_plain_stops(report: StopReport, outcome: StopOutcome, answers: Mapping[str, Envelope]) -> StopReport:
+    """Return the report of an emergency stop with the answers to a plain one.
+
+    Those are not signed and lock nothing. *Stopped* counts of a device that was only heard, and in whose name nothing
+    came that its key should have signed; *not stopped* counts of every robot.
+
+    Args:
+        report: of the emergency stop.
+        outcome: of that report.
+        answers: to the plain stop, by robot.
+    """
+    unproven = outcome.report.claimed.keys() | outcome.report.alarms.keys()
+    bare = {row.name for row in outcome.roster.rows if row.known is Known.HEARD and not row.processes} - unproven
+    stopped, moving, claimed = dict(report.stopped), dict(report.not_stopped), dict(report.claimed)
+    for name, answer in answers.items():
+        still, said = stop_outcome(answer)
+        if still is False:
+            moving[name] = Answer(name, False, 0.0, said)
+            claimed.pop(name, None)
+        elif still and name in bare:
+            stopped[name] = Answer(name, True, 0.0, "stopped, and NOT LOCKED: it did not act on the emergency stop")
+    return replace(report, stopped=stopped, not_stopped=moving, claimed=claimed)
 
 
 def unanswered(robot: str) -> Envelope:

@@ -48,6 +48,8 @@ def endpoint_problem(link: LinkConfig, endpoint: str, within: float = DIAL_S) ->
                 _shake_hands(raw, link, host_of(endpoint))
     except OSError as error:
         return reason_of(error)
+    except ValueError:  # such as a host of more than 63 characters between two dots
+        return "its host or port cannot be read"
     return ""
 
 

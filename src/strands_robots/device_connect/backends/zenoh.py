@@ -30,11 +30,15 @@ from .base import Backend, NoResponderError, Undo, UnreadableReplyError, too_lon
 from .config import LinkConfig
 from .dial import why_silent, words_of
 from .dispatch import REPLY_SUBJECT, Backlog, CommandServer, OrderedFeed, on_a_thread
+from .reasons import reason_of
 
 logger = logging.getLogger(__name__)
 
 NO_ZENOH = "what answers there speaks no Zenoh, or asks for TLS"
 """Why a client that reaches an endpoint has no link all the same."""
+
+WHY_S = 2.0
+"""Seconds in which it is looked for why an endpoint is silent; a system's look-up of names has no bound."""
 
 REPLY_TTL_S = 60.0
 """Seconds a query outside a command waits for its reply before it is given up."""
@@ -105,7 +109,7 @@ class ZenohBackend(Backend):
         except zenoh.ZError as error:
             where = ", ".join(link.connect or link.listeners)
             # Zenoh tells of a listener why it fails, and of a connection only that none came about in time.
-            silent = await on_a_thread(partial(why_silent, link))
+            silent = await _why_silent(link)
             reason = silent or (NO_ZENOH if link.connect and not link.is_peer else words_of(str(error)))
             raise MessagingConnectionError(redacted(f"no Zenoh link at {where}: {reason}")) from error
         self._closed = False
@@ -361,6 +365,15 @@ class _Request:
         """Set the outcome, unless there is one. On the loop."""
         if not self.future.done():
             self.future.set_result(value)
+
+
+async def _why_silent(link: LinkConfig) -> str:
+    """Return why a link's endpoints do not answer, or empty."""
+    try:
+        silent: str = await asyncio.wait_for(on_a_thread(partial(why_silent, link)), WHY_S)
+    except TimeoutError as error:
+        return reason_of(error)
+    return silent
 
 
 def _payload(message: Any, longest: int) -> bytes | int:
