@@ -101,7 +101,7 @@ class RosterSearch:
 def stop_and_search(
     controller: SafetyController, search: RosterSearch, expected: Collection[str], reason: str, deadline_s: float
 ) -> StopReport:
-    """Send the stop of ``search``, which goes on while it is repeated; return the report."""
+    """Send the stop of ``search``, which goes on meanwhile; return the report."""
     return controller.stop(
         expected,
         reason,
