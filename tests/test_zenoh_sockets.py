@@ -79,3 +79,16 @@ def test_a_system_without_a_folder_of_descriptors_changes_nothing(
     monkeypatch.setattr(zenoh_sockets, "DESCRIPTORS", Path("/nowhere"))
     assert change_links() == 0
     assert linger(link) == (1, 10)
+
+
+def test_search_that_got_no_thread_is_tried_again_at_the_next_link(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> int:
+        raise RuntimeError("can't start new thread")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(zenoh_sockets._thread, "start_new_thread", refuse)
+        zenoh_sockets.close_in_background()
+    searched = threading.Event()
+    monkeypatch.setattr(zenoh_sockets, "change_links", searched.set)
+    zenoh_sockets.close_in_background()
+    assert searched.wait(20)

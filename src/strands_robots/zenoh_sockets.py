@@ -38,8 +38,13 @@ def close_in_background() -> None:
     up together cost one search, on a thread that ends with it.
     """
     if _due.acquire(blocking=False):
-        # Unlike Thread.start, this does not wait for the new thread: it is Zenoh's receiving thread that calls.
-        _thread.start_new_thread(_gather, ())
+        try:
+            # Unlike Thread.start, this does not wait for the new thread: it is Zenoh's receiving thread that calls.
+            _thread.start_new_thread(_gather, ())
+        except RuntimeError:
+            # There is no thread to be had now: the next link that comes up tries again. Nothing is logged, because a
+            # paused terminal would hold Zenoh's thread.
+            _due.release()
 
 
 def change_links() -> int:
