@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import ExitStack
+from typing import Any
 
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
@@ -46,12 +47,17 @@ def test_true_stops_in_a_flood_of_fresh_ids_are_answered_recorded_and_cost_no_me
         assert report["ok"], report
     assert robots.ask("memory_mb") < 1.2 * before
     assert robots.ask("facts")["arm-1"]["epochs"][0] == first
-    records, verifies = robots.ask("audit")
-    assert verifies
+    # On a busy machine the count is written some seconds after the stops that it counts.
+    records = eventually(lambda: with_count(robots.ask("audit")[0]), what="the stops of the flood are counted")
+    assert robots.ask("audit")[1]
     engaged = [each["payload"]["estop_id"] for each in records if each["event"] == "remote_estop_engaged"]
     assert engaged[0] == first
     assert len(engaged) <= 65
-    assert any(each["event"] == "estops_counted" for each in records)
+
+
+def with_count(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the records, if one of them counts stops."""
+    return records if any(each["event"] == "estops_counted" for each in records) else []
 
 
 @pytest.mark.parametrize("forged", ["other names", "the controller's name"])
