@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -231,3 +232,16 @@ def test_currents_that_are_not_known_are_asked_for_once() -> None:
     assert reads == [1]
     assert found is not None
     assert 1.0 <= found <= 1.1, "the lag alone of 0.05 rad at 0.1 rad/s"
+
+
+@pytest.mark.parametrize("sinks_s", [0.04, 0.1, 0.3, 1.0])
+@pytest.mark.parametrize("duration", [2.0, 6.0, 12.0, 20.0, 40.0])
+@pytest.mark.parametrize("sag", [0.02, 0.035, 0.045])
+def test_joint_that_sinks_under_its_payload_as_a_motion_begins_is_no_contact(
+    sag: float, duration: float, sinks_s: float
+) -> None:
+    # The first setpoint is where the arm sagged to, so it sags anew, and its current rises from nothing to the load's.
+    def observed(now: float) -> float:
+        return setpoint(now - 0.04, 1.2, duration) - sag * (1 - math.exp(-now / sinks_s))
+
+    assert first_stall(observed, 1.2, duration, lag=0.05, current=pressing) is None

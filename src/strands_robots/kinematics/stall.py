@@ -90,8 +90,9 @@ class StallWatch:
         if not len(self._counts):
             self._counts = np.zeros(len(joints))
             self._lowest = np.full(len(joints), np.nan)
-        lags = np.max([self._still(now, window) for window in (*WINDOWS_S, *SLOW_WINDOWS_S)], axis=0)
-        pressing = self._pressing(lags, currents)
+        lags, steady = np.max([self._still(now, window) for window in (*WINDOWS_S, *SLOW_WINDOWS_S)], axis=0)
+        # Where the lag is enough, nothing is read.
+        pressing = self._pressing(np.where(lags >= self._lag, -np.inf, steady), currents)
         self._counts = np.where((lags >= self._lag) | pressing, self._counts + 1, 0)
         worst = int(np.argmax(np.where(self._counts >= CONFIRMED, np.abs(told - joints), -1.0)))
         return worst if self._counts[worst] >= CONFIRMED else None
@@ -100,7 +101,7 @@ class StallWatch:
         """Return which joints stand still with a current that has risen."""
         suspect = lags >= READ_LAG
         drawn = np.full(len(lags), np.nan)
-        if currents is not None and self._reads and bool(np.any(suspect & (lags < self._lag))):
+        if currents is not None and self._reads and bool(np.any(suspect)):
             read = np.abs(currents())
             drawn = np.where(np.isfinite(read), read, np.nan)
             # A lost answer costs the bus some control steps, so it is not asked again.
@@ -111,10 +112,14 @@ class StallWatch:
         return result
 
     def _still(self, now: float, window: float) -> Floats:
-        """Return the lag of each joint that stands still, else minus infinity."""
+        """Return the lag of joints that do not follow, and of those that stand still.
+
+        Both are minus infinity for the other joints.
+        A joint that sinks under its payload as a motion begins draws more and more, and does not stand still.
+        """
         first, last = self._seen[0], self._seen[-1]
         if now - window < self._seen[1 if len(self._seen) > 1 else 0][0]:
-            return np.full(len(last[2]), -np.inf)
+            return np.full((2, len(last[2])), -np.inf)
         before, earlier, earliest = (self._at(now - back) for back in (window, DELAY_S, DELAY_S + window))
         told, told_before = last[1] - before[1], earlier[1] - earliest[1]
         way = np.where(told * told_before > 0, np.sign(told) * np.minimum(np.abs(told), np.abs(told_before)), 0.0)
@@ -122,8 +127,9 @@ class StallWatch:
         lag = ((last[1] - last[2]) - (first[1] - first[2])) * np.sign(way)
         if window in SLOW_WINDOWS_S:
             way = np.where(np.abs(way) >= SLOW_SHARE * np.abs(told).max(), way, 0.0)
-        still = (np.abs(way) >= TOLD) & (gone <= np.minimum(FOLLOWED * np.abs(way), STILL))
-        return np.where(still, lag, -np.inf)
+        most = np.minimum(FOLLOWED * np.abs(way), STILL)
+        behind = (np.abs(way) >= TOLD) & (gone <= most)
+        return np.where([behind, behind & (gone >= -most)], lag, -np.inf)
 
     def _at(self, when: float) -> tuple[float, Floats, Floats]:
         """Return the last look at or before a time, else the first."""
