@@ -12,7 +12,14 @@ from typing import Any
 import pytest
 from fixtures.devices import RANGES, BlindDevice, RecordingDevice
 
-from strands_robots.bus_access import action_ranges, bus_lock, joint_read_source, read_joints, write_joints
+from strands_robots.bus_access import (
+    action_ranges,
+    bus_lock,
+    joint_read_source,
+    read_currents,
+    read_joints,
+    write_joints,
+)
 from strands_robots.hardware import DeviceBody
 
 
@@ -190,3 +197,44 @@ def test_pair_of_which_one_arm_is_limp_freezes_the_other() -> None:
     body = DeviceBody("pair", pair)
     body.release(["left_pan", "left_lift", "left_grip"])
     assert pair.written == [{"pan": 10.0, "lift": 10.0, "grip": 10.0}]
+
+
+def current_bus(model: str, **raw: int) -> Any:
+    reads: list[tuple[str, list[str]]] = []
+
+    def sync_read(register: str, motors: list[str]) -> dict[str, int]:
+        reads.append((register, motors))
+        return {name: raw[name] for name in motors}
+
+    return SimpleNamespace(
+        motors={name: SimpleNamespace(model=model) for name in raw}, sync_read=sync_read, reads=reads
+    )
+
+
+def test_currents_of_feetech_motors_are_read_in_ampere_whatever_their_direction() -> None:
+    bus = current_bus("sts3215", pan=100, lift=100 | 1 << 15, grip=-100)
+    features = {f"{name}.pos": float for name in bus.motors}
+    device = SimpleNamespace(bus=bus, observation_features=features, get_observation=dict)
+    assert read_currents(device) == pytest.approx(dict.fromkeys(features, 0.65))
+    assert bus.reads == [("Present_Current", ["pan", "lift", "grip"])]
+
+
+def test_currents_of_a_pair_are_called_as_its_joints_are() -> None:
+    left, right = (SimpleNamespace(bus=current_bus("sts3215", pan=raw)) for raw in (100, 200))
+    features = {"left_pan.pos": float, "right_pan.pos": float}
+    pair = SimpleNamespace(left_arm=left, right_arm=right, observation_features=features, get_observation=dict)
+    assert read_currents(pair) == pytest.approx({"left_pan.pos": 0.65, "right_pan.pos": 1.3})
+
+
+def test_motors_of_an_unknown_unit_are_not_asked_for_their_current() -> None:
+    bus = current_bus("xl330-m288", pan=100)
+    device = SimpleNamespace(bus=bus, observation_features={"pan.pos": float}, get_observation=dict)
+    assert read_currents(device) == {}
+    assert bus.reads == []
+    assert read_currents(BlindDevice()) == read_currents(RecordingDevice()) == read_currents(object()) == {}
+
+
+def test_device_that_tells_its_currents_is_asked_for_them() -> None:
+    device = RecordingDevice()
+    device.get_currents = lambda: {"pan.pos": -0.5, "lift.pos": math.nan, "note": "warm"}  # type: ignore[attr-defined]
+    assert read_currents(device) == {"pan.pos": 0.5}

@@ -530,6 +530,7 @@ class ArmMixin:
             motion = plan(Start(arm, state, hz, speed, seen if around else (), held, going))
             motion.clock = getattr(body, "clock", motion.clock)
             motion.stall_lag = getattr(body, "stall_lag", motion.stall_lag)
+            motion.currents = getattr(body, "get_currents", None)
             planned.append(motion)
             return motion
 

@@ -17,6 +17,13 @@ from strands_robots.policies.base import numbers
 NESTING_MAX = 4
 """Wrappers around wrappers that are looked through."""
 
+AMPERES = {"sts3215": 0.0065}
+"""Ampere of one unit of ``Present_Current`` by LeRobot's name of the motor, whose 15 lower bits are its magnitude.
+
+LeRobot 0.4.4 does not decode the direction, bit 15. Motors that are not named here have none that is known.
+"""
+
+_CURRENT_BITS = 0x7FFF
 _INNER = ("device", "robot")
 _READERS = ("get_joints", "get_observation")
 
@@ -79,6 +86,30 @@ def read_joints(device: Any) -> dict[str, float]:
             positions = bus.sync_read("Present_Position")
             joints |= numbers({f"{prefix}{name}.pos": positions[name] for name in bus.motors})
         return joints
+
+
+def read_currents(device: Any) -> dict[str, float]:
+    """Read the magnitude of each motor's current in ampere, under the bus lock.
+
+    By the keys of :func:`read_joints`: from ``get_currents()`` where the device has it, else from the motor buses of a
+    LeRobot device, of the motors in :data:`AMPERES`, in one exchange a bus. Empty, without an exchange, for any other.
+    Raises what the device raises.
+    """
+    source = joint_read_source(device)
+    if source is None:
+        return {}
+    with bus_lock(source):
+        own = getattr(source, "get_currents", None)
+        if callable(own):
+            return {key: abs(value) for key, value in numbers(own()).items()}
+        currents: dict[str, float] = {}
+        for prefix, bus in motor_buses(source):
+            models = {name: str(getattr(motor, "model", "")) for name, motor in bus.motors.items()}
+            known = [name for name, model in models.items() if model in AMPERES]
+            drawn = bus.sync_read("Present_Current", known) if known else {}
+            for name in known:
+                currents[f"{prefix}{name}.pos"] = (abs(int(drawn[name])) & _CURRENT_BITS) * AMPERES[models[name]]
+        return currents
 
 
 def write_joints(device: Any, targets: Mapping[str, float]) -> None:

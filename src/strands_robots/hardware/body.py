@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import logging
 import math
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
@@ -10,7 +11,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial
 from typing import Any, TypeVar
 
-from strands_robots.bus_access import action_ranges, bus_lock, motor_buses, read_joints, write_joints
+from strands_robots.bus_access import action_ranges, bus_lock, motor_buses, read_currents, read_joints, write_joints
 from strands_robots.hardware._compat import drop, forget_input, stop_base, unplugged
 from strands_robots.hardware.calibration import answer_lost, write_to_servos
 from strands_robots.hardware.device_facts import require_port
@@ -91,6 +92,7 @@ class DeviceBody:
         self._was_connected = self.is_connected
         self._holds_unconnected = bool(getattr(device, "holds_unconnected", False))
         self._stops: list[object] = []
+        self._current_lost = False
         self.driven = False
         """True from an action until it was frozen or let go."""
 
@@ -169,6 +171,28 @@ class DeviceBody:
     def get_positions(self) -> dict[str, float]:
         """Read the joints, which are called as the action keys are."""
         return self.get_joints()
+
+    def get_currents(self) -> dict[str, float]:
+        """Read how much the motors draw in ampere, by the keys of :meth:`get_joints`.
+
+        Empty where that is not known: the device has no such motors, a stop waits for the bus, or the answer was lost,
+        which is logged once. One try, for a motion goes on without it.
+        """
+        if self._stops:
+            return {}
+        with self.lock:
+            # Another stop may have come while this waited for the bus.
+            if self._stops:
+                return {}
+            try:
+                return self._exchange(lambda: read_currents(self.device), 1)
+            except Exception as exc:  # noqa: BLE001 - a bus may raise anything; contact is then seen by the lag alone
+                level = logging.DEBUG if self._current_lost else logging.WARNING
+                logger.log(
+                    level, "%s did not tell the currents of its motors: %s: %s", self.name, type(exc).__name__, exc
+                )
+                self._current_lost = True
+                return {}
 
     def send_action(self, action: Action, permit: Permit) -> Mapping[str, Any]:
         def send() -> Any:

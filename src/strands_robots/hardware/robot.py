@@ -62,8 +62,8 @@ class HardwareRobot(ArmMixin, TeleopMixin):
 
     Args:
         device: has ``observation_features``, ``action_features``, ``get_observation``, ``send_action``, ``connect``,
-            ``disconnect``, and may have ``is_connected``, ``joint_ranges``, ``get_joints``, ``hold``, and
-            ``holds_unconnected``, true where ``hold`` needs no connection.
+            ``disconnect``, and may have ``is_connected``, ``joint_ranges``, ``get_joints``, ``get_currents``, ``hold``,
+            and ``holds_unconnected``, true where ``hold`` needs no connection.
         tool_name: what the robot is called on a network, 1 to 128 characters.
         control_hz: control rate, 1 to 2000; ``STRANDS_CONTROL_HZ`` by default.
         joint_ranges: lowest and highest target by action key, in the device's unit; what is not named is asked of

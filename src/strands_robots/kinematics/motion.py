@@ -63,6 +63,7 @@ class Motion:
         told: the last opening that the gripper is told, None for none.
         grasps: something shall be between the jaws in the end.
         stall_lag: least lag of a joint that counts as contact with something (rad or m).
+        currents: reads the currents of the body's motors by its observation's keys (A), None where it cannot.
         contact: what ended the motion, if a joint met something.
         clock: the body's own time in seconds; a simulation's stands still with it.
         state: what was observed last.
@@ -81,6 +82,7 @@ class Motion:
     grasps: bool = False
     clock: Callable[[], float] = time.monotonic
     stall_lag: float = STALL_LAG
+    currents: Callable[[], Mapping[str, float]] | None = None
     state: ArmState | None = field(default=None, init=False)
     contact: str = field(default="", init=False)
     segment: str = field(default="", init=False)
@@ -175,12 +177,18 @@ class Motion:
         if self._told is None or self._watch is None or not self._frames:
             return
         told = np.where(np.isnan(self._told), state.joints, self._told)
-        index = self._watch.stalled(self.clock(), told, state.joints)
+        currents = self.currents
+        read = None if currents is None else lambda: self._by_joint(currents())
+        index = self._watch.stalled(self.clock(), told, state.joints, read)
         if index is not None:
             joint = self.arm.chain.joints[index]
             at = f"{np.degrees(state.joints[index]):.0f} degrees" if joint.turns else f"{state.joints[index]:.3f} m"
             self.contact = f"{joint.name} was blocked at {at}: it met something, or its servo is too weak"
             raise PolicyError(self.contact)
+
+    def _by_joint(self, currents: Mapping[str, float]) -> Floats:
+        """Return currents in the order of the joints, NaN where one is not known."""
+        return np.array([currents.get(each.observed, np.nan) for each in self.arm.maps])
 
     def interrupt(self) -> None:
         """Do nothing: this policy never waits."""

@@ -14,6 +14,7 @@ from fixtures.feetech_bus.twin import ArmTwin
 from fixtures.waiting import eventually
 
 from strands_robots.hardware.emulated.packets import BROADCAST, OVERLOAD, PING, READ, SYNC_READ, SYNC_WRITE, WRITE
+from strands_robots.hardware.emulated.servo import CURRENT_UNIT_A, STALL_A, STALL_NM, STIFFNESS_NM
 
 
 class Line:
@@ -100,6 +101,46 @@ def test_a_sync_read_is_answered_in_the_order_asked(line: Line) -> None:
     answers = line.ask(Packet(BROADCAST, SYNC_READ, bytes((address, size, 3, 1, 2))), count=3)
     assert [each.servo for each in answers] == [3, 1, 2]
     assert {int.from_bytes(each.parameters, "little") for each in answers} == {2048}
+
+
+def signed(raw: int) -> int:
+    return -(raw & 0x7FFF) if raw & 0x8000 else raw
+
+
+def test_a_blocked_servo_draws_its_stall_current_and_a_free_one_none(line: Line, bus: FeetechBus) -> None:
+    assert line.read(1, "present_current") == 0
+    bus.servos[1].blocked_at = bus.servos[1].shaft + 100
+    line.write(1, "torque_enable", 1)
+    line.write(1, "goal_position", line.read(1, "present_position") + 100 + 90)
+    # 90 counts are 7.9 degrees; the stall torque is reached at 6.1.
+    eventually(lambda: line.read(1, "present_current") == round(STALL_A / CURRENT_UNIT_A), what="the stall current")
+    bus.servos[1].blocked_at = None
+    eventually(lambda: line.read(1, "present_current") == 0, what="rest at the goal")
+    line.write(1, "torque_enable", 0)
+    line.write(1, "goal_position", 2500)
+    assert line.read(1, "present_current") == 0
+
+
+@pytest.mark.parametrize("payload_nm", [0.8, -0.8])
+def test_a_servo_that_carries_a_payload_sags_and_draws_the_current_that_holds_it(
+    line: Line, bus: FeetechBus, payload_nm: float
+) -> None:
+    bus.servos[2].payload_nm = payload_nm
+    before = line.read(2, "present_position")
+    line.write(2, "torque_enable", 1)
+    sag = payload_nm / STIFFNESS_NM
+    eventually(lambda: abs(before - sag - line.read(2, "present_position")) <= 1, what="its sag")
+    held = payload_nm / STALL_NM * STALL_A / CURRENT_UNIT_A
+    assert signed(line.read(2, "present_current")) == pytest.approx(held, abs=8)
+
+
+def test_a_register_that_is_silent_is_not_answered_and_the_others_are(line: Line, bus: FeetechBus) -> None:
+    bus.servos[3].silent = frozenset({"present_current"})
+    address, size = REGISTERS["present_current"]
+    assert line.ask(Packet(3, READ, bytes((address, size))), within=0.1) == []
+    asked = Packet(BROADCAST, SYNC_READ, bytes((address, size, 3, 1)))
+    assert [each.servo for each in line.ask(asked, count=1)] == [1]
+    assert line.read(3, "present_position") == 2048
 
 
 def test_a_servo_moves_to_its_goal_only_with_torque(line: Line, bus: FeetechBus) -> None:
