@@ -28,6 +28,7 @@ from strands_robots.mcp.resources import RobotResources
 from strands_robots.mcp.results import refused_arguments, result, unknown_arguments, with_note
 from strands_robots.mcp.tools import add_control, add_motions, add_reads, add_stops
 from strands_robots.safety.sightings import flush_sightings
+from strands_robots.serving import robot_verbs  # noqa: F401 - so that the first stop of a client loads nothing
 from strands_robots.serving.stop_arguments import network_emergency_stop, network_stop
 
 logger = logging.getLogger(__name__)
