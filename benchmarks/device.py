@@ -59,9 +59,7 @@ def _bring_up(repeats: int) -> Iterator[Row]:
     yield _to_discoverable("Zenoh D2D, multicast", repeats, LinkConfig(multicast=True), "zenoh")
 
 
-def _to_discoverable(
-    name: str, repeats: int, link: LinkConfig, backend: str, *, further: bool = False
-) -> Row:
+def _to_discoverable(name: str, repeats: int, link: LinkConfig, backend: str, *, further: bool = False) -> Row:
     ours: list[float] = []
     bare: list[float] = []
     with FleetClient(link) as fleet, _discovery_by_presence(), contextlib.ExitStack() as stack:
