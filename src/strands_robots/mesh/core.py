@@ -285,7 +285,6 @@ class Mesh(SensorLoopsMixin):
         if self.children is not None:
             every("children", rates["presence"].rate_hz, self.children.refresh)
             every("children's presence", rates["presence"].rate_hz, self.children.announce, quick=True)
-        every("hearing", HEARING_HZ, self._hearing.look, quick=True)
         self._look_for_late_peers()
         frames = frames_of(self.robot)
         if frames is not None:
@@ -336,12 +335,16 @@ class Mesh(SensorLoopsMixin):
 
         def look() -> None:
             late.look()
-            # In this order, so that what is noted meanwhile is looked for in time.
-            pace("late peers", REST_HZ)
+            if not late.waits:
+                pace("late peers", REST_HZ)
+
+        def hear() -> None:
+            self._hearing.look()
+            # Noticed here, so that a stop that is noted takes no lock of the timer's.
             if late.waits:
                 pace("late peers", LATE_HZ)
 
-        late.on_noted = lambda: pace("late peers", LATE_HZ)
+        self._scheduler.every("hearing", HEARING_HZ, hear, quick=True)
         # A stop that is published again may wait for its turn, and behind no robot.
         self._scheduler.every("late peers", LATE_HZ, look, queue="late peers")
 

@@ -59,16 +59,12 @@ class LatePeers:
 
     Args:
         epochs: returns those that lock this peer's own robot.
-
-    Attributes:
-        on_noted: called when something is to be looked for.
     """
 
     def __init__(self, context: Context, epochs: Callable[[], tuple[str, ...]]) -> None:
         self._context = context
         self._epochs = epochs
         self._missing: dict[tuple[str, bool], _Missing] = {}
-        self.on_noted: Callable[[], None] = lambda: None
         # Robots of one fleet look at the same time; the first one that publishes spares the others the work.
         self._delay_s = SPREAD_S * (zlib.crc32(context.peer_id.encode()) % 1000) / 1000
 
@@ -140,7 +136,6 @@ class LatePeers:
         )
         while len(self._missing) > STORED_MAX:
             del self._missing[next(iter(self._missing))]
-        self.on_noted()
 
     def _back(self, missing: _Missing, keys: Mapping[str, bytes] | None) -> list[str]:
         """Return peers in reach that missed it; forget those that it reached."""
