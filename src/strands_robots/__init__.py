@@ -15,15 +15,21 @@ if TYPE_CHECKING:
 
     from strands_robots.hardware import HardwareRobot
     from strands_robots.robot import Robot, run
+    from strands_robots.safety.gate import Permit
     from strands_robots.simulation import Simulation
+    from strands_robots.verb_declaration import verb
+    from strands_robots.verb_parameters import Domain
 
-__all__ = ["HardwareRobot", "Robot", "Simulation", "__version__", "run"]
+__all__ = ["Domain", "HardwareRobot", "Permit", "Robot", "Simulation", "__version__", "run", "verb"]
 
 _HOMES = {
+    "Domain": "strands_robots.verb_parameters",
     "HardwareRobot": "strands_robots.hardware",
+    "Permit": "strands_robots.safety.gate",
     "Robot": "strands_robots.robot",
     "Simulation": "strands_robots.simulation",
     "run": "strands_robots.robot",
+    "verb": "strands_robots.verb_declaration",
 }
 _SIM_PACKAGES = ("mujoco", "numpy", "PIL")
 

@@ -14,11 +14,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Literal, Protocol, runtime_checkable
-from weakref import WeakKeyDictionary
 
 from strands_robots import settings
 from strands_robots.envelope import Envelope, error, success
-from strands_robots.safety.gate import MotionGate, MotionRefused
+from strands_robots.identity_map import IdentityMap
+from strands_robots.safety.gate import MotionGate, MotionRefused, gate_of
+from strands_robots.safety.halted_verbs import halted_with_verbs
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import (
     PendingVerdict,
@@ -29,7 +30,9 @@ from strands_robots.safety.stopping import (
     json_blocks,
     read_verdict,
 )
+from strands_robots.safety.verbs_under_way import VerbCall
 from strands_robots.utils import ValidationError, shown
+from strands_robots.verb_declaration import declared_verbs
 
 logger = stop_logger(__name__)
 
@@ -78,6 +81,10 @@ Observer = Callable[[RolloutEvent], None]
 """Called from the control thread: it must return at once and may not raise."""
 
 Unsubscribe = Callable[[], None]
+
+
+VERB = "verb"
+"""The ``policy`` of a verb of a robot's own, in its events; its ``instruction`` is the verb's name."""
 
 
 @runtime_checkable
@@ -209,15 +216,18 @@ def adapt(robot: Any, joints: JointReader | None = None) -> TaskRobot:
         joints: reads the joints of a robot that has no ``get_state`` of its own; without it those are none.
 
     Raises:
-        ValidationError: ``robot`` lacks one of start_task, stop_task, get_task_status, get_features.
+        ValidationError: ``robot`` lacks one of start_task, stop_task, get_task_status, get_features, and declares no
+            verb of its own.
     """
     if isinstance(robot, TaskRobot):
         return robot
     missing = [verb for verb in _TASK_VERBS if not callable(getattr(robot, verb, None))]
-    if missing:
+    # What a robot with verbs of its own lacks is bridged: it may have no tasks at all.
+    if missing and not declared_verbs(robot):
         shapes = "; ".join(f"{verb}{_TASK_VERBS[verb]}" for verb in missing)
         raise ValidationError(
-            f"robot must have {', '.join(_TASK_VERBS)}; {shown(robot)} lacks {', '.join(missing)}. Expected: {shapes}."
+            f"robot must have {', '.join(_TASK_VERBS)}, or verbs of its own declared by @verb; {shown(robot)} lacks "
+            f"{', '.join(missing)}. Expected: {shapes}."
         )
     return AdaptedRobot(robot, joints)
 
@@ -225,6 +235,33 @@ def adapt(robot: Any, joints: JointReader | None = None) -> TaskRobot:
 def body_of(robot: Any) -> Any:
     """Return the robot that :func:`adapt` wrapped, else ``robot`` itself."""
     return robot.wrapped if isinstance(robot, AdaptedRobot) else robot
+
+
+def observe(robot: Robot, observer: Observer) -> Unsubscribe:
+    """Call ``observer`` with the events of rollouts and of the robot's own verbs."""
+
+    def told(call: VerbCall) -> None:
+        kind: Literal["started", "finished"] = "finished" if call.ended else "started"
+        elapsed_s = time.monotonic() - call.began if call.ended else 0.0
+        observer(
+            RolloutEvent(
+                kind,
+                robot.tool_name_str,
+                call.name,
+                VERB,
+                elapsed_s=elapsed_s,
+                state=call.ended or "running",
+                error=call.error,
+            )
+        )
+
+    leave, unsubscribe = robot.gate.under_way.observe(told), robot.subscribe(observer)
+
+    def end() -> None:
+        leave()
+        unsubscribe()
+
+    return end
 
 
 class _PutAway:
@@ -237,7 +274,7 @@ def put_away(robot: Any) -> Callable[[], None]:
 
     For a caller that halts a robot and then leaves its network: a motion requested in between would go on.
     """
-    gate, latch = _gate_of(robot, _shared(robot)), _PutAway()
+    gate, latch = gate_of(body_of(robot)), _PutAway()
     gate.attach(latch)
     return lambda: gate.detach(latch)
 
@@ -246,7 +283,6 @@ class _Shared:
     """State that all wrappers of one foreign robot share, on every network."""
 
     def __init__(self) -> None:
-        self.gate = MotionGate()
         self.reading = threading.Lock()
         self.read: tuple[float, Joints] | None = None
         self._calls: set[object] = set()
@@ -267,20 +303,12 @@ class _Shared:
             self._calls.discard(call)
 
 
-_known: WeakKeyDictionary[Any, _Shared] = WeakKeyDictionary()
+_known: IdentityMap[_Shared] = IdentityMap()
 
 
-def _shared(robot: Any) -> _Shared:
-    """Return the shared state of one robot, however often it is wrapped."""
-    try:
-        return _known.setdefault(robot, _Shared())
-    except TypeError:  # it cannot be a key; each wrapper has a gate, and every emergency stop knows them all
-        return _Shared()
-
-
-def _gate_of(robot: Any, shared: _Shared) -> MotionGate:
-    own = getattr(robot, "gate", None)
-    return own if isinstance(own, MotionGate) else shared.gate
+def stops_motions(robot: object) -> bool:
+    """Return True for a robot with a ``halt`` or a ``stop_task``."""
+    return any(callable(getattr(robot, name, None)) for name in ("halt", "stop_task"))
 
 
 class AdaptedRobot:
@@ -289,13 +317,20 @@ class AdaptedRobot:
     def __init__(self, robot: Any, joints: JointReader | None = None) -> None:
         self.wrapped = robot
         self._read_joints = joints
-        self.tool_name_str: str = str(getattr(robot, "tool_name_str", "") or "robot")
-        self._shared = _shared(robot)
-        self.gate = _gate_of(robot, self._shared)
+        usual = "robot" if callable(getattr(robot, "start_task", None)) else type(robot).__name__.lower()
+        self.tool_name_str: str = str(getattr(robot, "tool_name_str", "") or usual)
+        self._shared = _known.of(robot, _Shared)
+        self.gate = gate_of(robot)
 
     def start_task(
         self, instruction: str, policy_provider: str = "mock", duration: float = 30.0, policy_port: int = 0
     ) -> Envelope:
+        start = getattr(self.wrapped, "start_task", None)
+        if not callable(start):
+            return error(f"{self.tool_name_str} runs no tasks; it has verbs of its own.")
+        busy = self.gate.under_way.name
+        if busy:
+            return error(f"start_task is refused: {busy} of {self.tool_name_str} has not returned.")
         try:
             permit = self.gate.permit("start_task")
             permit.wait()
@@ -303,7 +338,7 @@ class AdaptedRobot:
         except MotionRefused as refused:
             return refused.envelope
         with self._shared.calling():
-            answer: Envelope = self.wrapped.start_task(
+            answer: Envelope = start(
                 instruction, policy_provider=policy_provider, duration=duration, policy_port=policy_port
             )
         if not permit.valid:
@@ -316,17 +351,32 @@ class AdaptedRobot:
 
     def stop_task(self) -> Envelope:
         """Stop the task; the robot's own answer where its status does not contradict it."""
+        stop = getattr(self.wrapped, "stop_task", None)
+        if self.gate.under_way or not callable(stop):
+            return self.halt("stop_task").envelope()
         with self._shared.calling():
-            answer: Envelope | None = self.wrapped.stop_task()
+            answer: Envelope | None = stop()
         verdict = read_verdict(_StatusAfter(self, {"task": answer}))
         return answer if answer is not None and verdict.stopped else verdict.envelope()
 
     def get_task_status(self) -> Envelope:
-        answer: Envelope = self.wrapped.get_task_status()
-        return answer
+        """Return the robot's own status; while a verb of its own runs, that."""
+        own = getattr(self.wrapped, "get_task_status", None)
+        verb = self.gate.under_way.name
+        if callable(own):
+            answer: Envelope = own()
+            if not verb or not isinstance(answer, Mapping) or _task_status(answer) in RUNNING:
+                return answer
+        if not verb:
+            return success("Nothing runs.", task_status="idle")
+        return success(f"{verb} runs.", task_status="running", instruction=verb, verb=verb)
 
     def get_features(self) -> Envelope:
-        answer: Envelope = self.wrapped.get_features()
+        """Return the robot's own features, or none."""
+        own = getattr(self.wrapped, "get_features", None)
+        if not callable(own):
+            return success("It states no features.", observation_features={}, action_features={})
+        answer: Envelope = own()
         return answer
 
     def get_state(self) -> Envelope:
@@ -364,12 +414,16 @@ class AdaptedRobot:
         Its status is read afterwards: a robot that says that its task runs has not stopped, whatever it answered.
         """
         began = time.monotonic()
-        verdict = read_verdict(self.halt_here(reason, began + settings.number("STRANDS_HALT_DEADLINE_S")))
+        deadline = began + settings.number("STRANDS_HALT_DEADLINE_S")
+        verdict = halted_with_verbs(self, lambda: self.halt_here(reason, deadline), deadline)
         return replace(verdict, elapsed_ms=(time.monotonic() - began) * 1000)
 
-    def halt_here(self, reason: str, deadline: float) -> PendingVerdict:
+    def halt_here(self, reason: str, deadline: float) -> StopVerdict | PendingVerdict:
         """Ask everything to stop, and leave the answers and the status to be read."""
         self.gate.revoke()
+        if not stops_motions(self.wrapped):
+            # Its verbs return when their permits are void; the stop executor waits for them.
+            return StopVerdict()
         with self._shared.calling():
             own = getattr(self.wrapped, "halt", None)
             if callable(own):

@@ -71,7 +71,7 @@ def test_the_agent_tool_describes_a_task_as_execute_does() -> None:
 def test_the_mesh_knows_the_documented_actions() -> None:
     assert set(PEER_VERBS) == {
         *("status", "stop", "features", "state", "execute", "start", "step", "reset"),
-        *("teleop_status", "teleop_receive", "teleop_stop", "releaseTorque", "resume", "ping"),
+        *("teleop_status", "teleop_receive", "teleop_stop", "releaseTorque", "resume", "ping", "describe"),
         *ARM_MOTION_VERBS,
         *PICTURE_VERBS,
         *CONTROL_VERBS,

@@ -11,7 +11,7 @@ import inspect
 import json
 from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from concurrent.futures import Future
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, ClassVar, TypeVar
 from weakref import WeakKeyDictionary
@@ -21,8 +21,8 @@ from device_connect_edge.drivers.decorators import get_rpc_source_device
 from device_connect_edge.types import DeviceStatus, EventDef, FunctionDef
 
 from strands_robots import settings
-from strands_robots.contract import Haltable, Robot, RolloutEvent, Unsubscribe
-from strands_robots.device_connect._compat import CollectedOnce, Labels, Runtime, emit, observed, on, rpc
+from strands_robots.contract import Haltable, Robot, RolloutEvent, Unsubscribe, observe
+from strands_robots.device_connect._compat import CollectedOnce, Runtime, emit, observed, on, rpc
 from strands_robots.device_connect.runtime_stops import stops_of
 from strands_robots.device_connect.safety_registration import (
     LEAVE_TIMEOUT_S,
@@ -44,8 +44,10 @@ from strands_robots.safety.stop_executor import stop_executor
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.control_changes import ControlChange
+from strands_robots.serving.own_verbs import own_verbs
 from strands_robots.serving.pipeline import Command, Pipeline, RefusalReason, Refused, Result, busy
 from strands_robots.serving.stop_arguments import noted
+from strands_robots.serving.verb_schema import described, labels_of, text_of
 from strands_robots.serving.verbs import REQUIRED, Arguments, Kind, Verb
 from strands_robots.serving.workers import ShareFullError, called, loop_future
 from strands_robots.serving.world_stops import stop_within
@@ -90,7 +92,7 @@ def rpc_method(verb: Verb) -> Callable[..., Any]:
     empty = inspect.Parameter.empty
     method.__name__ = verb.name
     method.__qualname__ = f"RobotDriver.{verb.name}"
-    method.__doc__ = _docstring(verb)
+    method.__doc__ = text_of(verb)
     method.__annotations__ = {**{each.name: each.type for each in verb.parameters}, "return": dict[str, Any]}
     parameters = [
         inspect.Parameter(
@@ -103,7 +105,7 @@ def rpc_method(verb: Verb) -> Callable[..., Any]:
     ]
     itself = inspect.Parameter("self", inspect.Parameter.POSITIONAL_OR_KEYWORD)
     vars(method)["__signature__"] = inspect.Signature([itself, *parameters], return_annotation=dict[str, Any])
-    return rpc(labels=_labels(verb))(method)
+    return rpc(labels=labels_of(verb))(method)
 
 
 def stated_type(robot: object, usual: str) -> str:
@@ -138,7 +140,10 @@ class RobotDriver(CollectedOnce):
     """The cell that the robot is in, "" for none; None asks the robot, then ``STRANDS_CELL``."""
 
     verbs: ClassVar[Mapping[str, Verb]] = {}
-    """The verbs of the device, by name; each becomes an RPC method."""
+    """The verbs of the device, by name; each becomes an RPC method. An instance serves its robot's own besides."""
+
+    own_verbs: Mapping[str, Verb] = {}
+    """The verbs that the robot itself declares, by name."""
 
     made: ClassVar[Mapping[str, Verb]] = {}
     """Those of :attr:`verbs` whose RPC method was made from them and not overridden."""
@@ -162,6 +167,7 @@ class RobotDriver(CollectedOnce):
     ) -> None:
         super().__init__()
         self.robot = robot
+        self.own_verbs = own_verbs(robot)
         self.hardware = hardware
         self.authorization = authorization or Authorization(hardware=hardware, robot=robot.tool_name_str)
         self.registration: SafetyRegistration | None = None
@@ -197,11 +203,13 @@ class RobotDriver(CollectedOnce):
             observable: False in a call that the framework's own wrapper makes.
             params: arguments, and ``source_device``, the caller's declared name.
         """
-        verb = self.verbs.get(function_name)
+        own = self.own_verbs.get(function_name)
+        verb = own or self.verbs.get(function_name)
         if verb is not None and verb.kind is Kind.STOP and function_name in self.made:
             params.pop("source_device", None)
             return await self._stop(verb, params)
-        if verb is None or function_name not in self.made or (observable and observed(self)):
+        made = own is not None or (function_name in self.made and not (observable and observed(self)))
+        if verb is None or not made:
             problem = verb and verb.unfit(params.keys() - {"source_device"})
             return error(problem) if problem else await super().invoke(function_name, **params)
         caller = params.pop("source_device", None)
@@ -212,7 +220,9 @@ class RobotDriver(CollectedOnce):
         try:
             self.pipeline.share(verb).submit(partial(self.pipeline.serve, command, hand_over))
             # Not wait_for: in Python 3.11 it forgets a cancellation that comes together with the answer.
-            within_s = (START_DEADLINE_S if moves else READ_DEADLINE_S) + (WAIT_S if verb.lasts else 0.0)
+            within_s = (START_DEADLINE_S if moves else READ_DEADLINE_S) + (
+                verb.lasts_s or WAIT_S if verb.lasts else 0.0
+            )
             async with asyncio.timeout(within_s):
                 result: Result = await answered
         except ShareFullError:
@@ -255,7 +265,8 @@ class RobotDriver(CollectedOnce):
         else:
             lockouts = lock_facts(self._unregistered) if self._unregistered in self.robot.gate.latches else {}
         control = {} if self.pipeline.leases is None else {"control": self.pipeline.leases.facts()}
-        return {**answer, **lockouts, **control}
+        running = self.robot.gate.under_way.name
+        return {**answer, **lockouts, **control, **({"verb": running} if running else {})}
 
     # Stops.
 
@@ -425,7 +436,15 @@ class RobotDriver(CollectedOnce):
         """Return the functions that can be called, read once for each class."""
         if type(self) not in _FUNCTIONS:
             _FUNCTIONS[type(self)] = tuple(super().functions)
-        return list(_FUNCTIONS[type(self)])
+        own = [FunctionDef(**described(verb)) for verb in self.own_verbs.values()]
+        return [*_FUNCTIONS[type(self)], *own]
+
+    def _get_functions(self) -> dict[str, Callable[..., Any]]:
+        functions = super()._get_functions()
+        for name, own in self.own_verbs.items():
+            if name not in functions:
+                functions[name] = partial(rpc_method(own), self)
+        return functions
 
     @property
     def events(self) -> list[EventDef]:
@@ -442,8 +461,10 @@ class RobotDriver(CollectedOnce):
         """
         labels = json.dumps(self.labels, allow_nan=False)
         known = _DESCRIBED.get(type(self))
-        if known is None or known[0] != labels:
+        if self.own_verbs or known is None or known[0] != labels:
             known = labels, json.dumps(self.capabilities.model_dump(), allow_nan=False)
+            if self.own_verbs:
+                return known[1]
             _DESCRIBED[type(self)] = known
         return known[1]
 
@@ -500,7 +521,7 @@ class RobotDriver(CollectedOnce):
         if not self._looked_once:
             await self.read_activity()
         pump = RolloutPump(self._on_rollout, settings.number("STRANDS_DC_STREAM_HZ"))
-        subscribe = partial(self.robot.subscribe, pump.observe)
+        subscribe = partial(observe, self.robot, pump.observe)
         self._unsubscribe = await called(self.pipeline.shares.read, subscribe, READ_DEADLINE_S)
         self._watchers = [asyncio.create_task(work) for work in (pump.run(), *self.watches())]
         sweep(settings.number("STRANDS_DC_STATE_HZ")).add(self)
@@ -565,7 +586,7 @@ class RobotDriver(CollectedOnce):
 
     def unchanged(self) -> bool:
         """Look at the robot, on a worker; False when its state is another one."""
-        return self.same(self.glance(), self.activity)
+        return self.same(self.glance(), self.activity) and not self.robot.gate.under_way
 
     def same(self, one: Activity, other: Activity) -> bool:
         """Return True for two states of which the second one need not be told."""
@@ -625,7 +646,8 @@ class RobotDriver(CollectedOnce):
     async def _looked(self) -> Activity:
         self._looking += 1
         try:
-            return await called(self.pipeline.shares.read, self.glance, READ_DEADLINE_S)
+            activity = await called(self.pipeline.shares.read, self.glance, READ_DEADLINE_S)
+            return replace(activity, busy=True) if self.robot.gate.under_way else activity
         except Exception as exc:  # noqa: BLE001 - whatever a robot's read raises is its state to tell
             fault = f"{type(exc).__name__}: {exc}"
             if fault != self.activity.fault:
@@ -654,16 +676,3 @@ def _status_fields(activity: Activity) -> dict[str, Any]:
         "busy_score": 1.0 if activity.busy else 0.0,
         "error_state": activity.fault or None,
     }
-
-
-def _labels(verb: Verb) -> Labels:
-    if verb.kind is Kind.READ:
-        return {"direction": "read"}
-    return {"direction": "write", **({"safety": "critical"} if verb.critical else {})}
-
-
-def _docstring(verb: Verb) -> str:
-    lines = [verb.summary]
-    if verb.parameters:
-        lines += ["", "Args:", *(f"    {each.name}: {each.meaning}" for each in verb.parameters)]
-    return "\n".join(lines)

@@ -138,10 +138,12 @@ class RobotDeviceDriver(RobotDriver):
 
     async def _tell_change(self, activity: Activity) -> None:
         instruction = activity.facts["instruction"]
-        if activity.busy and self._began is None:
+        # The robot's own verbs tell their begin and end themselves.
+        runs = activity.facts["task_status"] in RUNNING and instruction not in self.own_verbs
+        if runs and self._began is None:
             self._began = time.monotonic()
             await self.taskStarted(instruction=instruction, policy_provider=self._provider)
-        elif not activity.busy and self._began is not None:
+        elif not runs and self._began is not None:
             duration, self._began = time.monotonic() - self._began, None
             state = activity.facts["task_status"]
             await self.taskComplete(

@@ -26,7 +26,7 @@ from strands_robots.mesh.transport import Declaration, Sample, TransportError, u
 from strands_robots.safety.identity import SigningIdentity
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS
-from strands_robots.serving.peer_verbs import PEER_VERBS, TELEOP_VERBS
+from strands_robots.serving.peer_verbs import PEER_VERBS, TELEOP_VERBS, description_of
 from strands_robots.serving.picture_verbs import PICTURE_VERBS
 from strands_robots.serving.pipeline import Own, Pipeline
 from strands_robots.serving.verbs import Arguments, Verb
@@ -240,6 +240,7 @@ class Children:
                 **parents,
                 **self._arm_verbs(name),
                 "status": status_of(robot, partial(self._report, peer)),
+                "describe": lambda arguments: description_of(robot),
                 "execute": execute_on(robot, parent),
             },
             pending=self._pipeline.pending.of(name),

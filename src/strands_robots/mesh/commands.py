@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from functools import partial
+from types import MappingProxyType
 from typing import Any
 
 from strands_robots.contract import Haltable, Robot, WorldRobot
@@ -157,6 +158,7 @@ class CommandReceiver:
         robot_key: signs the answers to stops; without one they are not signed.
         lock: locks by the envelope of an emergency stop in a stop from this sender, and returns its epoch.
         epochs: returns those that lock the robot.
+        own_verbs: those that the robot declares.
     """
 
     def __init__(
@@ -170,8 +172,10 @@ class CommandReceiver:
         robot_key: SigningIdentity | None = None,
         lock: Callable[[object, Sample, str], str | None] = lambda estop, sample, sender: None,
         epochs: Callable[[], Collection[str]] = tuple,
+        own_verbs: Mapping[str, Verb] = MappingProxyType({}),
     ) -> None:
         self._context = context
+        self._verbs = {**PEER_VERBS, **own_verbs}
         self._lock, self._epochs = lock, epochs
         self._locking: dict[str, str] = {}
         self._robot_key = robot_key
@@ -208,7 +212,9 @@ class CommandReceiver:
             return
         named = request.command.get("robot_name")
         asked = self._pipeline.pending.arrive(named if isinstance(named, str) else "")
-        command = Command(verb, request.command, request.sender_id, asked, request)
+        # A verb of a robot's own refuses what it does not have; the others drop it.
+        arguments = {name: value for name, value in request.command.items() if name != "action"}
+        command = Command(verb, arguments if verb.own else request.command, request.sender_id, asked, request)
         answered = partial(self._answer, request, verb)
         if verb.name == "ping":
             # It reaches nothing below the mesh, so it waits for no worker and no worker waits for it.
@@ -237,9 +243,9 @@ class CommandReceiver:
             self._refuse(request, "", MISSING_COMMAND)
             return None
         action = request.command.get("action")
-        verb = PEER_VERBS.get(action) if isinstance(action, str) else None
+        verb = self._verbs.get(action) if isinstance(action, str) else None
         if verb is None:
-            known = ", ".join(PEER_VERBS)
+            known = ", ".join(self._verbs)
             self._refuse(
                 request,
                 action if isinstance(action, str) else "",

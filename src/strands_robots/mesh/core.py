@@ -47,6 +47,8 @@ from strands_robots.safety.gate import MotionGate
 from strands_robots.safety.persistence import simulation_key
 from strands_robots.safety.plane import SafetyPlane
 from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope, none_known, own_cell
+from strands_robots.serving.own_verbs import own_verbs
+from strands_robots.serving.peer_verbs import description_of
 from strands_robots.serving.pipeline import Own, Pipeline
 from strands_robots.serving.robot_verbs import served
 from strands_robots.utils import number, text
@@ -113,6 +115,7 @@ class Mesh(SensorLoopsMixin):
         self.peer_id = validate_peer_id(peer_id)
         self.peer_type = text("peer_type", peer_type, longest=100)
         self.robot = None if robot is None else served(robot)
+        self._own_verbs = {} if self.robot is None else own_verbs(self.robot)
         self._parts = parts or Parts()
         self._lifecycle_lock = threading.Lock()
         self._frames: dict[str, count[int]] = {}
@@ -140,7 +143,7 @@ class Mesh(SensorLoopsMixin):
         self._sensors = SensorPublisher(context, self._scheduler)
         self._requester = Requester(context)
         self._teleop = TeleopReceivers(lambda source, device: InputReceiver(self, body_of(robot), source, device))
-        self._description = Description(peer, robot)
+        self._description = Description(peer, robot, self._own_verbs)
         self._hearing = Hearing(context, self._adapter.halt)
         self._presence = PresencePublisher(context, self.peer_type, self._describe, self._safety_facts)
         self._state = StateReader(peer, robot, parts.clock)
@@ -153,6 +156,7 @@ class Mesh(SensorLoopsMixin):
             "teleop_stop": self._teleop.stop,
             "ping": lambda arguments: pong(context),
             "resume": self._resume_of(peer),
+            "describe": lambda arguments: description_of(robot, self._own_verbs),
         }
         if robot is not None:
             own["status"] = status_of(robot, lambda nonce: {**self._adapter.report("", nonce), **self._hearing.facts()})
@@ -170,6 +174,7 @@ class Mesh(SensorLoopsMixin):
             robot_key=self._adapter.identity,
             lock=self._lock_of(peer),
             epochs=self._adapter.epochs,
+            own_verbs=self._own_verbs,
         )
         self._safety = FleetSafety(
             context, self._adapter, self._requester, self._pipeline.shares.urgent, robot=robot is not None
@@ -278,7 +283,6 @@ class Mesh(SensorLoopsMixin):
         every, rates = self._scheduler.every, topics.BY_NAME
         if self.robot is not None:
             self.add_robot_sensors()
-        if self.robot is not None:
             self._report_states(self.robot.gate)
         else:
             every("describe", rates["presence"].rate_hz, self._presence.refresh)

@@ -23,7 +23,7 @@ from strands_robots.safety.statements import Purpose
 from strands_robots.safety.stopping import Outcome, grade
 from strands_robots.serving.peer_verbs import PEER_VERBS
 from strands_robots.serving.verbs import Kind
-from strands_robots.utils import RESERVED_IDS, ValidationError, number, shown
+from strands_robots.utils import RESERVED_IDS, ValidationError, finite, mapping, number, shown
 
 logger = logging.getLogger(__name__)
 
@@ -106,7 +106,7 @@ class Requester:
     def _answer(self, turn: Turn, command: dict[str, Any], seconds: float) -> dict[str, Any] | None:
         """Wait for the reply; ask for a stop again, and towards a 0.5 peer for a read."""
         deadline = time.monotonic() + seconds
-        kind = PEER_VERBS[command["action"]].kind
+        kind = kind_of_action(command)
         while True:
             left = max(0.0, deadline - time.monotonic())
             pause = REPEAT_S if kind is Kind.STOP else left
@@ -309,7 +309,7 @@ class Requester:
         if not isinstance(target, str) or not target or "\x00" in target:
             return f"target must be a non-empty string without NUL, not {shown(target)}."
         try:
-            clean = validate_command(command)
+            clean = self._own_command(target, command) or validate_command(command)
             seconds = number("timeout", timeout, above=0)
         except ValidationError as exc:
             return f"validation: {exc}"
@@ -317,12 +317,26 @@ class Requester:
             return f"target must be a peer id, not {shown(target)}."
         return target, clean, seconds
 
+    def _own_command(self, target: str, command: object) -> dict[str, Any] | None:
+        """Return the command of a verb that its robot announces as its own; None for any other.
+
+        The robot checks its arguments.
+        """
+        action = command.get("action") if isinstance(command, Mapping) else None
+        if not isinstance(command, Mapping) or not isinstance(action, str) or action in PEER_VERBS:
+            return None
+        if action not in own_verbs_of(self._context.registry.get(target)):
+            return None
+        given = mapping("command", dict(command))
+        finite("command", given)
+        return given
+
     def _publish(self, key: str, command: dict[str, Any], turn: Turn, seconds: float | None = None) -> str | None:
         context = self._context
         target = wire.BROADCAST_TARGET if key == topics.broadcast() else key.split("/")[1]
         request = wire.Request(context.peer_id, self._open(turn), command, context.clock(), target_id=target)
         body = request.to_wire()
-        if PEER_VERBS[command["action"]].kind is Kind.MOTION:
+        if kind_of_action(command) is Kind.MOTION:
             body = context.console.sign(body, console_keys.MOTION)
         try:
             body = context.identity.sign(body)
@@ -332,7 +346,7 @@ class Requester:
                 taken = transport.put_confirmed(key, body, seconds)
                 turn.confirmed = taken is True
                 return None if taken is not False else OFFLINE
-            self._put(key, target, body, stop=PEER_VERBS[command["action"]].kind is Kind.STOP)
+            self._put(key, target, body, stop=kind_of_action(command) is Kind.STOP)
         except (wire.WireError, TransportError) as exc:
             return str(exc)
         return None
@@ -360,6 +374,18 @@ class Requester:
         with self._lock:
             for turn_id in turn.ids:
                 self._turns.pop(turn_id, None)
+
+
+def own_verbs_of(row: Mapping[str, Any] | None) -> frozenset[str]:
+    """Return the own verbs that a peer announces, by its row of the registry."""
+    names = row.get("own_verbs") if row is not None else None
+    return frozenset(each for each in names if isinstance(each, str)) if isinstance(names, list) else frozenset()
+
+
+def kind_of_action(command: Mapping[str, Any]) -> Kind:
+    """Return the kind of a command; a verb of a robot's own counts as a motion."""
+    verb = PEER_VERBS.get(command["action"])
+    return Kind.MOTION if verb is None else verb.kind
 
 
 def stop_outcome(reply: Mapping[str, Any]) -> Outcome:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -153,8 +153,9 @@ class StateReader:
 class Description:
     """Reads a robot for presence, field by field; failures are logged once."""
 
-    def __init__(self, peer_id: str, robot: TaskRobot | WorldRobot | None) -> None:
+    def __init__(self, peer_id: str, robot: TaskRobot | WorldRobot | None, own_verbs: Collection[str] = ()) -> None:
         self._peer_id = peer_id
+        self._own_verbs = sorted(own_verbs)
         self._robot = robot
         self._world = robot if isinstance(robot, WorldRobot) else None
         self._arm = robot if self._world is None and isinstance(robot, TaskRobot) else None
@@ -167,6 +168,8 @@ class Description:
         if robot is None:
             return {}
         fields: dict[str, Any] = {"tool_name": robot.tool_name_str, "robot_kind": self._kind}
+        if self._own_verbs:
+            fields["own_verbs"] = self._own_verbs
         if world is not None:
             fields["world"] = True
             fields.update(self._field("sim_robots", lambda: {"sim_robots": world.list_robots()}))

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, Self
 
-from strands_robots.contract import RolloutEvent, Unsubscribe, WorldRobot, adapt
+from strands_robots.contract import RolloutEvent, Unsubscribe, WorldRobot, adapt, observe
 from strands_robots.envelope import text_of
 from strands_robots.policies.base import numbers
 from strands_robots.recording.cameras import Frames, jpeg
@@ -79,7 +79,7 @@ class RobotRecording:
         self._unsubscribe: Unsubscribe = lambda: None
 
     def __enter__(self) -> Self:
-        self._unsubscribe = self._robot.subscribe(self._record)
+        self._unsubscribe = observe(self._robot, self._record)
         for thread in self._threads:
             thread.start()
         return self

@@ -21,7 +21,9 @@ from typing import ParamSpec, Protocol, TypeVar
 
 from strands_robots.envelope import Envelope, error
 from strands_robots.errors import StrandsRobotsError
+from strands_robots.identity_map import IdentityMap
 from strands_robots.safety.awake import AWAKE, AwakeClock
+from strands_robots.safety.verbs_under_way import VerbCall, VerbsUnderWay
 from strands_robots.utils import MissingExtraError, ValidationError
 
 P = ParamSpec("P")
@@ -29,6 +31,10 @@ T = TypeVar("T")
 
 WAIT_S = 0.005
 """Seconds between two looks of a writer that waits; a halt ends its wait within these."""
+
+
+ERROR_MAX = 500
+"""Characters of what a verb raised, in its events."""
 
 
 class Latch(Protocol):
@@ -85,12 +91,14 @@ class Asked:
 
     Attributes:
         begun: something has moved by it, whatever it is answered.
+        read: the verb that asks, where it is declared a read and gets no permit; empty for motions.
     """
 
-    __slots__ = ("__weakref__", "begun", "generation", "given_up")
+    __slots__ = ("__weakref__", "begun", "generation", "given_up", "read")
 
-    def __init__(self, generation: int) -> None:
+    def __init__(self, generation: int, read: str = "") -> None:
         self.generation = generation
+        self.read = read
         self.given_up = False
         self.begun = False
 
@@ -114,6 +122,11 @@ class Permit:
     def generation(self) -> int:
         """The gate's, when the motion was asked for."""
         return self._asked.generation
+
+    @property
+    def call(self) -> Asked:
+        """The call that it was given to; what the call begins besides has the same."""
+        return self._asked
 
     @property
     def valid(self) -> bool:
@@ -216,6 +229,7 @@ class MotionGate:
         self._here = threading.local()
         self._watchers: tuple[Callable[[], None], ...] = ()
         self._given = 0
+        self.under_way = VerbsUnderWay()
 
     @property
     def generation(self) -> int:
@@ -290,6 +304,34 @@ class MotionGate:
         finally:
             self._here.asked = before
 
+    def reading(self, verb: str) -> AbstractContextManager[None]:
+        """Refuse permits on this thread, for the time of a verb that is a read."""
+        return self.asked_at(Asked(self._generation, read=verb))
+
+    @contextmanager
+    def moving(self, verb: str) -> Iterator[Permit]:
+        """Give the permit of a robot's own verb, and mark the time until it has returned.
+
+        Raises:
+            MotionRefused: locked, halted since it was asked for, or another own verb has not returned.
+        """
+        permit = self.permit(verb)
+        call = VerbCall(verb, permit.call, lambda: permit.valid, permit.call.give_up)
+        with self.under_way.entered(call) as other:
+            if other:
+                raise MotionRefused(error(f"{verb} is refused: {other} of this robot has not returned."))
+            try:
+                permit.wait()
+                permit.check()
+                permit.begin()
+                with permit.inside():
+                    yield permit
+                call.ended = "completed" if permit.valid else "stopped"
+            except BaseException as exc:
+                call.error = f"{type(exc).__name__}: {exc}"[:ERROR_MAX]
+                call.ended = "error" if permit.valid else "stopped"
+                raise
+
     def lockout(self, verb: str) -> Envelope | None:
         """Return the answer to ``verb`` while locked, else None."""
         for latch in self._latches:
@@ -358,6 +400,8 @@ class MotionGate:
         return getattr(self._here, "asked", None) or Asked(self._generation)
 
     def _refusal(self, verb: str, asked: Asked) -> Envelope | None:
+        if asked.read:
+            return error(f"{verb} is refused: {asked.read} is declared a read, and a read moves nothing.")
         locked = self.lockout(verb)
         if locked is not None:
             return locked
@@ -366,3 +410,12 @@ class MotionGate:
 
 
 _LATE = "{} is refused: the robot was halted after it was asked for; nothing was started."
+
+
+_gates: IdentityMap[MotionGate] = IdentityMap()
+
+
+def gate_of(robot: object) -> MotionGate:
+    """Return the gate of a robot: its own ``gate``, or the one that is kept for it."""
+    own = getattr(robot, "gate", None)
+    return own if isinstance(own, MotionGate) else _gates.of(robot, MotionGate)

@@ -24,6 +24,7 @@ from typing import cast
 
 from strands_robots import settings
 from strands_robots.contract import Haltable, body_of
+from strands_robots.safety.halted_verbs import HaltedVerbs
 from strands_robots.safety.ready_threads import ReadyThreads
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stop_targets import (
@@ -241,18 +242,21 @@ class StopExecutor:
             outer = getattr(self._here, "serving", ())
             self._here.serving = (*outer, slot)
             answer: object = None
+            reason, target = stops[0].reason, stops[0].target
+            deadline = max(each.moment(RETURN_SHARE) for each in stops)
+            verbs = HaltedVerbs(target)
             try:
-                reason, target = stops[0].reason, stops[0].target
                 # Nested, an overridden halt has called the one of its class.
                 if has_parts(target) or (nested and isinstance(target, HaltsInParts)):
-                    answer = target.halt_here(reason, max(each.moment(RETURN_SHARE) for each in stops))
+                    answer = target.halt_here(reason, deadline)
                 elif target is not None:
                     answer = cast(Haltable, target).halt(reason)
             except BaseException as exc:  # noqa: BLE001 - a stop that raises is a robot that may be moving
                 answer = exc
             finally:
                 self._here.serving = outer
-            del target
+            answer = verbs.after(answer, slot.name, deadline)
+            del target, verbs
             unread = [stop for stop in stops if not stop.halted(answer)]
             if unread:
                 slot.readings.waiting.extend(unread)

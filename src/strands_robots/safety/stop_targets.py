@@ -9,7 +9,7 @@ from typing import Any, Protocol, TypeGuard, cast, runtime_checkable
 from strands_robots.contract import Haltable, body_of
 from strands_robots.safety.gate import MotionGate
 from strands_robots.safety.stop_log import stop_logger
-from strands_robots.safety.stopping import PendingVerdict, StopVerdict, graded
+from strands_robots.safety.stopping import PendingVerdict, StopVerdict
 
 logger = stop_logger(__name__)
 
@@ -89,26 +89,6 @@ def has_parts(target: object) -> TypeGuard[HaltsInParts]:
 def is_direct(target: object) -> TypeGuard[DirectTarget]:
     """Return whether it answers for itself while its halt blocks."""
     return has_parts(target) and hasattr(type(target), "unanswered")
-
-
-class ForeignAnswer(PendingVerdict):
-    """A robot's own answer to its halt, which runs its code when it is graded."""
-
-    def __init__(self, answer: object, name: str) -> None:
-        super().__init__(0.0)
-        self._answer, self._name = answer, name
-
-    def known(self) -> StopVerdict:
-        return graded(self._answer, self._name)
-
-    def read(self) -> object:
-        return None
-
-    def judged(self, reading: object, *, last: bool) -> StopVerdict:
-        return self.known()
-
-    def unread(self, why: str) -> StopVerdict:
-        return StopVerdict(not_stopped={self._name: why})
 
 
 def target_key(target: Target) -> Hashable:

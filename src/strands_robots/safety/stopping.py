@@ -216,6 +216,26 @@ def graded(answer: object, name: str) -> StopVerdict:
     return StopVerdict(unknown=why) if outcome.stopped is None else StopVerdict(not_stopped=why)
 
 
+class ForeignAnswer(PendingVerdict):
+    """A robot's own answer to its halt, which runs its code when it is graded."""
+
+    def __init__(self, answer: object, name: str) -> None:
+        super().__init__(0.0)
+        self._answer, self._name = answer, name
+
+    def known(self) -> StopVerdict:
+        return graded(self._answer, self._name)
+
+    def read(self) -> object:
+        return None
+
+    def judged(self, reading: object, *, last: bool) -> StopVerdict:
+        return self.known()
+
+    def unread(self, why: str) -> StopVerdict:
+        return StopVerdict(not_stopped={self._name: why})
+
+
 def verdict_of(stop: Callable[[], object], name: str) -> StopVerdict:
     """Return what ``stop`` answers or raises as a verdict on ``name``."""
     try:

@@ -11,8 +11,8 @@ from concurrent.futures import Future, InvalidStateError
 from dataclasses import dataclass, field, replace
 
 from strands_robots.safety.stop_log import stop_logger
-from strands_robots.safety.stop_targets import ForeignAnswer, Target, is_direct
-from strands_robots.safety.stopping import PendingVerdict, StopVerdict, graded
+from strands_robots.safety.stop_targets import Target, is_direct
+from strands_robots.safety.stopping import ForeignAnswer, PendingVerdict, StopVerdict, graded
 
 logger = stop_logger(__name__)
 

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from types import MappingProxyType
 from typing import Any
 
 from strands_robots.contract import Robot, WorldRobot, body_of
 from strands_robots.drivers.reachy import ReachyDriver
-from strands_robots.envelope import error
+from strands_robots.envelope import Envelope, error, success
 from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS, for_robot
 from strands_robots.serving.base_verbs import DRIVE, NAVIGATE_TO
 from strands_robots.serving.control_verbs import CONTROL_VERBS
@@ -28,6 +29,7 @@ from strands_robots.serving.robot_verbs import (
     status,
     step_world,
 )
+from strands_robots.serving.verb_schema import described
 from strands_robots.serving.verbs import (
     ASSERTION,
     DURATION,
@@ -130,6 +132,7 @@ PEER_VERBS = table(
         ),
         _peer_verb("resume", Kind.RESUME, RESUME.summary, (_PEER_ASSERTION,), urgent=True),
         _peer_verb("ping", Kind.READ, "Answer that the peer is there."),
+        _peer_verb("describe", Kind.READ, "Describe the verbs of the robot, with parameters.", returns="functions"),
         *(
             for_robot(verb, _PEER_ROBOT, drops_unknown=True)
             for verb in (*ARM_MOTION_VERBS.values(), *CONTROL_VERBS.values())
@@ -138,11 +141,11 @@ PEER_VERBS = table(
         *_REACHY,
     ]
 )
-"""The actions of the mesh; ``execute``, ``stop``, ``resume``, ``ping`` and teleoperation are the peer's own."""
+"""The actions of the mesh; ``execute``, ``stop``, ``resume``, ``ping``, ``describe``, teleoperation are the peer's."""
 
 TELEOP_VERBS = tuple(name for name in PEER_VERBS if name.startswith("teleop_"))
 
-_OF_ALL = ("status", "stop", "features", "state", "resume", "ping", *CONTROL_VERBS)
+_OF_ALL = ("status", "stop", "features", "state", "resume", "ping", "describe", *CONTROL_VERBS)
 _OF_TASKS = ("execute", "start", *(name for name in PEER_VERBS if name.startswith("teleop_")))
 _OF_ARMS = (*_OF_TASKS, "releaseTorque", *ARM_MOTION_VERBS, *PICTURE_VERBS)
 
@@ -154,6 +157,18 @@ KINDS: Mapping[str, tuple[str, ...]] = {
     "reachy_mini": (*_OF_ALL, "releaseTorque", *(verb.name for verb in _REACHY)),
 }
 """Actions that the robots of a kind carry out, as presence names the kind; every other one they refuse."""
+
+
+def description_of(robot: Robot | None, own: Mapping[str, Verb] = MappingProxyType({})) -> Envelope:
+    """Return the answer to ``describe``: verbs in Device Connect's shape.
+
+    Args:
+        robot: None for a peer without one.
+        own: the verbs that the robot declares.
+    """
+    names = ("ping", "describe") if robot is None else KINDS[kind_of(robot)]
+    verbs = [*(PEER_VERBS[name] for name in names), *own.values()]
+    return success(f"{len(verbs)} verbs.", functions=[described(each) for each in verbs])
 
 
 def kind_of(robot: Robot) -> str:

@@ -20,7 +20,7 @@ from strands_robots.contract import Robot
 from strands_robots.envelope import Envelope, error, is_error
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety.approval import Approval, Claim, digest
-from strands_robots.safety.gate import Asked, MotionGate, MotionRefused
+from strands_robots.safety.gate import REFUSALS, Asked, MotionGate, MotionRefused, refusal_envelope
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.serving.admissions import Admission
 from strands_robots.serving.control import ControlLeases, NotHolderError, leases_of
@@ -241,8 +241,10 @@ class Pipeline:
                 begun = not is_error(result)
         except Refused as refused:
             refusal, result, begun = refused, refused.envelope, False
-        except (ValidationError, MotionRefused, NotHolderError) as exc:
-            result, begun = error(str(exc)) if isinstance(exc, ValidationError) else exc.envelope, False
+        except NotHolderError as exc:
+            result, begun = exc.envelope, False
+        except REFUSALS as exc:
+            result, begun = refusal_envelope(verb.name, exc), False
         except BaseException:
             # A binding's panic is no Exception; the caller is answered all the same, and the thread goes on.
             logger.exception("%s: %s failed.", self.peer_id(), verb.name)
@@ -348,6 +350,10 @@ class Pipeline:
                 text = f"{text} {verb.instead} works while it is locked, with the operator's approval."
                 locked = {**locked, **error(text)}
             raise Refused(RefusalReason.LOCKOUT, text, reason="locked by an emergency stop", envelope=locked)
+        busy_with = self.robot.gate.under_way.name
+        if busy_with:
+            text = f"{verb.name} is refused: {busy_with} of this robot has not returned."
+            raise Refused(RefusalReason.BUSY, text, reason="busy")
         # Halted since the command arrived: refused before a grant is spent on it.
         late = self.robot.gate.refusal(verb.name)
         if late is not None:

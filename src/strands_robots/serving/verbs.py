@@ -50,6 +50,7 @@ class Parameter:
     Attributes:
         meaning: a line for callers, with the unit and the domain.
         type: the Python type that its schema is made from.
+        schema: JSON Schema of a robot's own verb; the others have that of their type.
     """
 
     name: str
@@ -57,6 +58,7 @@ class Parameter:
     meaning: str
     check: Check
     default: Any = REQUIRED
+    schema: Mapping[str, Any] | None = None
 
 
 LEASE_ID = "lease_id"
@@ -125,6 +127,8 @@ class Verb:
         instead: the verb that a locked robot offers in the place of this one.
         of_world: a motion of all robots of a world; any other is of one, the first where none is named.
         on_lease: a verb of the control lease; its ``run`` gets ``caller``, ``robot`` and ``leases`` besides.
+        own: a verb that its robot declares (:func:`~strands_robots.verb_declaration.verb`).
+        lasts_s: seconds that it may take to return, besides those that each verb of its kind has.
     """
 
     name: str
@@ -142,6 +146,8 @@ class Verb:
     instead: str = ""
     on_lease: bool = False
     of_world: bool = False
+    own: bool = False
+    lasts_s: float = 0.0
     by_name: Mapping[str, Parameter] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:

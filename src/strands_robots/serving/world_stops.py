@@ -19,6 +19,7 @@ from strands_robots.safety.stopping import (
     read_verdict,
     verdict_of,
 )
+from strands_robots.safety.verbs_under_way import VerbsUnderWay
 from strands_robots.utils import ValidationError
 
 
@@ -99,6 +100,11 @@ class RobotStop:
 
     world: WorldRobot
     name: str
+
+    @property
+    def under_way(self) -> VerbsUnderWay:
+        """The world's own verbs, of which each may move this robot."""
+        return self.world.gate.under_way
 
     def stop(self) -> Envelope:
         """Stop the robot's rollout."""

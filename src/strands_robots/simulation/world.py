@@ -30,6 +30,7 @@ from strands_robots.policies.rollout import (
     unfollowed,
 )
 from strands_robots.safety.gate import MotionGate, Permit, Waiting, answered
+from strands_robots.safety.halted_verbs import halted_with_verbs
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stop_targets import note_motion
 from strands_robots.safety.stopping import PendingVerdict, StopLevel, StopVerdict, halts_in_parts, read_verdict
@@ -472,7 +473,8 @@ class Simulation(PicturesMixin, ArmMixin, TeleopMixin):
     @halts_in_parts
     def halt(self, reason: str = "") -> StopVerdict:
         """Stop everything that moves a robot, freeze all; then as the stop level says."""
-        return read_verdict(self.halt_here(reason, time.monotonic() + settings.number("STRANDS_HALT_DEADLINE_S")))
+        deadline = time.monotonic() + settings.number("STRANDS_HALT_DEADLINE_S")
+        return halted_with_verbs(self, lambda: self.halt_here(reason, deadline), deadline)
 
     def halt_here(self, reason: str, deadline: float) -> StopVerdict | PendingVerdict:
         """Void every permit, freeze, and leave the ends of the loops to be read."""

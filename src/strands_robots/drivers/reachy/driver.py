@@ -32,6 +32,8 @@ from strands_robots.drivers.reachy.target import (
 )
 from strands_robots.envelope import Envelope, error, success, text_of
 from strands_robots.safety.gate import MotionGate
+from strands_robots.safety.halted_verbs import halted_with_verbs
+from strands_robots.safety.stop_executor import RETURN_SHARE
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.utils import ValidationError, choice, flag, identifier, shown, text
 
@@ -427,6 +429,10 @@ class ReachyDriver:
 
         While it is locked by an emergency stop, the motors go off as well where ``release_on_estop`` says so.
         """
+        deadline = time.monotonic() + RETURN_SHARE * settings.number("STRANDS_HALT_DEADLINE_S")
+        return halted_with_verbs(self, lambda: self._halt(reason), deadline)
+
+    def _halt(self, reason: str) -> StopVerdict:
         began = time.monotonic()
         verdict = self.motions.halt(reason)
         locked = self.gate.lockout("motion") or {}

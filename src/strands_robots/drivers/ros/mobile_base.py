@@ -20,8 +20,9 @@ from strands_robots.ros.gate import CommandGate
 from strands_robots.ros.link import RosError, RosLink
 from strands_robots.ros.names import bare_kind, graph_name, interface
 from strands_robots.safety.gate import MotionGate, MotionRefused, Permit
+from strands_robots.safety.halted_verbs import halted_with_verbs
 from strands_robots.safety.stop_log import stop_logger
-from strands_robots.safety.stopping import PendingVerdict, StopVerdict, halts_in_parts, read_verdict
+from strands_robots.safety.stopping import PendingVerdict, StopVerdict, halts_in_parts
 from strands_robots.utils import MissingExtraError, ValidationError, identifier, number, whole
 
 logger = stop_logger(__name__)
@@ -225,7 +226,7 @@ class MobileBaseRobot:
         """
         began = time.monotonic()
         deadline = began + ANSWER_SHARE * settings.number("STRANDS_HALT_DEADLINE_S")
-        verdict = read_verdict(self.halt_here(reason, deadline))
+        verdict = halted_with_verbs(self, lambda: self.halt_here(reason, deadline), deadline)
         return replace(verdict, elapsed_ms=(time.monotonic() - began) * 1000)
 
     def halt_here(self, reason: str, deadline: float) -> PendingVerdict:

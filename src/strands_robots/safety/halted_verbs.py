@@ -1,0 +1,121 @@
+"""Halts of robots whose own verbs run: their verdict waits for the verbs."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+from strands_robots.safety.stop_log import stop_logger
+from strands_robots.safety.stopping import ForeignAnswer, PendingVerdict, StopVerdict, read_verdict
+from strands_robots.safety.verbs_under_way import VerbCall, VerbsUnderWay
+
+logger = stop_logger(__name__)
+
+
+class VerbsAfterHalt(PendingVerdict):
+    """Verdict of a halt, with the own verbs that ran when it came.
+
+    Args:
+        answer: of the halt, which has returned.
+        calls: ran before the halt; their permits are void.
+        until: monotonic s at which a verb that has not returned did not stop.
+    """
+
+    def __init__(self, answer: StopVerdict | PendingVerdict, calls: tuple[VerbCall, ...], until: float) -> None:
+        rest = answer if isinstance(answer, PendingVerdict) else None
+        super().__init__(until, *(() if rest is None else (rest.pause_s,)))
+        self._rest, self._calls = rest, calls
+        self._verdict = answer if isinstance(answer, StopVerdict) else None
+
+    def known(self) -> StopVerdict | None:
+        if self._rest is not None and self._verdict is None:
+            self._verdict = self._rest.known()
+        return None if self._verdict is None or self._running() else self._with_verbs(self._verdict)
+
+    def read(self) -> object:
+        return self._rest.read() if self._rest is not None and self._verdict is None else None
+
+    def judged(self, reading: object, *, last: bool) -> StopVerdict | None:
+        if self._rest is not None and self._verdict is None:
+            last_of_rest = last or time.monotonic() >= self._rest.until
+            self._verdict = self._rest.judged(reading, last=last_of_rest)
+        if self._verdict is None or (self._running() and not last):
+            return None
+        return self._with_verbs(self._verdict)
+
+    def unread(self, why: str) -> StopVerdict:
+        if self._verdict is not None:
+            return self._with_verbs(self._verdict)
+        return self._with_verbs(StopVerdict() if self._rest is None else self._rest.unread(why))
+
+    def _running(self) -> bool:
+        return any(not each.ended for each in self._calls)
+
+    def _with_verbs(self, verdict: StopVerdict) -> StopVerdict:
+        names = {each.name: True for each in self._calls}
+        names |= {each.name: False for each in self._calls if not each.ended}
+        returned = [name for name, ended in names.items() if ended and name not in verdict.halted]
+        why = "it has not returned, and may go on to move the robot"
+        unreturned = {name: why for name, ended in names.items() if not ended}
+        return replace(verdict, halted=(*verdict.halted, *returned), not_stopped={**verdict.not_stopped, **unreturned})
+
+
+def under_way_of(target: object) -> VerbsUnderWay | None:
+    """Return the own verbs of what is stopped; None where it has no gate of ours."""
+    try:
+        # Without its ``__getattr__``, which may look names up anywhere.
+        own = object.__getattribute__(target, "under_way")
+    except AttributeError:
+        try:
+            own = getattr(object.__getattribute__(target, "gate"), "under_way", None)
+        except AttributeError:
+            return None
+    return own if isinstance(own, VerbsUnderWay) else None
+
+
+class HaltedVerbs:
+    """The own verbs of a target that is about to be halted.
+
+    Their permits are void from now on. Never raises: the halt follows.
+    """
+
+    def __init__(self, target: object) -> None:
+        self._under_way: VerbsUnderWay | None = None
+        try:
+            self._under_way = under_way_of(target)
+        except Exception:
+            # A property of the robot's own may raise anything.
+            logger.exception("The verbs that run on a robot could not be read before its stop.")
+        self._calls = self._under_way.calls if self._under_way else ()
+        for each in self._calls:
+            each.void()
+
+    def after(self, answer: object, name: str, until: float) -> object:
+        """Return the answer to the halt, not settled while a verb has not returned.
+
+        Args:
+            answer: of the halt, or what it raised.
+            name: what the verdict calls a target whose halt names nothing.
+            until: monotonic s at which a verb that has not returned did not stop.
+        """
+        # One that began while the halt came saw a valid permit, which is void now.
+        late = [each for each in self._under_way.calls if not each.valid()] if self._under_way else []
+        calls = (*self._calls, *(each for each in late if each not in self._calls))
+        if not calls:
+            return answer
+        given = answer if isinstance(answer, StopVerdict | PendingVerdict) else ForeignAnswer(answer, name)
+        return VerbsAfterHalt(given, calls, until)
+
+
+def halted_with_verbs(robot: object, halt: Callable[[], StopVerdict | PendingVerdict], deadline: float) -> StopVerdict:
+    """Halt a robot on this thread; the verdict waits for its own verbs.
+
+    Args:
+        robot: whose verbs may run.
+        halt: returns its answer.
+        deadline: monotonic s at which a verb that has not returned did not stop.
+    """
+    verbs, answer = HaltedVerbs(robot), halt()
+    given = verbs.after(answer, "", deadline)
+    return read_verdict(given if isinstance(given, PendingVerdict) else answer)

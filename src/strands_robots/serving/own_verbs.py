@@ -1,0 +1,117 @@
+"""Verbs that a robot declares itself, on their way through the pipeline."""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from strands_robots.contract import body_of, stops_motions
+from strands_robots.envelope import Envelope, jsonable, success
+from strands_robots.serving.robot_verbs import ARM_VERBS, WORLD_VERBS
+from strands_robots.serving.verb_schema import described
+from strands_robots.serving.verbs import REQUIRED, Arguments, Kind, Parameter, Verb
+from strands_robots.utils import ValidationError
+from strands_robots.verb_declaration import DeclaredVerb, declared_verbs
+
+VERBS_MAX = 100
+"""Own verbs of one robot."""
+
+DESCRIPTION_MAX_BYTES = 64 * 1024
+"""Size of the description of a robot's own verbs, in JSON."""
+
+STOPS = frozenset({"stop", "halt", "estop", "emergencyStop", "stopMotion", "stopTask", "stopPolicy", "stopTeleoperate"})
+"""Names that a caller would take for a stop, which no verb of a robot's own may be."""
+
+MEMBERS = frozenset(
+    {
+        *("call", "verbs", "status", "state", "features", "events", "picture", "control", "id", "type", "model"),
+        *("network", "describe", "hasStop", "hasLockout", "hasLease", "leftOut", "close", "tags", "where", "invoke"),
+        *("functions", "identity", "labels", "capabilities", "connect", "disconnect", "requestRegistration"),
+    }
+)
+"""Names of what every robot has on the calling side or as a device."""
+
+
+@functools.cache
+def _ours() -> frozenset[str]:
+    """Return the names of the verbs that robots of ours have, in lower case."""
+    from strands_robots.serving.peer_verbs import PEER_VERBS  # noqa: PLC0415 - loads every driver
+    from strands_robots.serving.reachy_verbs import REACHY_VERBS  # noqa: PLC0415 - as above
+
+    return frozenset(each.lower() for each in {*ARM_VERBS, *WORLD_VERBS, *PEER_VERBS, *REACHY_VERBS, *MEMBERS})
+
+
+def own_verbs(robot: object) -> dict[str, Verb]:
+    """Return the verbs that a robot declares, by name.
+
+    Raises:
+        ValidationError: naming the verb that cannot be served, and why.
+    """
+    body = body_of(robot)
+    declared = declared_verbs(body)
+    if len(declared) > VERBS_MAX:
+        raise ValidationError(f"{type(body).__name__} declares {len(declared)} verbs; a robot may have {VERBS_MAX}.")
+    verbs = {name: _served(body, each) for name, each in declared.items()}
+    size = len(json.dumps([described(each) for each in verbs.values()]))
+    if size > DESCRIPTION_MAX_BYTES:
+        raise ValidationError(
+            f"The descriptions of the verbs of {type(body).__name__} have {size} bytes of JSON; they may have "
+            f"{DESCRIPTION_MAX_BYTES}. Shorten their docstrings."
+        )
+    return verbs
+
+
+def _served(body: object, declared: DeclaredVerb) -> Verb:
+    declared.check()
+    name, method = declared.name, declared.method
+    lower = name.lower()
+    if lower in {each.lower() for each in STOPS}:
+        raise ValidationError(f"{method} cannot be the verb {name}: a robot's own verb is never a stop. Rename it.")
+    if lower in _ours():
+        raise ValidationError(
+            f"{method} cannot be the verb {name}, which other robots have in another sense. Rename it."
+        )
+    if declared.motion and not declared.permit and not stops_motions(body):
+        raise ValidationError(
+            f"{method} is a motion that no stop would end: give {type(body).__name__} a halt() or stop_task(), or let "
+            "the method take a Permit and return when it is void. A method that moves nothing is declared by "
+            "@verb(motion=False)."
+        )
+
+    def run(robot: Any, arguments: Arguments) -> Envelope:
+        return answer_of(name, declared.carry_out(body_of(robot), arguments))
+
+    return Verb(
+        name,
+        Kind.MOTION if declared.motion else Kind.READ,
+        declared.summary,
+        tuple(
+            Parameter(
+                each.name, each.type, each.meaning, each.check, REQUIRED if each.required else each.default, each.schema
+            )
+            for each in declared.parameters
+        ),
+        returns=declared.returns,
+        run=run,
+        lasts=declared.lasts > 0,
+        own=True,
+        lasts_s=declared.lasts,
+    )
+
+
+def answer_of(verb: str, result: object) -> Envelope:
+    """Return what a robot's own verb returned as an envelope that JSON can carry.
+
+    An envelope stays one. The items of another mapping are its fields, any other value is the field ``result``.
+    """
+    plain = jsonable(result)
+    if isinstance(plain, Mapping):
+        if plain.get("status") in ("success", "error"):
+            return {"content": [{"text": str(plain.get("reason", f"{verb} answered."))}], **plain}
+        return success(f"{verb} has returned.", **{key: each for key, each in plain.items() if key not in _OF_ENVELOPE})
+    return success(f"{verb} has returned.", **({} if plain is None else {"result": plain}))
+
+
+_OF_ENVELOPE = frozenset({"content", "status"})

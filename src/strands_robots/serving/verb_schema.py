@@ -1,0 +1,60 @@
+"""Descriptions of verbs as they are sent: name, text, JSON Schema, labels."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from strands_robots.serving.verbs import REQUIRED, Kind, Parameter, Verb
+
+JSON_TYPES: dict[type, str] = {
+    float: "number",
+    int: "integer",
+    bool: "boolean",
+    str: "string",
+    dict: "object",
+    list: "array",
+}
+"""Types of JSON Schema by the types of parameters."""
+
+Labels = dict[str, str | list[str]]
+
+
+def labels_of(verb: Verb) -> Labels:
+    """Return the labels of a verb: direction, and what an own one is."""
+    kind: Labels = {"direction": "read"} if verb.kind is Kind.READ else {"direction": "write"}
+    if verb.kind is not Kind.READ and verb.critical:
+        kind["safety"] = "critical"
+    if verb.own:
+        kind["own"] = "true"
+    if verb.lasts_s:
+        kind["lasts_s"] = f"{verb.lasts_s:g}"
+    return kind
+
+
+def text_of(verb: Verb) -> str:
+    """Return the text that describes a verb and its parameters."""
+    lines = [verb.summary]
+    if verb.parameters:
+        lines += ["", "Args:", *(f"    {each.name}: {each.meaning}" for each in verb.parameters)]
+    return "\n".join(lines)
+
+
+def described(verb: Verb) -> dict[str, Any]:
+    """Return the description of a verb, in Device Connect's shape for a function."""
+    return {
+        "name": verb.name,
+        "description": text_of(verb),
+        "parameters": {
+            "type": "object",
+            "properties": {each.name: _schema(each) for each in verb.parameters},
+            "required": [each.name for each in verb.parameters if each.default is REQUIRED],
+        },
+        "labels": labels_of(verb),
+    }
+
+
+def _schema(parameter: Parameter) -> dict[str, Any]:
+    if parameter.schema is not None:
+        return dict(parameter.schema)
+    kind = {"type": JSON_TYPES.get(parameter.type, "string"), "description": parameter.meaning}
+    return kind if parameter.default is REQUIRED else {**kind, "default": parameter.default}

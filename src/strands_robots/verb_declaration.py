@@ -1,0 +1,305 @@
+"""Verbs of a robot's own: the decorator ``@verb``, and what it declares.
+
+    class Barista:
+        @verb(motion=True, lasts=90.0)
+        def brew_coffee(
+            self,
+            cups: Annotated[int, Domain(1, 8)],
+            permit: Permit,
+            strength: Literal["mild", "strong"] = "mild",
+        ) -> dict[str, int]:
+            \"\"\"Brew coffee.
+
+            Args:
+                cups: how many
+                strength: of the coffee
+            \"\"\"
+            for cup in range(cups):
+                if not permit.valid:
+                    break
+                ...
+
+Hints and docstring are the description that callers read, on every network; arguments are checked by it before the
+method is called. On the wire the verb is ``brewCoffee``. A ``permit`` is given to the method and never asked of its
+caller: it is void after a stop, and the method then has to return.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import re
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, TypeVar, get_type_hints, overload
+
+from strands_robots.safety.gate import Permit, gate_of
+from strands_robots.utils import ValidationError, flag, number, shown, text
+from strands_robots.verb_parameters import Domain, VerbParameter, is_permit, parameter_of, plain
+
+__all__ = ["DeclaredVerb", "Domain", "Permit", "declared_verbs", "verb"]
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+LASTS_MAX_S = 3600.0
+"""Longest time, in seconds, that a verb may take to return."""
+
+NAME_MAX = 64
+SUMMARY_MAX = 600
+
+MARK = "__strands_verb__"
+"""Attribute by which a method is known as a verb."""
+
+_NAME = re.compile(r"[a-z][A-Za-z0-9]*\Z")
+_SECTION = re.compile(r"(Args|Arguments|Returns|Raises|Yields|Example|Examples|Note|Notes):\s*\Z")
+_ENTRY = re.compile(r"(\w+)(?: ?\([^)]*\))?:\s*(.*)\Z")
+
+
+@dataclass(frozen=True)
+class DeclaredVerb:
+    """A method that its robot declares as a verb.
+
+    Attributes:
+        function: as it was written.
+        name: on the wire.
+        motion: False for a read.
+        lasts: seconds that it may take to return.
+    """
+
+    function: Callable[..., Any]
+    name: str
+    motion: bool
+    lasts: float
+
+    @cached_property
+    def parameters(self) -> tuple[VerbParameter, ...]:
+        """Parameters that callers give, by the hints.
+
+        Raises:
+            ValidationError: a hint is missing, or is no type that a message can carry.
+        """
+        return tuple(
+            parameter_of(
+                f"{self.method}({each.name})", each, self._hint(each.name), self._sections[1].get(each.name, "")
+            )
+            for each in self._given
+            if each.name != self.permit
+        )
+
+    @cached_property
+    def permit(self) -> str:
+        """The parameter that the permit is given by; empty without one.
+
+        Raises:
+            ValidationError: there are several.
+        """
+        names = [each.name for each in self._given if is_permit(self._hint(each.name))]
+        if len(names) > 1:
+            raise ValidationError(f"{self.method} takes one Permit, not {', '.join(names)}.")
+        return names[0] if names else ""
+
+    @property
+    def method(self) -> str:
+        """The method's name, for messages."""
+        return self.function.__qualname__.rpartition("<locals>.")[2]
+
+    @property
+    def summary(self) -> str:
+        """The first paragraph of the docstring, else the name."""
+        return self._sections[0] or f"{self.name}."
+
+    @property
+    def returns(self) -> str:
+        """Text of the docstring on the result."""
+        return self._sections[2]
+
+    def check(self) -> None:
+        """Raise :class:`ValidationError` where the verb cannot be served."""
+        if self.permit and not self.motion:
+            raise ValidationError(f"{self.method} is declared a read (motion=False), and a read gets no Permit.")
+        _ = self.parameters
+
+    def carry_out(self, robot: object, arguments: Mapping[str, Any]) -> Any:
+        """Call the method with checked arguments, and a permit where it takes one.
+
+        Raises:
+            MotionRefused: the robot is locked, was halted since the call was asked for, or one of its own verbs has
+                not returned.
+        """
+        gate = gate_of(robot)
+        if not self.motion:
+            with gate.reading(self.name):
+                return self.function(robot, **arguments)
+        with gate.moving(self.name) as permit:
+            given = {self.permit: permit} if self.permit else {}
+            return self.function(robot, **arguments, **given)
+
+    def called(self, robot: object, *values: object, **named: object) -> Any:
+        """Do what a call of the method does: check its arguments, then carry it out.
+
+        Raises:
+            ValidationError: an argument outside its domain.
+            MotionRefused: as :meth:`carry_out`.
+        """
+        # A verb that calls another one may pass its permit on; each is given its own of the same call.
+        named.pop(self.permit, None)
+        values = tuple(each for each in values if not isinstance(each, Permit))
+        taken = [each for each in self.parameters if each.name not in named]
+        if len(values) > len(taken):
+            raise ValidationError(f"{self.method} takes at most {len(taken)} arguments in order, not {len(values)}.")
+        given = {**{each.name: value for each, value in zip(taken, values, strict=False)}, **named}
+        return self.carry_out(robot, self._checked(given))
+
+    def _checked(self, given: Mapping[str, object]) -> dict[str, Any]:
+        known = {each.name: each for each in self.parameters}
+        for name in given.keys() - known.keys():
+            raise ValidationError(
+                f"{self.method} has no argument {shown(name)}; it takes {', '.join(known) or 'none'}."
+            )
+        missing = [name for name, each in known.items() if each.required and name not in given]
+        if missing:
+            raise ValidationError(f"{self.method} needs {', '.join(missing)}.")
+        return {name: known[name].check(name, value) for name, value in given.items()}
+
+    @cached_property
+    def _given(self) -> tuple[inspect.Parameter, ...]:
+        own = list(inspect.signature(self.function).parameters.values())[1:]
+        for each in own:
+            if each.kind in (each.VAR_POSITIONAL, each.VAR_KEYWORD, each.POSITIONAL_ONLY):
+                raise ValidationError(f"{self.method}: {each} has no name that a caller could give it by.")
+            if each.name.startswith("_"):
+                raise ValidationError(f"{self.method}: {each.name} begins with an underscore; give it another name.")
+        return tuple(own)
+
+    def _hint(self, name: str) -> Any:
+        return self._hints.get(name)
+
+    @cached_property
+    def _hints(self) -> Mapping[str, Any]:
+        try:
+            return get_type_hints(self.function, include_extras=True)
+        except Exception as exc:
+            raise ValidationError(f"The type hints of {self.method} cannot be read: {exc}.") from exc
+
+    @cached_property
+    def _sections(self) -> tuple[str, dict[str, str], str]:
+        return _read_docstring(inspect.getdoc(self.function) or "")
+
+
+@overload
+def verb(function: F) -> F: ...
+
+
+@overload
+def verb(*, motion: bool = True, name: str = "", lasts: float = 0.0) -> Callable[[F], F]: ...
+
+
+def verb(function: F | None = None, *, motion: bool = True, name: str = "", lasts: float = 0.0) -> F | Callable[[F], F]:
+    """Declare a method as a verb of its robot, for every network and face.
+
+    Args:
+        function: the method, where the decorator is used without arguments.
+        motion: True for what may move the robot: it passes lease, lockout and approval, and gets a :class:`Permit` by
+            the parameter of that type. False for a read, which can obtain none.
+        name: on the wire, in camelCase; made from the method's name by default.
+        lasts: seconds that it may take to return, 0 to 3600, besides the 10 s that every motion has. After that its
+            permit is void.
+
+    Raises:
+        ValidationError: an argument outside its domain, or ``function`` is no plain method.
+    """
+    flag("motion", motion)
+    seconds = number("lasts", lasts, low=0.0, high=LASTS_MAX_S)
+
+    def declare(method: F) -> F:
+        if not inspect.isfunction(method):
+            raise ValidationError(f"@verb declares a method, not {shown(method)}; put it below other decorators.")
+        if (
+            inspect.iscoroutinefunction(method)
+            or inspect.isgeneratorfunction(method)
+            or inspect.isasyncgenfunction(method)
+        ):
+            raise ValidationError(f"{method.__qualname__} must be a plain method: it is called on a thread of its own.")
+        declared = DeclaredVerb(method, _wire_name(name, method.__name__), motion, seconds)
+
+        @functools.wraps(method)
+        def call(self: object, *values: object, **named: object) -> Any:
+            return declared.called(self, *values, **named)
+
+        vars(call)[MARK] = declared
+        return call  # type: ignore[return-value]  # the same signature, its permit left out by callers
+
+    return declare if function is None else declare(function)
+
+
+def declared_verbs(robot: object) -> dict[str, DeclaredVerb]:
+    """Return the verbs that the class of a robot declares, by name on the wire.
+
+    Raises:
+        ValidationError: two verbs have one name, or a method overrides a verb without being declared.
+    """
+    found: dict[str, DeclaredVerb] = {}
+    for attribute, method in _methods(type(robot)):
+        declared = getattr(method, MARK, None)
+        if not isinstance(declared, DeclaredVerb):
+            raise ValidationError(f"{type(robot).__name__}.{attribute} overrides a verb; declare it with @verb, too.")
+        other = next((each for name, each in found.items() if name.lower() == declared.name.lower()), None)
+        if other is not None:
+            names = f"{other.function.__name__} and {declared.function.__name__}"
+            raise ValidationError(f"{type(robot).__name__} has two verbs {declared.name}: {names}; rename one.")
+        found[declared.name] = declared
+    return found
+
+
+def _methods(kind: type) -> Iterator[tuple[str, object]]:
+    """Give the attributes of a class that it or a base declares as verbs."""
+    seen: set[str] = set()
+    for each in kind.__mro__:
+        for attribute, value in vars(each).items():
+            if attribute not in seen and hasattr(value, MARK):
+                seen.add(attribute)
+                # Read off the classes: an attribute of the robot's own may be looked up anywhere.
+                yield attribute, next(vars(base)[attribute] for base in kind.__mro__ if attribute in vars(base))
+
+
+def _wire_name(stated: object, method: str) -> str:
+    head, *rest = method.split("_")
+    made = head + "".join(part[:1].upper() + part[1:] for part in rest)
+    name = text("name", stated, longest=NAME_MAX) if stated != "" else made
+    if not _NAME.match(name) or len(name) > NAME_MAX:
+        source = f"name of {method}" if stated != "" else f"name made of {method}"
+        raise ValidationError(
+            f"the {source} must be camelCase of at most {NAME_MAX} letters and digits, not {shown(name)}."
+        )
+    return name
+
+
+def _read_docstring(words: str) -> tuple[str, dict[str, str], str]:
+    """Return the summary, the meanings of ``Args`` and the text of ``Returns``."""
+    paragraphs: list[str] = []
+    meanings: dict[str, str] = {}
+    returns: list[str] = []
+    section, entry, indent = "", "", 0
+    for line in words.splitlines():
+        heading = _SECTION.match(line)
+        if heading is not None:
+            section, entry = heading[1], ""
+        elif not section:
+            paragraphs.append(line)
+        elif section.startswith("Arg") and line.strip():
+            depth = len(line) - len(line.lstrip())
+            match = _ENTRY.match(line.strip())
+            if match is not None and (not entry or depth <= indent):
+                entry, indent = match[1], depth
+                meanings[entry] = match[2]
+            elif entry:
+                meanings[entry] += f" {line.strip()}"
+        elif section == "Returns":
+            returns.append(line)
+    summary = "\n".join(paragraphs).strip().split("\n\n")[0]
+    return (
+        plain(summary, SUMMARY_MAX),
+        {name: plain(meaning, SUMMARY_MAX) for name, meaning in meanings.items()},
+        plain(" ".join(returns), SUMMARY_MAX),
+    )
