@@ -14,7 +14,8 @@ T = TypeVar("T")
 class IdentityMap(Generic[T]):
     """Values by the identity of objects; thread-safe.
 
-    The objects may be equal, or have no hash. A value goes with its object. One that cannot be referred to weakly is kept for good.
+    The objects may be equal, or have no hash. A value goes with its object. An object that cannot be referred to
+    weakly is kept for good.
     """
 
     def __init__(self) -> None:

@@ -318,9 +318,9 @@ class Requester:
         return target, clean, seconds
 
     def _own_command(self, target: str, command: object) -> dict[str, Any] | None:
-        """Return the command of a verb that its robot announces as its own; None for any other.
+        """Return the command of a robot's own verb; None for any other.
 
-        The robot checks its arguments.
+        The robot announces its own verbs, and checks its arguments.
         """
         action = command.get("action") if isinstance(command, Mapping) else None
         if not isinstance(command, Mapping) or not isinstance(action, str) or action in PEER_VERBS:

@@ -304,9 +304,15 @@ class MotionGate:
         finally:
             self._here.asked = before
 
-    def reading(self, verb: str) -> AbstractContextManager[None]:
+    @contextmanager
+    def reading(self, verb: str) -> Iterator[None]:
         """Refuse permits on this thread, for the time of a verb that is a read."""
-        return self.asked_at(Asked(self._generation, read=verb))
+        before: Asked | None = getattr(self._here, "asked", None)
+        self._here.asked = Asked(self._generation, read=verb)
+        try:
+            yield
+        finally:
+            self._here.asked = before
 
     @contextmanager
     def moving(self, verb: str) -> Iterator[Permit]:

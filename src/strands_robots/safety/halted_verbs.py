@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 
-from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import ForeignAnswer, PendingVerdict, StopVerdict, read_verdict
 from strands_robots.safety.verbs_under_way import VerbCall, VerbsUnderWay
-
-logger = stop_logger(__name__)
 
 
 class VerbsAfterHalt(PendingVerdict):
@@ -62,34 +59,42 @@ class VerbsAfterHalt(PendingVerdict):
 
 
 def under_way_of(target: object) -> VerbsUnderWay | None:
-    """Return the own verbs of what is stopped; None where it has no gate of ours."""
+    """Return the own verbs of what is stopped; None where it has no gate of ours.
+
+    No code of the robot's own is run: it may hang, and a stop follows.
+    """
+    # Of its class: a stop of a part of a robot.
+    part_of = getattr(type(target), "verbs_under_way", None)
+    if part_of is not None:
+        target = part_of(target)
     try:
-        # Without its ``__getattr__``, which may look names up anywhere.
-        own = object.__getattribute__(target, "under_way")
+        gate = object.__getattribute__(target, "__dict__").get("gate")
     except AttributeError:
-        try:
-            own = getattr(object.__getattribute__(target, "gate"), "under_way", None)
-        except AttributeError:
-            return None
+        return None
+    own = getattr(gate, "under_way", None)
     return own if isinstance(own, VerbsUnderWay) else None
+
+
+def void_calls(target: object) -> tuple[VerbCall, ...]:
+    """Void the permits of the own verbs that run on ``target``; return their calls."""
+    under_way = under_way_of(target)
+    calls = under_way.calls if under_way else ()
+    for each in calls:
+        each.void()
+    return calls
 
 
 class HaltedVerbs:
     """The own verbs of a target that is about to be halted.
 
-    Their permits are void from now on. Never raises: the halt follows.
+    Args:
+        target: of the halt; permits of its verbs are void from now on.
+        before: calls that ran when the halt was asked for.
     """
 
-    def __init__(self, target: object) -> None:
-        self._under_way: VerbsUnderWay | None = None
-        try:
-            self._under_way = under_way_of(target)
-        except Exception:
-            # A property of the robot's own may raise anything.
-            logger.exception("The verbs that run on a robot could not be read before its stop.")
-        self._calls = self._under_way.calls if self._under_way else ()
-        for each in self._calls:
-            each.void()
+    def __init__(self, target: object, before: Iterable[VerbCall] = ()) -> None:
+        self._under_way = under_way_of(target)
+        self._calls = dict.fromkeys((*before, *void_calls(target)))
 
     def after(self, answer: object, name: str, until: float) -> object:
         """Return the answer to the halt, not settled while a verb has not returned.
@@ -99,13 +104,13 @@ class HaltedVerbs:
             name: what the verdict calls a target whose halt names nothing.
             until: monotonic s at which a verb that has not returned did not stop.
         """
-        # One that began while the halt came saw a valid permit, which is void now.
-        late = [each for each in self._under_way.calls if not each.valid()] if self._under_way else []
-        calls = (*self._calls, *(each for each in late if each not in self._calls))
-        if not calls:
+        if self._under_way:
+            # One that began while the halt came saw a valid permit, which is void now.
+            self._calls.update(dict.fromkeys(each for each in self._under_way.calls if not each.valid()))
+        if not self._calls:
             return answer
         given = answer if isinstance(answer, StopVerdict | PendingVerdict) else ForeignAnswer(answer, name)
-        return VerbsAfterHalt(given, calls, until)
+        return VerbsAfterHalt(given, tuple(self._calls), until)
 
 
 def halted_with_verbs(robot: object, halt: Callable[[], StopVerdict | PendingVerdict], deadline: float) -> StopVerdict:

@@ -24,7 +24,7 @@ from typing import cast
 
 from strands_robots import settings
 from strands_robots.contract import Haltable, body_of
-from strands_robots.safety.halted_verbs import HaltedVerbs
+from strands_robots.safety.halted_verbs import HaltedVerbs, void_calls
 from strands_robots.safety.ready_threads import ReadyThreads
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stop_targets import (
@@ -171,6 +171,7 @@ class StopExecutor:
         if answered is not None:
             stop.future.add_done_callback(lambda future: answered(future.result()))
         note_motion(target)
+        stop.verbs = void_calls(target)
         if stop.direct or slot.halts.running is not None:
             # The halt of any other target voids permits itself, after it has seen what moves, unless it has to wait.
             revoke_permits(target)
@@ -244,7 +245,7 @@ class StopExecutor:
             answer: object = None
             reason, target = stops[0].reason, stops[0].target
             deadline = max(each.moment(RETURN_SHARE) for each in stops)
-            verbs = HaltedVerbs(target)
+            verbs = HaltedVerbs(target, [call for each in stops for call in each.verbs])
             try:
                 # Nested, an overridden halt has called the one of its class.
                 if has_parts(target) or (nested and isinstance(target, HaltsInParts)):

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stop_targets import Target, is_direct
 from strands_robots.safety.stopping import ForeignAnswer, PendingVerdict, StopVerdict, graded
+from strands_robots.safety.verbs_under_way import VerbCall
 
 logger = stop_logger(__name__)
 
@@ -29,6 +30,7 @@ class SubmittedStop:
     Attributes:
         within: seconds to halt, which count from ``since``.
         answered: called with a verdict that comes too late for the future.
+        verbs: own verbs of the target that ran when it was submitted.
         pending: what is still to be read for the verdict; None until the halt has returned.
         begun: the moment at which its halt, or later its reading, began.
     """
@@ -41,6 +43,7 @@ class SubmittedStop:
     since: float
     answered: Answered | None
     direct: bool = False
+    verbs: tuple[VerbCall, ...] = ()
     extended: bool = False
     pending: PendingVerdict | None = None
     begun: float | None = None

@@ -19,7 +19,6 @@ from strands_robots.safety.stopping import (
     read_verdict,
     verdict_of,
 )
-from strands_robots.safety.verbs_under_way import VerbsUnderWay
 from strands_robots.utils import ValidationError
 
 
@@ -101,10 +100,9 @@ class RobotStop:
     world: WorldRobot
     name: str
 
-    @property
-    def under_way(self) -> VerbsUnderWay:
-        """The world's own verbs, of which each may move this robot."""
-        return self.world.gate.under_way
+    def verbs_under_way(self) -> WorldRobot:
+        """Return the world, of whose own verbs each may move this robot."""
+        return self.world
 
     def stop(self) -> Envelope:
         """Stop the robot's rollout."""

@@ -1,0 +1,124 @@
+"""Verbs that a robot declares: which are served, what they answer, and what the pipeline does with them."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from fixtures.barista import Barista, Careless
+
+from strands_robots import Permit, verb
+from strands_robots.contract import adapt
+from strands_robots.serving.own_verbs import answer_of, own_verbs
+from strands_robots.serving.pipeline import Command, Pipeline, Result
+from strands_robots.serving.verbs import Kind
+from strands_robots.utils import ValidationError
+
+
+def with_verb(method: Callable[..., Any], **options: Any) -> Any:
+    return adapt(type("Robot", (), {"method": verb(**options)(method)})())
+
+
+def served(robot: Any, name: str, **arguments: Any) -> Result:
+    """Serve one call on this thread and return its answer."""
+    seen = adapt(robot)
+    pipeline = Pipeline.of(seen, lambda: "robot-1", hardware=False, authorize=lambda command, given: ("tester",))
+    answers: list[Result] = []
+    asked = pipeline.pending.arrive()
+    pipeline.serve(Command(own_verbs(seen)[name], arguments, "tester", asked), answers.append)
+    return answers[0]
+
+
+@pytest.mark.parametrize(
+    "name", ["stop", "halt", "estop", "emergencyStop", "stopMotion", "execute", "getStatus", "pick", "resume", "state"]
+)
+def test_name_of_a_stop_or_of_another_verb_is_refused_by_name(name: str) -> None:
+    def method(self: object, permit: Permit) -> None: ...
+
+    method.__annotations__["permit"] = Permit
+    with pytest.raises(ValidationError, match=f"cannot be the verb {name}"):
+        own_verbs(with_verb(method, name=name))
+
+
+def test_motion_that_no_stop_would_end_is_refused_at_registration() -> None:
+    def brew(self: object) -> None: ...
+
+    with pytest.raises(ValidationError, match="a motion that no stop would end"):
+        own_verbs(with_verb(brew))
+    assert own_verbs(with_verb(brew, motion=False))["brew"].kind is Kind.READ
+
+    class Halts:
+        def halt(self, reason: str = "") -> dict[str, Any]:
+            return {"status": "success"}
+
+        @verb
+        def brew(self) -> None: ...
+
+    assert own_verbs(adapt(Halts()))["brew"].kind is Kind.MOTION
+
+
+def test_description_beyond_64_kb_is_refused() -> None:
+    def brew(self: object, permit: Permit) -> None: ...
+
+    brew.__annotations__["permit"] = Permit
+    long = {f"brew{n}": verb(name=f"brew{n}")(brew) for n in range(101)}
+    with pytest.raises(ValidationError, match="declares 101 verbs"):
+        own_verbs(adapt(type("Robot", (), long)()))
+
+
+def test_own_verb_is_served_with_its_arguments_checked() -> None:
+    answer = served(Barista(), "brewCoffee", cups=2).result
+    assert (answer["status"], answer["cups"], answer["strength"]) == ("success", 2, "mild")
+    refused = served(Barista(), "brewCoffee", cups=9)
+    assert refused.refusal is not None
+    assert "cups must be an integer from 1 to 8, not 9" in refused.result["reason"]
+    assert "it has no mugs" in served(Barista(), "brewCoffee", cups=1, mugs=2).result["reason"]
+
+
+def test_numpy_is_numbers_and_lists_and_nan_is_none() -> None:
+    answer = served(Careless(), "weigh").result
+    assert (answer["grams"], answer["samples"], answer["count"], answer["noise"]) == (12.5, [[1.0, 2.0]], 3, None)
+
+
+def test_verb_that_raises_failed_inside_the_device() -> None:
+    answer = served(Careless(), "spill")
+    assert answer.refusal is not None
+    assert "failed inside the device" in answer.result["reason"]
+
+
+def test_read_that_moves_is_refused() -> None:
+    assert "peek is declared a read" in served(Careless(), "peek").result["reason"]
+
+
+def test_every_other_motion_waits_for_the_verb_to_return() -> None:
+    robot = Barista()
+    working = threading.Thread(target=robot.brew_coffee, args=(8,))
+    working.start()
+    try:
+        assert robot.brewing.wait(20.0)
+        assert "brewCoffee of this robot has not returned" in served(robot, "brewCoffee", cups=1).result["reason"]
+        assert served(robot, "beansLeft").result["result"] == 250.0
+    finally:
+        adapt(robot).halt()
+        working.join(20.0)
+
+
+@pytest.mark.parametrize(
+    ("given", "fields"),
+    [
+        (None, {"status": "success"}),
+        (3, {"status": "success", "result": 3}),
+        ([1], {"status": "success", "result": [1]}),
+        (np.float64(2.5), {"status": "success", "result": 2.5}),
+        ({"a": 1, "status": "odd"}, {"status": "success", "a": 1}),
+        ({"status": "error", "reason": "no beans"}, {"status": "error", "reason": "no beans"}),
+        ({"status": "success", "cups": 1}, {"status": "success", "cups": 1}),
+    ],
+)
+def test_answer_is_an_envelope_whatever_the_verb_returns(given: object, fields: dict[str, Any]) -> None:
+    answer = answer_of("brew", given)
+    assert answer["content"][0]["text"]
+    assert {name: answer[name] for name in fields} == fields
