@@ -112,6 +112,7 @@ def run(
     *,
     peer_id: str | None = None,
     until: threading.Event | None = None,
+    mesh: bool | None = None,
     **network: Any,
 ) -> StopVerdict:
     """Serve ``robot`` until SIGINT, SIGTERM or ``until``, then halt it and leave.
@@ -123,6 +124,8 @@ def run(
         robot: any robot that ``init_device_connect`` accepts.
         peer_id: its id, without dots; made from its name by default.
         until: ends the serving as a signal does.
+        mesh: True joins the native mesh besides, under the same id; None asks ``STRANDS_MESH``. A robot that
+            :func:`Robot` has joined stays as it is.
         network: other arguments of ``init_device_connect``, such as ``messaging_url``, ``cell`` and
             ``allow_insecure``.
 
@@ -140,10 +143,13 @@ def run(
     verdict: StopVerdict = StopVerdict()
     # A user who waits for Ctrl-C reads the terminal, whatever the program does about logging.
     report: Callable[[str], None] = _print_to_terminal if until is None else logger.info
+    joins = getattr(robot, "mesh", None) is None and (mesh or (mesh is None and mesh_env_request() is True))
     with device_connect.StopSignal() if until is None else nullcontext(until) as stop:
         runtime = device_connect.init_device_connect_sync(robot, peer_id=peer_id, **network)
+        peer = None
         report(f"Serving {runtime.device_id}; Ctrl-C stops the robot first.")
         try:
+            peer = _join_mesh(robot, runtime.device_id, "robot") if joins else None
             stop.wait()
         finally:
             free = put_away(body)
@@ -156,6 +162,8 @@ def run(
             if verdict.settling:
                 # On the network, so that a stop still reaches it.
                 report(body.wait_settled())
+            if peer is not None:
+                peer.close()
             device_connect.stop_device_connect(runtime)
             free()
     return verdict
@@ -247,7 +255,7 @@ def _label(name: object) -> str:
 def _join_mesh(robot: Any, peer_id: str | None, peer_type: str) -> Any:
     from strands_robots.mesh import init_mesh  # noqa: PLC0415 - the mesh is loaded when it is used
 
-    mesh = init_mesh(robot, peer_id=peer_id, peer_type=peer_type, cell=robot.cell)
+    mesh = init_mesh(robot, peer_id=peer_id, peer_type=peer_type, cell=getattr(robot, "cell", None))
     if mesh is not None and hasattr(robot, "input_sink"):
         from strands_robots.mesh.input import MeshInputSink  # noqa: PLC0415 - as above
 

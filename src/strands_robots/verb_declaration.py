@@ -120,8 +120,11 @@ class DeclaredVerb:
             raise ValidationError(f"{self.method} is declared a read (motion=False), and a read gets no Permit.")
         _ = self.parameters
 
-    def carry_out(self, robot: object, arguments: Mapping[str, Any]) -> Any:
+    def carry_out(self, robot: object, arguments: Mapping[str, Any]) -> tuple[Any, str]:
         """Call the method with checked arguments, and a permit where it takes one.
+
+        Returns:
+            Its result, and how a motion ended: ``completed``, or ``stopped`` where its permit is void.
 
         Raises:
             MotionRefused: the robot is locked, was halted since the call was asked for, or one of its own verbs has
@@ -130,10 +133,11 @@ class DeclaredVerb:
         gate = gate_of(robot)
         if not self.motion:
             with gate.reading(self.name):
-                return self.function(robot, **arguments)
+                return self.function(robot, **arguments), ""
         with gate.moving(self.name) as permit:
             given = {self.permit: permit} if self.permit else {}
-            return self.function(robot, **arguments, **given)
+            result = self.function(robot, **arguments, **given)
+            return result, "completed" if permit.valid else "stopped"
 
     def called(self, robot: object, *values: object, **named: object) -> Any:
         """Do what a call of the method does: check its arguments, then carry it out.
@@ -149,7 +153,7 @@ class DeclaredVerb:
         if len(values) > len(taken):
             raise ValidationError(f"{self.method} takes at most {len(taken)} arguments in order, not {len(values)}.")
         given = {**{each.name: value for each, value in zip(taken, values, strict=False)}, **named}
-        return self.carry_out(robot, self._checked(given))
+        return self.carry_out(robot, self._checked(given))[0]
 
     def _checked(self, given: Mapping[str, object]) -> dict[str, Any]:
         known = {each.name: each for each in self.parameters}

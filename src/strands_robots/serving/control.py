@@ -24,11 +24,11 @@ from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Protocol, cast
-from weakref import WeakKeyDictionary
 
 from strands_robots.contract import AT_REST, RUNNING, Robot, WorldRobot, body_of
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.errors import StrandsRobotsError
+from strands_robots.identity_map import IdentityMap
 from strands_robots.safety.authorization import ANONYMOUS, caller_name
 from strands_robots.safety.resume import configured_keys
 from strands_robots.safety.stop_executor import stop_executor
@@ -613,17 +613,14 @@ class ControlLeases:
         return halting
 
 
-_LEASES: WeakKeyDictionary[Any, ControlLeases] = WeakKeyDictionary()
+_LEASES: IdentityMap[ControlLeases] = IdentityMap()
 
 
 def leases_of(robot: Robot, *, hardware: bool) -> ControlLeases:
     """Return the leases of a robot, the same on every network that serves it."""
-    body = body_of(robot)
-    try:
-        leases = _LEASES.setdefault(body, ControlLeases())
-        leases.serve(robot, hardware=hardware)
-    except TypeError:  # no weak reference to it, or no hash
-        leases = _Strong(robot, hardware=hardware)
+    referable = hasattr(robot, "__weakref__")
+    leases = _LEASES.of(body_of(robot), lambda: ControlLeases() if referable else _Strong(robot))
+    leases.serve(robot, hardware=hardware)
     return leases
 
 
@@ -651,12 +648,16 @@ class _OneOf(ControlLeases):
 
 
 class _Strong(ControlLeases):
-    """Leases of a robot without weak references; they live with its pipeline."""
+    """Leases of a robot without weak references, which is kept with them."""
 
-    def __init__(self, robot: Robot, *, hardware: bool) -> None:
+    def __init__(self, robot: Robot) -> None:
         super().__init__()
-        self._hardware = hardware
         self._kept = robot
+
+    def serve(self, robot: Robot, *, hardware: bool) -> None:
+        """Add the robot as one of its networks serves it."""
+        with self._changing:
+            self._hardware = self._hardware or hardware
 
     def _robot(self) -> Robot | None:
         return self._kept

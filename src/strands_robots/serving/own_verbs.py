@@ -81,7 +81,7 @@ def _served(body: object, declared: DeclaredVerb) -> Verb:
         )
 
     def run(robot: Any, arguments: Arguments) -> Envelope:
-        return answer_of(name, declared.carry_out(body_of(robot), arguments))
+        return answer_of(name, *declared.carry_out(body_of(robot), arguments))
 
     return Verb(
         name,
@@ -101,17 +101,24 @@ def _served(body: object, declared: DeclaredVerb) -> Verb:
     )
 
 
-def answer_of(verb: str, result: object) -> Envelope:
+def answer_of(verb: str, result: object, ended: str = "") -> Envelope:
     """Return what a robot's own verb returned as an envelope that JSON can carry.
 
     An envelope stays one. The items of another mapping are its fields, any other value is the field ``result``.
+
+    Args:
+        verb: its name.
+        result: as the method returned it.
+        ended: ``task_status`` of a motion; empty for a read.
     """
     plain = jsonable(result)
-    if isinstance(plain, Mapping):
-        if plain.get("status") in ("success", "error"):
-            return {"content": [{"text": str(plain.get("reason", f"{verb} answered."))}], **plain}
-        return success(f"{verb} has returned.", **{key: each for key, each in plain.items() if key not in _OF_ENVELOPE})
-    return success(f"{verb} has returned.", **({} if plain is None else {"result": plain}))
+    status = {"task_status": ended} if ended else {}
+    said = f"{verb} {ended or 'answered'}."
+    if not isinstance(plain, Mapping):
+        return success(said, **status, **({} if plain is None else {"result": plain}))
+    if plain.get("status") in ("success", "error"):
+        return {"content": [{"text": str(plain.get("reason", said))}], **status, **plain}
+    return success(said, **{**status, **{key: each for key, each in plain.items() if key not in _OF_ENVELOPE}})
 
 
 _OF_ENVELOPE = frozenset({"content", "status"})

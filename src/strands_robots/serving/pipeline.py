@@ -209,9 +209,11 @@ class Pipeline:
         """Return the share of threads for a verb; only motions wait for motions."""
         if verb.urgent:
             return self.shares.urgent
-        if verb.lasts:
+        if verb.lasts and not (verb.own and verb.kind is Kind.READ):
             return self.shares.lasting
-        return self.shares.motion if verb.kind is Kind.MOTION else self.shares.read
+        if verb.kind is Kind.MOTION:
+            return self.shares.motion
+        return self.shares.own_read if verb.own else self.shares.read
 
     def serve(self, command: Command, answered: Answered) -> None:
         """Carry ``command`` out on this thread and hand its answer to ``answered``."""

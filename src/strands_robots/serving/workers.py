@@ -18,10 +18,10 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from functools import partial
 from typing import Any, Generic, TypeVar
-from weakref import WeakKeyDictionary
 
 from strands_robots.contract import body_of
 from strands_robots.errors import StrandsRobotsError
+from strands_robots.identity_map import IdentityMap
 from strands_robots.safety.stop_log import stop_logger
 
 logger = stop_logger(__name__)
@@ -189,26 +189,23 @@ class Shares:
     """Shares of one robot; none waits for another.
 
     ``motion`` starts motions, ``lasting`` waits for their end, ``read`` answers, ``urgent`` resumes and takes energy
-    away.
+    away. ``own_read`` has the reads that the robot declares: one that hangs costs no status.
     """
 
     def __init__(self, pool: WorkerPool = POOL) -> None:
         self.motion = Share(pool=pool)
         self.lasting = Share(pool=pool)
         self.read = Share(pool=pool)
+        self.own_read = Share(pool=pool)
         self.urgent = Share(pool=pool)
 
 
-_SHARES: WeakKeyDictionary[Any, Shares] = WeakKeyDictionary()
+_SHARES: IdentityMap[Shares] = IdentityMap()
 
 
 def shares_of(robot: object) -> Shares:
     """The shares of a robot, the same on every network that serves it."""
-    body = body_of(robot)
-    try:
-        return _SHARES.setdefault(body, Shares())
-    except TypeError:  # no weak reference to it, or no hash
-        return Shares()
+    return _SHARES.of(body_of(robot), Shares)
 
 
 def loop_future() -> tuple[asyncio.Future[Any], Callable[[Any], None]]:

@@ -93,6 +93,32 @@ def test_a_robot_that_knows_tasks_alone_is_started_for_the_allowed_and_stops(env
         assert 0 < done["step_count"] < 30_000
 
 
+def test_a_robots_own_verb_is_called_by_the_allowed_and_stopped_in_its_middle(environment: dict[str, str]) -> None:
+    allowed = {"DEVICE_CONNECT_RPC_ALLOW": "strands-robots", "STRANDS_ROBOT_COMMAND_ALLOW": "brewCoffee"}
+    with example("barista.py", environment | allowed):
+        eventually(lambda: live(environment, "barista"), within=WITHIN_S, what="the robot is live")
+        brew = ("call", "barista", "brewCoffee", "cups=1")
+        assert command(environment, *brew, "--as", "stranger").returncode == 1
+        made = command(environment, *brew)
+        assert made.returncode == 0, made.stderr
+        assert "brewCoffee completed." in made.stdout
+        refused = command(environment, "call", "barista", "brewCoffee", "cups=9")
+        assert refused.returncode == 1
+        assert "cups must be an integer from 1 to 8, not 9." in refused.stderr
+        assert "result: 242.0" in command(environment, "call", "barista", "beansLeft").stdout
+        brewing = subprocess.Popen([*COMMAND, "call", "barista", "brewCoffee", "cups=8"], env=environment)
+        try:
+            status = ("call", "barista", "getStatus", "--json")
+            eventually(lambda: json.loads(command(environment, *status).stdout).get("verb"), within=WITHIN_S)
+            stopped = command(environment, "stop", "barista")
+            assert stopped.returncode == 0, stopped.stderr
+            assert "Stopped brewCoffee." in stopped.stdout
+            brewing.wait(WITHIN_S)
+        finally:
+            brewing.kill()
+            brewing.wait()
+
+
 @pytest.mark.parametrize(("name", "peer"), [("own_driver.py", "pan-tilt"), ("own_robot.py", "turntable")])
 def test_a_robot_of_ones_own_moves_for_nobody_unless_told(environment: dict[str, str], name: str, peer: str) -> None:
     with example(name, environment):
