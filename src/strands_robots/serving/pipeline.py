@@ -57,7 +57,22 @@ class Refused(StrandsRobotsError):  # noqa: N818 - a refusal, not a fault
         super().__init__(text)
         self.why = why
         self.reason = reason or text
-        self.envelope = error(text) if envelope is None else envelope
+        self.envelope = _refused(error(text) if envelope is None else envelope, why)
+
+
+def _refused(envelope: Envelope, why: RefusalReason) -> Envelope:
+    """Return the envelope with the part that refused, for callers that are programs."""
+    return {**envelope, "refused": why.value}
+
+
+def _own_refusal(refused: ValidationError | MotionRefused | NotHolderError) -> Envelope:
+    """Return the answer to a verb that refused by itself."""
+    if isinstance(refused, ValidationError):
+        return _refused(error(str(refused)), RefusalReason.ARGUMENTS)
+    if isinstance(refused, NotHolderError):
+        return _refused(refused.envelope, RefusalReason.CONTROL)
+    locked = refused.envelope.get("locked") is True
+    return _refused(refused.envelope, RefusalReason.LOCKOUT) if locked else refused.envelope
 
 
 @dataclass(frozen=True)
@@ -242,7 +257,7 @@ class Pipeline:
         except Refused as refused:
             refusal, result, begun = refused, refused.envelope, False
         except (ValidationError, MotionRefused, NotHolderError) as exc:
-            result, begun = error(str(exc)) if isinstance(exc, ValidationError) else exc.envelope, False
+            result, begun = _own_refusal(exc), False
         except BaseException:
             # A binding's panic is no Exception; the caller is answered all the same, and the thread goes on.
             logger.exception("%s: %s failed.", self.peer_id(), verb.name)
