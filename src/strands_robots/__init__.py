@@ -13,16 +13,18 @@ TYPE_CHECKING = False  # importing typing would be most of this import's time
 if TYPE_CHECKING:
     from typing import Any
 
+    from strands_robots.fleet import connect
     from strands_robots.hardware import HardwareRobot
     from strands_robots.robot import Robot, run
     from strands_robots.simulation import Simulation
 
-__all__ = ["HardwareRobot", "Robot", "Simulation", "__version__", "run"]
+__all__ = ["HardwareRobot", "Robot", "Simulation", "__version__", "connect", "run"]
 
 _HOMES = {
     "HardwareRobot": "strands_robots.hardware",
     "Robot": "strands_robots.robot",
     "Simulation": "strands_robots.simulation",
+    "connect": "strands_robots.fleet.fleet",
     "run": "strands_robots.robot",
 }
 _SIM_PACKAGES = ("mujoco", "numpy", "PIL")
