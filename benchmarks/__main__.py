@@ -22,6 +22,7 @@ from benchmarks.table import Row, markdown
 
 PARTS = {
     "rpc": "Calls and events over Zenoh and NATS",
+    "remote": "Calls through a RemoteRobot",
     "cli": "Commands from prompt to prompt",
     "device": "Bring-up, import and fleets in one process",
     "fleet": "Hundreds of devices",

@@ -46,6 +46,7 @@ FLOORS: list[set[str]] = [
     },
     {"serving"},
     {"device_connect", "mesh", "mesh_session"},
+    {"fleet"},
     {"cli", "tools", "mcp", "dashboard", "evaluation", "robot"},
 ]
 

@@ -13,6 +13,7 @@ TYPE_CHECKING = False  # importing typing would be most of this import's time
 if TYPE_CHECKING:
     from typing import Any
 
+    from strands_robots.fleet import connect
     from strands_robots.hardware import HardwareRobot
     from strands_robots.robot import Robot, run
     from strands_robots.safety.gate import Permit
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from strands_robots.verb_declaration import verb
     from strands_robots.verb_parameters import Domain
 
-__all__ = ["Domain", "HardwareRobot", "Permit", "Robot", "Simulation", "__version__", "run", "verb"]
+__all__ = ["Domain", "HardwareRobot", "Permit", "Robot", "Simulation", "__version__", "connect", "run", "verb"]
 
 _HOMES = {
     "Domain": "strands_robots.verb_parameters",
@@ -28,6 +29,7 @@ _HOMES = {
     "Permit": "strands_robots.safety.gate",
     "Robot": "strands_robots.robot",
     "Simulation": "strands_robots.simulation",
+    "connect": "strands_robots.fleet.fleet",
     "run": "strands_robots.robot",
     "verb": "strands_robots.verb_declaration",
 }

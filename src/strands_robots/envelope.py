@@ -36,7 +36,8 @@ def is_error(answer: object) -> bool:
 
 def text_of(answer: Envelope) -> str:
     """Return the sentence of an envelope, or an empty string when it has none."""
-    for block in answer.get("content", []):
+    content = answer.get("content")
+    for block in content if isinstance(content, list) else ():
         if isinstance(block, dict) and isinstance(block.get("text"), str):
             return str(block["text"])
     return str(answer.get("reason", ""))

@@ -54,7 +54,7 @@ def test_insecure_flag_or_certificates_allow_a_remote_network(tmp_path: Path, mo
 
 
 def test_missing_extra_is_named_in_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("strands_robots.cli.network.find_spec", lambda _: None)
+    monkeypatch.setattr("strands_robots.fleet.link_flags.find_spec", lambda _: None)
     with pytest.raises(MissingExtraError, match=r"the \[device-connect\] extra"):
         Network().link()
 

@@ -71,6 +71,7 @@ def test_the_first_stage_that_refuses_is_the_one_that_is_named(
     assert result.refusal is not None
     assert result.refusal.why is why
     assert result.result["status"] == "error"
+    assert result.result["refused"] == why.value
     assert robot.rollouts == {}
 
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, fields, replace
-from importlib.util import find_spec
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,7 +14,8 @@ import typer
 from strands_robots import settings
 from strands_robots.cli.output import CliError, Exit, plain
 from strands_robots.envelope import Envelope
-from strands_robots.utils import missing_extra, port, redacted
+from strands_robots.fleet.link_flags import LinkFlags, as_flag
+from strands_robots.utils import ValidationError, port, redacted
 
 if TYPE_CHECKING:
     from strands_robots.device_connect import FleetClient
@@ -27,11 +27,6 @@ NO_METHOD = -32601
 
 SOURCE = "strands-robots"
 """Caller's name that goes with the calls of the command line."""
-
-_NEEDS = (
-    "A network beyond this machine needs authentication: certificates (--tls-ca, --tls-cert, --tls-key), "
-    "credentials (--credentials FILE) or --insecure, which lets every program on that network drive the robot."
-)
 
 
 def _option(flag: str, text: str, **more: Any) -> Any:
@@ -63,7 +58,7 @@ class Network:
     @property
     def opted_in(self) -> bool:
         """True when the user accepts a transport without authentication."""
-        return self.insecure or settings.boolean("DEVICE_CONNECT_ALLOW_INSECURE")
+        return self._stated.opted_in
 
     def link(self) -> LinkConfig:
         """Return the link that the flags describe.
@@ -72,12 +67,14 @@ class Network:
             CliError: the flags contradict one another, or leave this machine without authentication.
             MissingExtraError: Device Connect is not installed.
         """
-        if self.nats and (self.connect or self.listen or self.multicast):
-            raise CliError("--nats names a broker; --connect, --listen and --multicast are for Zenoh.", Exit.USAGE)
-        link = self._secured(self._reached())
-        if not link.authenticated and not link.loopback_only and not self.opted_in:
-            raise CliError(_NEEDS, Exit.USAGE)
-        return link
+        try:
+            return self._stated.link(as_flag)
+        except ValidationError as exc:
+            raise CliError(str(exc), Exit.USAGE) from exc
+
+    @property
+    def _stated(self) -> LinkFlags:
+        return LinkFlags(**{each.name: getattr(self, each.name) for each in fields(self)})
 
     @contextmanager
     def fleet(self, source: str = SOURCE) -> Iterator[FleetClient]:
@@ -100,7 +97,7 @@ class Network:
     @property
     def stated_tenant(self) -> str:
         """The tenant of Device Connect, of the flag or the environment."""
-        return self.tenant or settings.raw("TENANT")
+        return self._stated.stated_tenant
 
     @property
     def flags(self) -> str:
@@ -125,36 +122,6 @@ class Network:
             raise CliError("--mesh takes no network flag but --port; docs/mesh.md has its settings.", Exit.USAGE)
         if self.port is not None:
             settings.put("STRANDS_MESH_PORT", str(port("--port", self.port)))
-
-    def _reached(self) -> LinkConfig:
-        backends = _backends()
-        tenant = self.stated_tenant
-        if self.credentials:
-            settings.put("MESSAGING_CREDENTIALS_FILE", str(self.credentials))
-        if self.nats or self.connect or self.listen or self.multicast:
-            transport = "nats" if self.nats else "zenoh"
-            link: LinkConfig = backends.LinkConfig(transport=transport, tenant=tenant)
-            if self.credentials:
-                link = backends.link_from_environment(tenant, transport)
-            return replace(
-                link,
-                mode="peer" if self.listen or self.multicast else "auto",
-                connect=_urls(self.nats) if self.nats else _endpoints(self.connect),
-                listen=_endpoints(self.listen),
-                multicast=True if self.multicast else None,
-                verify_hostname=True,
-            )
-        from strands_robots.device_connect.links import usual_link  # noqa: PLC0415 - loaded when a network is used
-
-        return usual_link(tenant, self.port)
-
-    def _secured(self, link: LinkConfig) -> LinkConfig:
-        return replace(
-            link,
-            ca=_pem("--tls-ca", self.tls_ca, link.ca),
-            cert=_pem("--tls-cert", self.tls_cert, link.cert),
-            key=_pem("--tls-key", self.tls_key, link.key),
-        )
 
 
 def describe(link: LinkConfig) -> str:
@@ -235,30 +202,3 @@ def mesh_peer(robot: Any, peer_id: str | None, peer_type: str) -> Iterator[Mesh]
         except ValueError as exc:
             raise CliError(str(exc), Exit.USAGE) from exc
         yield mesh
-
-
-def _backends() -> Any:
-    # The framework is looked up and not imported: a command that refuses its flags need not load it.
-    if find_spec("device_connect_edge") is None:
-        raise missing_extra("Device Connect", "device-connect")
-    from strands_robots.device_connect import backends  # noqa: PLC0415 - loaded when a network is used
-
-    return backends
-
-
-def _pem(flag: str, path: Path | None, otherwise: str) -> str:
-    if path is not None and not path.is_file():
-        raise CliError(f"{flag} {path} is no file.", Exit.USAGE)
-    return str(path) if path is not None else otherwise
-
-
-def _urls(values: list[str] | None) -> tuple[str, ...]:
-    from strands_robots.device_connect.backends.config import split_urls  # noqa: PLC0415 - as above
-
-    return split_urls(values or [])
-
-
-def _endpoints(values: list[str] | None) -> tuple[str, ...]:
-    from strands_robots.device_connect.backends.config import endpoints  # noqa: PLC0415 - as above
-
-    return endpoints(_urls(values))

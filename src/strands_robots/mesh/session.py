@@ -28,6 +28,7 @@ __all__ = [
     "acquire",
     "clear_peers",
     "current_session",
+    "dial",
     "get_peer",
     "get_peers",
     "get_session",
@@ -72,6 +73,26 @@ class _Shared:
                     logger.error("The mesh has no session: %s", exc)  # noqa: TRY400 - one sentence, no trace
                     return None
                 self.transport = transport
+            # A robot of this process may become the hub, though the first user of the session only dialled.
+            self.transport.dials_only = False
+            self.references += 1
+            return self.transport
+
+    def dial(self) -> Transport:
+        """Take a reference as a caller without a robot, which never becomes the hub.
+
+        Raises:
+            TransportError: the mesh is switched off, or there is no hub and no stated endpoint to reach.
+            MissingExtraError: the transport's extra is not installed.
+        """
+        if mesh_env_request() is False:
+            raise TransportError("STRANDS_MESH switches the mesh off.")
+        with self.lock:
+            if self.transport is None:
+                transport = make_transport()
+                transport.dials_only = True
+                transport.connect()
+                self.transport = transport
             self.references += 1
             return self.transport
 
@@ -103,6 +124,7 @@ atexit.register(_shared.close)
 
 
 acquire = _shared.acquire
+dial = _shared.dial
 release_session = _shared.release
 
 

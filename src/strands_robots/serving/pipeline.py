@@ -57,7 +57,20 @@ class Refused(StrandsRobotsError):  # noqa: N818 - a refusal, not a fault
         super().__init__(text)
         self.why = why
         self.reason = reason or text
-        self.envelope = error(text) if envelope is None else envelope
+        self.envelope = _refused(error(text) if envelope is None else envelope, why)
+
+
+def _refused(envelope: Envelope, why: RefusalReason) -> Envelope:
+    """Return the envelope with the part that refused, for callers that are programs."""
+    return {**envelope, "refused": why.value}
+
+
+def _own_refusal(verb: str, refused: Exception) -> Envelope:
+    """Return the answer to a verb that refused by itself."""
+    envelope = refusal_envelope(verb, refused)
+    if isinstance(refused, ValidationError):
+        return _refused(envelope, RefusalReason.ARGUMENTS)
+    return _refused(envelope, RefusalReason.LOCKOUT) if envelope.get("locked") is True else envelope
 
 
 @dataclass(frozen=True)
@@ -244,9 +257,9 @@ class Pipeline:
         except Refused as refused:
             refusal, result, begun = refused, refused.envelope, False
         except NotHolderError as exc:
-            result, begun = exc.envelope, False
+            result, begun = _refused(exc.envelope, RefusalReason.CONTROL), False
         except REFUSALS as exc:
-            result, begun = refusal_envelope(verb.name, exc), False
+            result, begun = _own_refusal(verb.name, exc), False
         except BaseException:
             # A binding's panic is no Exception; the caller is answered all the same, and the thread goes on.
             logger.exception("%s: %s failed.", self.peer_id(), verb.name)

@@ -100,10 +100,12 @@ class Transport(ABC):
     Attributes:
         confirms: :meth:`put_confirmed` reports whether a topic has subscribers.
         pins_topics: the broker's policy lets a peer publish on topics of its own name alone.
+        dials_only: it connects to a hub of others and never becomes one.
     """
 
     confirms = False
     pins_topics = False
+    dials_only = False
 
     @property
     @abstractmethod

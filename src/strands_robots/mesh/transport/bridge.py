@@ -146,6 +146,15 @@ class BridgeTransport(Transport):
         """The certificates of the local leg."""
         return getattr(self._local, "posture", None)
 
+    @property
+    def dials_only(self) -> bool:
+        """True where the local leg never becomes the hub."""
+        return self._local.dials_only
+
+    @dials_only.setter
+    def dials_only(self, value: bool) -> None:
+        self._local.dials_only = value
+
     def connect(self) -> None:
         problems = self._join()
         if not self._joined:

@@ -22,6 +22,9 @@ from strands_robots.zenoh_sockets import close_in_background
 logger = logging.getLogger(__name__)
 
 OPEN_S = 5.0
+DIAL_MS = 300
+"""Milliseconds in which a hub on loopback has to answer a caller that never becomes one."""
+
 RESCUE_EVERY_S = 0.1
 STEADY_LOOKS = 10
 PUBLISHERS_MAX = 4096
@@ -244,6 +247,8 @@ class ZenohTransport(Transport):
             raise TransportError(f"Zenoh session: {exc}") from None
 
     def _open_on_loopback(self, posture: Posture) -> Any:
+        if self.dials_only:
+            return self._dial(posture)
         deadline = time.monotonic() + OPEN_S
         while True:
             with contextlib.suppress(TransportError):  # another process is the hub
@@ -260,6 +265,12 @@ class ZenohTransport(Transport):
                     f"{posture.hub} is taken and no mesh of ours answers there ({exc}); set STRANDS_MESH_PORT."
                 ) from None
             return session
+
+    def _dial(self, posture: Posture) -> Any:
+        try:
+            return self._open(zenoh_config.child(posture, self._id, DIAL_MS))
+        except TransportError:
+            raise TransportError(f"no mesh answers on {posture.hub}.") from None
 
     def _watch_links(self, session: Any, *, of_hub: bool) -> None:
         def changed(event: Any) -> None:
@@ -289,7 +300,7 @@ class ZenohTransport(Transport):
             # The lost link may still be listed for a moment, so only a link that lasts ends this.
             while posture is not None and not self._closing.is_set() and steady < STEADY_LOOKS:
                 steady = steady + 1 if self.linked() else 0
-                if steady == 0 and self._relay is None:
+                if steady == 0 and self._relay is None and not self.dials_only:
                     with contextlib.suppress(TransportError):  # another survivor was quicker
                         self._relay = self._open(zenoh_config.hub(posture))
                         logger.warning("The mesh's hub is gone; this process relays on %s now.", posture.hub)

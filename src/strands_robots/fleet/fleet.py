@@ -1,0 +1,225 @@
+"""Robots in reach, on every network of this process."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Self
+
+from strands_robots._mesh_switch import mesh_env_request
+from strands_robots.errors import NoSuchRobotError, RefusalError, UnreachableError
+from strands_robots.fleet.adapter import DEVICE_CONNECT, FIND_S, MESH, STOP_S, FoundRobot, NetworkAdapter
+from strands_robots.fleet.link_flags import LinkFlags
+from strands_robots.fleet.refusals import near
+from strands_robots.fleet.remote_robot import RemoteRobot, combined, verdict_of_answer
+from strands_robots.safety.stopping import StopVerdict
+from strands_robots.utils import device_id
+
+SOURCE = "strands-robots"
+"""Caller's name where none is given."""
+
+
+def connect(
+    *,
+    nats: Sequence[str] | None = None,
+    connect: Sequence[str] | None = None,
+    listen: Sequence[str] | None = None,
+    multicast: bool = False,
+    port: int | None = None,
+    tenant: str | None = None,
+    insecure: bool = False,
+    tls_ca: str | Path | None = None,
+    tls_cert: str | Path | None = None,
+    tls_key: str | Path | None = None,
+    credentials: str | Path | None = None,
+    name: str = SOURCE,
+    mesh: bool | None = None,
+) -> Fleet:
+    """Return the fleet in reach; use it as a context manager.
+
+    Without arguments it is this machine, or the network that the environment names. The arguments down to
+    ``credentials`` are the command line's network flags, for Device Connect; the mesh has its own settings::
+
+        with connect(nats=["tls://broker:4222"], credentials="robot.creds.json") as fleet:
+            print(fleet.robots())
+
+    Args:
+        nats: NATS servers, such as ``nats://host:4222``.
+        connect: Zenoh endpoints to connect to, such as ``tls/host:7447``.
+        listen: Zenoh endpoints to listen on.
+        multicast: find peers on the local network by multicast.
+        port: loopback port where local robots meet.
+        tenant: Device Connect tenant: a fleet that sees no other one.
+        insecure: accept a transport without authentication.
+        tls_ca: authority that peers are checked against, a PEM file.
+        tls_cert: this side's certificate.
+        tls_key: this side's private key.
+        credentials: Device Connect credentials file.
+        name: the caller's name that robots see; letters, digits, ``_`` and ``-``.
+        mesh: False leaves the mesh out; by default ``STRANDS_MESH`` decides.
+
+    Raises:
+        ValidationError: an argument outside its domain, or a network beyond this machine without authentication.
+        MissingExtraError: Device Connect is asked for and not installed.
+    """
+    source, absent = device_id("name", name), dict[str, str]()
+    files = {"tls_ca": tls_ca, "tls_cert": tls_cert, "tls_key": tls_key, "credentials": credentials}
+    paths = {each: Path(file).expanduser() for each, file in files.items() if file is not None}
+    flags = LinkFlags(nats, connect, listen, multicast, port, tenant, insecure, **paths)
+    networks: list[NetworkAdapter] = []
+    if flags != LinkFlags() or find_spec("device_connect_edge") is not None:
+        from strands_robots.fleet.device_connect import DeviceConnectNetwork  # noqa: PLC0415 - loaded when it is used
+
+        networks.append(DeviceConnectNetwork(flags.link(), source))
+    else:
+        absent[DEVICE_CONNECT] = "the extra device-connect is not installed"
+    if mesh is False or mesh_env_request() is False:
+        absent[MESH] = "it is switched off"
+    else:
+        from strands_robots.fleet.mesh import MeshNetwork  # noqa: PLC0415 - as above
+
+        networks.append(MeshNetwork(source))
+    return Fleet(networks, absent)
+
+
+class Fleet:
+    """Robots of Device Connect and of the mesh, as a context manager.
+
+    It is made by :func:`connect`::
+
+        with connect() as fleet:
+            for robot in fleet.robots():
+                print(robot.id, robot.type, robot.network)
+            arm = fleet["arm-1"]
+
+    An id that both networks have is one robot: Device Connect answers its reads, its motions are refused, and
+    :meth:`RemoteRobot.halt` stops both.
+
+    Args:
+        networks: those to join, the one whose robots win an id first.
+        absent: networks that are not joined, with the reason.
+
+    Attributes:
+        absent: networks that are not joined, with the reason. A mesh without a hub is absent and no error.
+    """
+
+    def __init__(self, networks: Sequence[NetworkAdapter], absent: Mapping[str, str] | None = None) -> None:
+        self.absent: dict[str, str] = dict(absent or {})
+        self._stated = tuple(networks)
+        self._networks: tuple[NetworkAdapter, ...] = ()
+        self._robots: dict[str, RemoteRobot] = {}
+
+    def __enter__(self) -> Self:
+        """Join the networks, side by side.
+
+        Raises:
+            UnreachableError: none of them can be reached.
+        """
+        with ThreadPoolExecutor(max(1, len(self._stated)), "fleet-open") as pool:
+            problems = list(pool.map(_opened, self._stated))
+        self.absent |= {each.name: why for each, why in zip(self._stated, problems, strict=True) if why}
+        self._networks = tuple(each for each, why in zip(self._stated, problems, strict=True) if not why)
+        if not self._networks:
+            raise UnreachableError("; ".join(f"{name}: {why.rstrip('.')}" for name, why in self.absent.items()))
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Leave the networks."""
+        networks, self._networks = self._networks, ()
+        for each in networks:
+            each.close()
+
+    def robots(self, timeout: float = FIND_S) -> list[RemoteRobot]:
+        """Look for robots and return them, sorted by id.
+
+        Args:
+            timeout: seconds at most; it ends early once no more robots come.
+        """
+        found: dict[str, tuple[FoundRobot, NetworkAdapter]] = {}
+        with ThreadPoolExecutor(max(1, len(self._networks)), "fleet-find") as pool:
+            listed = list(pool.map(lambda each: each.find(timeout), self._networks))
+        # The first network is the last to write, so its robots win an id.
+        for network, robots in reversed(list(zip(self._networks, listed, strict=True))):
+            found |= {each.id: (each, network) for each in robots}
+        for name, (each, network) in found.items():
+            known = self._robots.get(name)
+            if known is None:
+                self._robots[name] = RemoteRobot(each, network, lambda: self._networks)
+            else:
+                known.rediscovered(each, network)
+        return [self._robots[name] for name in sorted(found)]
+
+    def where(self, *, kind: str | None = None, network: str | None = None) -> list[RemoteRobot]:
+        """Look for robots of a kind or a network.
+
+        Args:
+            kind: a type or a model, as :attr:`RemoteRobot.type` and :attr:`RemoteRobot.model` have it.
+            network: ``device_connect`` or ``mesh``.
+        """
+        return [
+            each
+            for each in self.robots()
+            if (kind is None or kind in (each.type, each.model)) and (network is None or network == each.network)
+        ]
+
+    def stop(self) -> dict[str, StopVerdict]:
+        """Halt every robot in reach, without a lockout; return the verdicts by id.
+
+        A robot is stopped as soon as it is found. Never raises for a verdict.
+        """
+        with ThreadPoolExecutor(max(1, len(self._networks)), "fleet-stop") as pool:
+            answers = list(pool.map(_all_stopped, self._networks))
+        verdicts: dict[str, list[StopVerdict]] = {name: [] for name in self._robots}
+        for each in answers:
+            for name, answer in each.items():
+                verdicts.setdefault(name, []).append(verdict_of_answer(answer, name))
+        return {name: combined(name, verdicts[name], 0.0) for name in sorted(verdicts)}
+
+    def __getitem__(self, robot: str) -> RemoteRobot:
+        """Return the robot of this id, looked for where it is not known yet.
+
+        Raises:
+            NoSuchRobotError: no robot in reach has it; the message names similar ones and absent networks.
+        """
+        if robot not in self._robots:
+            self.robots()
+        if robot not in self._robots:
+            remedy = " ".join(
+                filter(
+                    None,
+                    [near(robot, self._robots, "robots"), *(f"Not joined: {n}, {w}." for n, w in self.absent.items())],
+                )
+            )
+            raise NoSuchRobotError(f"No robot {robot[:100]!r} is in reach", remedy=remedy)
+        return self._robots[robot]
+
+    def __contains__(self, robot: object) -> bool:
+        return robot in self._robots or robot in {each.id for each in self.robots()}
+
+    def __iter__(self) -> Iterator[RemoteRobot]:
+        return iter(self.robots())
+
+    def __repr__(self) -> str:
+        joined = ", ".join(each.name for each in self._networks) or "no network"
+        return f"<Fleet on {joined}{''.join(f'; {name} is absent: {why}' for name, why in self.absent.items())}>"
+
+
+def _opened(network: NetworkAdapter) -> str:
+    """Join a network; return the reason where that fails."""
+    try:
+        network.open()
+    except UnreachableError as exc:
+        return exc.why
+    return ""
+
+
+def _all_stopped(network: NetworkAdapter) -> Mapping[str, object]:
+    try:
+        return network.stop_all(STOP_S)
+    except (RefusalError, TimeoutError, OSError) as exc:
+        return {f"the robots on {network.name}": exc}

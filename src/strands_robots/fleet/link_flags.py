@@ -1,0 +1,141 @@
+"""Network of Device Connect: flags, else the environment, else this machine."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from strands_robots import settings
+from strands_robots.utils import ValidationError, missing_extra
+
+if TYPE_CHECKING:
+    from strands_robots.device_connect.backends import LinkConfig
+
+Spelled = Callable[[str], str]
+"""Gives the name of a flag as its user writes it."""
+
+
+def as_flag(name: str) -> str:
+    """Spell a flag as the command line does."""
+    return f"--{name.replace('_', '-')}"
+
+
+@dataclass(frozen=True, slots=True)
+class LinkFlags:
+    """Network flags as the user gave them.
+
+    Attributes:
+        nats: NATS servers, such as ``nats://host:4222``.
+        connect: Zenoh endpoints to connect to.
+        listen: Zenoh endpoints to listen on.
+        multicast: find peers on the local network by multicast.
+        port: loopback port where local robots meet.
+        tenant: Device Connect tenant; that of the environment by default.
+        insecure: accept a transport without authentication.
+        tls_ca: authority that peers are checked against, a PEM file.
+        tls_cert: this side's certificate.
+        tls_key: this side's private key.
+        credentials: Device Connect credentials file.
+    """
+
+    nats: Sequence[str] | None = None
+    connect: Sequence[str] | None = None
+    listen: Sequence[str] | None = None
+    multicast: bool = False
+    port: int | None = None
+    tenant: str | None = None
+    insecure: bool = False
+    tls_ca: Path | None = None
+    tls_cert: Path | None = None
+    tls_key: Path | None = None
+    credentials: Path | None = None
+
+    @property
+    def opted_in(self) -> bool:
+        """True when the user accepts a transport without authentication."""
+        return self.insecure or settings.boolean("DEVICE_CONNECT_ALLOW_INSECURE")
+
+    @property
+    def stated_tenant(self) -> str:
+        """The tenant of Device Connect, of the flag or the environment."""
+        return self.tenant or settings.raw("TENANT")
+
+    def link(self, spelled: Spelled = str) -> LinkConfig:
+        """Return the link that the flags describe.
+
+        Raises:
+            ValidationError: the flags contradict one another, or leave this machine without authentication.
+            MissingExtraError: Device Connect is not installed.
+        """
+        if self.nats and (self.connect or self.listen or self.multicast):
+            zenoh = f"{spelled('connect')}, {spelled('listen')} and {spelled('multicast')}"
+            raise ValidationError(f"{spelled('nats')} names a broker; {zenoh} are for Zenoh.")
+        link = self._secured(self._reached(), spelled)
+        if not link.authenticated and not link.loopback_only and not self.opted_in:
+            raise ValidationError(
+                "A network beyond this machine needs authentication: certificates "
+                f"({spelled('tls_ca')}, {spelled('tls_cert')}, {spelled('tls_key')}), credentials "
+                f"({spelled('credentials')} FILE) or {spelled('insecure')}, which lets every program on that network "
+                "drive the robot."
+            )
+        return link
+
+    def _reached(self) -> LinkConfig:
+        backends = _backends()
+        tenant = self.stated_tenant
+        if self.credentials:
+            settings.put("MESSAGING_CREDENTIALS_FILE", str(self.credentials))
+        if self.nats or self.connect or self.listen or self.multicast:
+            transport = "nats" if self.nats else "zenoh"
+            link: LinkConfig = backends.LinkConfig(transport=transport, tenant=tenant)
+            if self.credentials:
+                link = backends.link_from_environment(tenant, transport)
+            return replace(
+                link,
+                mode="peer" if self.listen or self.multicast else "auto",
+                connect=_urls(self.nats) if self.nats else _endpoints(self.connect),
+                listen=_endpoints(self.listen),
+                multicast=True if self.multicast else None,
+                verify_hostname=True,
+            )
+        from strands_robots.device_connect.links import usual_link  # noqa: PLC0415 - loaded when a network is used
+
+        return usual_link(tenant, self.port)
+
+    def _secured(self, link: LinkConfig, spelled: Spelled) -> LinkConfig:
+        return replace(
+            link,
+            ca=_pem(spelled("tls_ca"), self.tls_ca, link.ca),
+            cert=_pem(spelled("tls_cert"), self.tls_cert, link.cert),
+            key=_pem(spelled("tls_key"), self.tls_key, link.key),
+        )
+
+
+def _backends() -> Any:
+    # The framework is looked up and not imported: a command that refuses its flags need not load it.
+    if find_spec("device_connect_edge") is None:
+        raise missing_extra("Device Connect", "device-connect")
+    from strands_robots.device_connect import backends  # noqa: PLC0415 - loaded when a network is used
+
+    return backends
+
+
+def _pem(flag: str, path: Path | None, otherwise: str) -> str:
+    if path is not None and not path.is_file():
+        raise ValidationError(f"{flag} {path} is no file.")
+    return str(path) if path is not None else otherwise
+
+
+def _urls(values: Sequence[str] | None) -> tuple[str, ...]:
+    from strands_robots.device_connect.backends.config import split_urls  # noqa: PLC0415 - as above
+
+    return split_urls(values or [])
+
+
+def _endpoints(values: Sequence[str] | None) -> tuple[str, ...]:
+    from strands_robots.device_connect.backends.config import endpoints  # noqa: PLC0415 - as above
+
+    return endpoints(_urls(values))

@@ -1,0 +1,100 @@
+"""Answers of robots as exceptions of :mod:`strands_robots.errors`.
+
+Robots of ours name the part of their pipeline that refused, in ``refused``. An older robot's answer is known by its
+fields, and an answer of the mesh, which is a text, by its words.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Collection, Mapping
+from typing import Any
+
+from strands_robots.envelope import text_of
+from strands_robots.errors import (
+    ApprovalError,
+    ArgumentsError,
+    BusyError,
+    CallerError,
+    ControlError,
+    LockoutError,
+    RefusalError,
+    RobotError,
+    UnknownVerbError,
+)
+from strands_robots.fleet.description import plain_text
+from strands_robots.serving.pipeline import RefusalReason
+
+WHY_MAX = 500
+
+BY_REASON: Mapping[str, type[RefusalError]] = {
+    RefusalReason.ARGUMENTS.value: ArgumentsError,
+    RefusalReason.CALLER.value: CallerError,
+    RefusalReason.CONTROL.value: ControlError,
+    RefusalReason.LOCKOUT.value: LockoutError,
+    RefusalReason.APPROVAL.value: ApprovalError,
+    RefusalReason.BUSY.value: BusyError,
+    RefusalReason.FAILED.value: RobotError,
+}
+
+LEASE_CODES = ("not_holder", "displaced", "lease_over")
+
+EXACT: Mapping[str, tuple[type[RefusalError], str]] = {
+    "command rejected": (LockoutError, "it is locked by an emergency stop"),
+    "busy": (BusyError, "it has not yet answered earlier calls"),
+    "dispatch error": (RobotError, "the verb failed inside the robot; its log has the details"),
+    "replay rejected": (CallerError, "the message came twice or late; compare the clocks of both machines"),
+}
+"""Refusals of the mesh, with what they mean."""
+
+WORDS: tuple[tuple[str, type[RefusalError]], ...] = (
+    ("validation: action must be one of", UnknownVerbError),
+    ("validation: ", ArgumentsError),
+    ("is locked by", LockoutError),
+    ("holds control", ControlError),
+    ("has taken control", ControlError),
+    ("this lease is over", ControlError),
+    ("needs operator approval", ApprovalError),
+    ("cannot be attributed", ApprovalError),
+    ("may not move this robot", CallerError),
+    ("has not yet answered earlier calls", BusyError),
+    ("has left its network", BusyError),
+    ("failed inside the device", RobotError),
+    (": it has no ", ArgumentsError),
+    (" is missing.", ArgumentsError),
+)
+"""Words of a text, the first that is found counts."""
+
+
+def refusal_of(robot: str, verb: str, answer: Mapping[str, Any]) -> RefusalError:
+    """Return the exception for an answer of status error."""
+    said, why = answer.get("refused"), plain_text(text_of(dict(answer)), WHY_MAX) or "it gave no reason"
+    stated = BY_REASON.get(said) if isinstance(said, str) else None
+    if stated is not None:
+        return stated(why, robot=robot, verb=verb, envelope=answer)
+    if answer.get("code") in LEASE_CODES:
+        return ControlError(why, robot=robot, verb=verb, envelope=answer)
+    if answer.get("locked") is True:
+        return LockoutError(why, robot=robot, verb=verb, envelope=answer)
+    return refusal_of_text(robot, verb, why, answer)
+
+
+def refusal_of_text(robot: str, verb: str, text: object, answer: Mapping[str, Any] | None = None) -> RefusalError:
+    """Return the exception for a refusal that is a text."""
+    why = plain_text(text, WHY_MAX)
+    known = EXACT.get(why)
+    if known is not None:
+        return known[0](known[1], robot=robot, verb=verb, envelope=answer)
+    cause = next((each for words, each in WORDS if words in why), RobotError)
+    return cause(why.removeprefix("validation: ") or "it gave no reason", robot=robot, verb=verb, envelope=answer)
+
+
+def near(wanted: str, names: Collection[str], what: str) -> str:
+    """Return a sentence with the names that resemble ``wanted``, else with all."""
+    alike = difflib.get_close_matches(wanted[:100], names, n=3, cutoff=0.5)
+    listed = alike or sorted(names)[:20]
+    return (
+        f"{'Near it' if alike else f'Its {what}' if what == 'verbs' else 'There are'}: {', '.join(listed)}."
+        if listed
+        else ""
+    )

@@ -1,0 +1,443 @@
+"""Robot on another machine, of Device Connect or of the mesh.
+
+A :class:`RemoteRobot` has the contract of a robot here: verbs with descriptions, state, features, events, halt. What
+comes over the wire is data: it is bounded, and every text of it is marked as the robot's words.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import logging
+import queue
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, Self
+
+from strands_robots.envelope import Envelope, is_error
+from strands_robots.errors import AmbiguousRobotError, NoSuchRobotError, RefusalError, RobotError, UnknownVerbError
+from strands_robots.fleet.adapter import STOP_S, FoundRobot, NetworkAdapter, RobotEvent
+from strands_robots.fleet.description import RobotDescription, VerbDescription, plain_text, python_name
+from strands_robots.fleet.lease import HeldLease
+from strands_robots.fleet.refusals import near, refusal_of
+from strands_robots.safety.stopping import StopVerdict, graded
+from strands_robots.utils import WAIT_S, number, optional_module
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+logger = logging.getLogger(__name__)
+
+CALL_S = 10.0
+"""Seconds in which a robot has to have started a motion or answered a read; it gives up itself by then."""
+
+EVENTS_MAX = 10_000
+"""Events that wait for a slow reader; a further one displaces the oldest."""
+
+PIXELS_MAX = 4096 * 4096
+HALTED_MAX = 64
+
+OF_THE_HOLDER = ("renewControl", "releaseControl", "resume")
+"""Verbs that write and move nothing; they go to the robot that reads go to."""
+
+Networks = Callable[[], Sequence[NetworkAdapter]]
+"""Returns the networks that are joined now."""
+
+
+class RemoteRobot:
+    """A robot on another machine. Its verbs are methods::
+
+        arm = fleet["arm-1"]
+        arm.move_to(x=0.25, y=0.0, z=0.1)     # the robot's moveTo; help(arm.move_to) describes it
+        arm.call("moveTo", x=0.25, y=0.0, z=0.1, timeout=60.0)
+        with arm.control():                   # no other caller moves it meanwhile
+            arm.pick("cube")
+        arm.halt()                            # a StopVerdict; never raises
+
+    A verb's name is that on the wire in snake_case. A verb that has the name of a member of this class, one that
+    begins with an underscore, and two verbs that give one name are reachable by :meth:`call` alone.
+
+    A device that is not ours (a bare ``DeviceDriver`` with ``@rpc``) is a RemoteRobot too. It may have no lockout, no
+    control lease and no stop: :attr:`has_lockout`, :attr:`has_lease` and :attr:`has_stop` say so, and its ``repr``.
+
+    Args:
+        found: the robot as its network announces it.
+        network: the network that reads and calls go to.
+        networks: returns all networks on which a robot may have this id; ``network`` alone by default.
+    """
+
+    def __init__(self, found: FoundRobot, network: NetworkAdapter, networks: Networks | None = None) -> None:
+        self._found, self._network = found, network
+        self._networks: Networks = networks or (lambda: (network,))
+        self._description: RobotDescription | None = None
+        self._names: dict[str, str] = {}
+        self._methods: dict[str, Callable[..., dict[str, Any]]] = {}
+        self._lease: HeldLease | None = None
+
+    @property
+    def id(self) -> str:
+        """Its id on the network."""
+        return self._found.id
+
+    @property
+    def type(self) -> str:
+        """Its type as it states it, such as ``strands_robot``."""
+        return self._found.type
+
+    @property
+    def model(self) -> str:
+        """The model that it states; may be empty."""
+        return self._found.model
+
+    @property
+    def network(self) -> str:
+        """``device_connect`` or ``mesh``."""
+        return self._network.name
+
+    @property
+    def verbs(self) -> Mapping[str, VerbDescription]:
+        """Its verbs by their names on the wire."""
+        return self._described.verbs
+
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """Parts of its description that are out of bounds and left out."""
+        return self._described.left_out
+
+    @property
+    def has_stop(self) -> bool:
+        """True where it has a stop."""
+        return any(verb.kind == "stop" for verb in self.verbs.values())
+
+    @property
+    def has_lockout(self) -> bool:
+        """True where an emergency stop locks it until the operator's resume."""
+        resume = self.verbs.get("resume")
+        return resume is not None and "assertion" in resume.parameters.get("properties", {})
+
+    @property
+    def has_lease(self) -> bool:
+        """True where :meth:`control` keeps other callers from moving it."""
+        return self.verbs.keys() >= {"acquireControl", "renewControl", "releaseControl"}
+
+    def call(self, verb: str, /, *, timeout: float | None = None, **arguments: Any) -> dict[str, Any]:
+        """Call a verb by its name on the wire and return the robot's answer.
+
+        Args:
+            verb: such as ``moveTo``.
+            timeout: seconds to wait for the answer; by default as long as the verb may take.
+            arguments: checked by the robot.
+
+        Raises:
+            RefusalError: the robot refused it, failed or did not answer; the subclass says which.
+        """
+        return self._call(verb, arguments, timeout)
+
+    def status(self) -> dict[str, Any]:
+        """Return what it is doing, its lockouts and its holder."""
+        return self._call(self._network.reads["status"], {}, None)
+
+    def state(self) -> dict[str, Any]:
+        """Return its measured state."""
+        return self._call(self._network.reads["state"], {}, None)
+
+    def features(self) -> dict[str, Any]:
+        """Return its observations and actions with their units."""
+        return self._call(self._network.reads["features"], {}, None)
+
+    def events(self, timeout: float | None = None) -> EventFeed:
+        """Return its events from now on, as an iterator and context manager.
+
+        Args:
+            timeout: seconds without an event after which the iteration ends; None waits for ever.
+        """
+        return EventFeed(self.id, self._network, timeout)
+
+    def picture(self, camera: str = "", width: int = 640, height: int = 480) -> NDArray[np.uint8]:
+        """Return a picture of a camera as an array of height x width x 3, RGB, 0 to 255.
+
+        Args:
+            camera: as ``listCameras`` has it; empty for the first.
+            width: largest width in pixels.
+            height: largest height in pixels.
+
+        Raises:
+            RefusalError: the robot has no camera, or its answer is no picture.
+            MissingExtraError: Pillow or numpy is not installed.
+        """
+        answer = self._call("getPicture", {"camera": camera, "width": width, "height": height}, None)
+        try:
+            return _decoded(answer.get("jpeg"))
+        except (ValueError, OSError, SyntaxError) as exc:
+            raise RobotError(f"Its answer is no picture: {exc}", robot=self.id, verb="getPicture") from exc
+
+    def halt(self, reason: str = "") -> StopVerdict:
+        """Stop what moves it, without a lockout; never raises.
+
+        Every robot of this id is stopped, on each network that has one.
+
+        Args:
+            reason: for this side's log.
+
+        Returns:
+            The verdict; *unknown* by name where the robot did not answer or has no stop.
+        """
+        began, networks = time.monotonic(), tuple(self._networks()) or (self._network,)
+        logger.debug("%s is halted: %s", self.id, reason)
+        if len(networks) == 1:
+            answers = [_stopped(self.id, networks[0])]
+        else:
+            with ThreadPoolExecutor(len(networks), "fleet-halt") as pool:
+                answers = list(pool.map(lambda each: _stopped(self.id, each), networks))
+        bearers = [(each, said) for each, said in zip(networks, answers, strict=True) if said is not None]
+        verdicts = [
+            verdict_of_answer(said, self.id if len(bearers) == 1 else f"{self.id} on {each.name}")
+            for each, said in bearers
+        ]
+        return combined(self.id, verdicts, (time.monotonic() - began) * 1000)
+
+    @contextmanager
+    def control(self, ttl_s: float = 60.0) -> Iterator[Self]:
+        """Hold the robot for the block: motions of other callers are refused.
+
+        The lease is renewed in the background and released at the end, also after an exception. If this process dies,
+        the robot halts when ``ttl_s`` seconds are over.
+
+        Raises:
+            ControlError: another caller holds it.
+            UnknownVerbError: it has no control lease.
+        """
+        seconds = number("ttl_s", ttl_s, above=0)
+        if not self.has_lease:
+            raise UnknownVerbError("It has no control lease", robot=self.id, verb="acquireControl")
+        answer = self._call("acquireControl", {"ttl_s": seconds}, None)
+        lease_id = answer.get("lease_id")
+        if not isinstance(lease_id, str) or not lease_id:
+            raise RobotError("It gave no lease_id", robot=self.id, verb="acquireControl", envelope=answer)
+        before, self._lease = self._lease, HeldLease(self.id, self._call, lease_id, seconds)
+        try:
+            yield self
+        finally:
+            held, self._lease = self._lease, before
+            held.release()
+
+    def __getattr__(self, name: str) -> Callable[..., dict[str, Any]]:
+        # Copying and pickling ask for underscore names before there is a description.
+        if name.startswith("_"):
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+        described = self._described
+        method = self._methods.get(name)
+        if method is None:
+            wire = self._names.get(name)
+            if wire is None:
+                raise self._unknown(name)
+            method = self._methods[name] = self._method(name, described.verbs[wire])
+        return method
+
+    def __dir__(self) -> list[str]:
+        described = self._described
+        return sorted({*object.__dir__(self), *(self._names if described.verbs else ())})
+
+    def __repr__(self) -> str:
+        kind = self.model or self.type
+        known = self._description is not None or self._network.announces_verbs
+        lacking = self._lacking() if known else ""
+        return f"<RemoteRobot {self.id} ({', '.join(filter(None, (kind, self.network, lacking)))})>"
+
+    @property
+    def _described(self) -> RobotDescription:
+        if self._description is None:
+            self._describe()
+        return self._description or RobotDescription()
+
+    def _describe(self) -> None:
+        """Ask the network for the robot's verbs, and name the methods."""
+        try:
+            description = RobotDescription.of(self._network.describe(self.id))
+        except RefusalError as exc:
+            logger.warning("%s: its verbs cannot be read: %s", self.id, exc)
+            return
+        names: dict[str, list[str]] = {}
+        for wire in description.verbs:
+            names.setdefault(python_name(wire), []).append(wire)
+        self._names = {
+            name: wires[0]
+            for name, wires in names.items()
+            if len(wires) == 1 and name not in _RESERVED and name[0] != "_"
+        }
+        self._methods = {}
+        self._description = description
+
+    def rediscovered(self, found: FoundRobot, network: NetworkAdapter) -> None:
+        """Take what a new discovery found; its verbs are read again when they are used."""
+        self._found, self._network, self._description = found, network, None
+
+    def _lacking(self) -> str:
+        has = {"lockout": self.has_lockout, "lease": self.has_lease, "stop": self.has_stop}
+        return ", ".join(f"no {name}" for name, there in has.items() if not there)
+
+    def _method(self, name: str, verb: VerbDescription) -> Callable[..., dict[str, Any]]:
+        signature = verb.signature()
+        positional = tuple(signature.parameters)
+
+        def method(*values: Any, **arguments: Any) -> dict[str, Any]:
+            if values:
+                arguments = _named(name, positional, values, arguments)
+            return self._call(verb.name, arguments, None)
+
+        lacking = self._lacking()
+        method.__name__ = name
+        method.__qualname__ = f"{type(self).__name__}.{name}"
+        method.__doc__ = verb.docstring(f"This robot has {lacking}." if lacking else "")
+        vars(method)["__signature__"] = signature
+        return method
+
+    def _call(self, verb: str, arguments: Mapping[str, Any], timeout: float | None) -> dict[str, Any]:
+        description = self._described.verbs.get(verb)
+        if (description is None or description.kind == "motion") and verb not in OF_THE_HOLDER:
+            self._refuse_ambiguous(verb)
+            held = self._lease
+            if held is not None and description is not None and description.leased and "lease_id" not in arguments:
+                arguments = {**arguments, "lease_id": held.lease_id}
+        if timeout is None:
+            timeout = _patience(description, arguments)
+        try:
+            answer: Envelope = self._network.call(self.id, verb, arguments, timeout)
+        except UnknownVerbError:
+            raise self._unknown(verb) from None
+        if is_error(answer):
+            raise refusal_of(self.id, verb, answer)
+        return answer
+
+    def _refuse_ambiguous(self, verb: str) -> None:
+        networks = self._networks()
+        bearers = [each for each in networks if each.bears(self.id)] if len(networks) > 1 else ()
+        if len(bearers) > 1:
+            named = " and ".join(each.name for each in bearers)
+            raise AmbiguousRobotError(
+                f"{verb} is sent to neither: {named} both have a robot of this id", robot=self.id, verb=verb
+            )
+
+    def _unknown(self, verb: str) -> UnknownVerbError:
+        named = [*self.verbs, *self._names]
+        called = ", ".join(name for name in self.verbs if python_name(name) == verb)
+        remedy = f"Reach it by call(): {called}." if called else near(verb, named, "verbs")
+        return UnknownVerbError(f"It has no verb {verb[:100]}", robot=self.id, verb=verb, remedy=remedy)
+
+
+_RESERVED = frozenset(dir(RemoteRobot))
+"""Names of members, which no verb of a robot takes."""
+
+
+class EventFeed:
+    """Events of one robot as they come; an iterator and context manager."""
+
+    def __init__(self, robot: str, network: NetworkAdapter, timeout: float | None) -> None:
+        self._arrived: queue.Queue[RobotEvent] = queue.Queue(EVENTS_MAX)
+        self._timeout = timeout
+        self._end: Callable[[], None] | None = network.subscribe(robot, self._push)
+
+    def close(self) -> None:
+        """Receive no more events."""
+        end, self._end = self._end, None
+        if end is not None:
+            end()
+
+    def __iter__(self) -> Self:
+        return self
+
+    def __next__(self) -> RobotEvent:
+        try:
+            return self._arrived.get(timeout=self._timeout)
+        except queue.Empty:
+            self.close()
+            raise StopIteration from None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self.close()
+
+    def _push(self, event: RobotEvent) -> None:
+        while True:
+            try:
+                self._arrived.put_nowait(event)
+            except queue.Full:
+                self._arrived.get_nowait()
+            else:
+                return
+
+
+def verdict_of_answer(answer: object, name: str) -> StopVerdict:
+    """Return the answer to a stop of a remote robot as a verdict on ``name``."""
+    verdict = graded(answer, name)
+    if verdict.stopped and isinstance(answer, Mapping):
+        listed = answer.get("halted", answer.get("stopped"))
+        halted = [plain_text(each, 100) for each in listed[:HALTED_MAX]] if isinstance(listed, list) else [name]
+        return StopVerdict(tuple(filter(None, halted)), settling=answer.get("settling") is True)
+    return StopVerdict(
+        verdict.halted,
+        {each: plain_text(why, 500) for each, why in verdict.not_stopped.items()},
+        {each: plain_text(why, 500) for each, why in verdict.unknown.items()},
+    )
+
+
+def combined(robot: str, verdicts: Sequence[StopVerdict], elapsed_ms: float) -> StopVerdict:
+    """Return the verdicts of all bearers of an id as one; unknown without any."""
+    if not verdicts:
+        return StopVerdict(unknown={robot: "it did not answer, or has no stop"}, elapsed_ms=elapsed_ms)
+    return StopVerdict(
+        tuple(name for each in verdicts for name in each.halted),
+        {name: why for each in verdicts for name, why in each.not_stopped.items()},
+        {name: why for each in verdicts for name, why in each.unknown.items()},
+        elapsed_ms,
+        any(each.settling for each in verdicts),
+    )
+
+
+def _stopped(robot: str, network: NetworkAdapter) -> object:
+    try:
+        return network.stop(robot, STOP_S)
+    except NoSuchRobotError:
+        return None
+    except Exception as exc:  # noqa: BLE001 - a stop that fails is a verdict, whatever it raised
+        return {"status": "error", "stopped": None, "reason": f"{type(exc).__name__}: {exc}"}
+
+
+def _patience(verb: VerbDescription | None, arguments: Mapping[str, Any]) -> float:
+    """Return the seconds in which a verb has to answer."""
+    if verb is None:
+        return CALL_S
+    lasts, duration = verb.lasts_s, arguments.get("duration")
+    if lasts and isinstance(duration, int | float) and 0 < duration <= 3600:
+        lasts = max(lasts, float(duration))
+    return CALL_S + (WAIT_S if verb.waits else 0.0) + lasts
+
+
+def _named(verb: str, positional: Sequence[str], values: Sequence[Any], arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the arguments by name."""
+    if len(values) > len(positional):
+        raise TypeError(f"{verb}() takes {len(positional)} positional arguments but {len(values)} were given")
+    given = dict(zip(positional, values, strict=False))
+    twice = given.keys() & arguments.keys()
+    if twice:
+        raise TypeError(f"{verb}() got multiple values for argument {', '.join(sorted(twice))}")
+    return {**given, **arguments}
+
+
+def _decoded(jpeg: object) -> NDArray[np.uint8]:
+    """Return a base64 JPEG as pixels; raise ValueError or OSError for anything else."""
+    images = optional_module("PIL.Image", what="picture", extra="sim")
+    numpy = optional_module("numpy", what="picture", extra="sim")
+    if not isinstance(jpeg, str):
+        raise ValueError("there is no jpeg in it")  # noqa: TRY004 - the answer's value, not the caller's type
+    with images.open(io.BytesIO(base64.b64decode(jpeg, validate=True)), formats=("JPEG",)) as image:
+        # The header is read before the pixels, so that a small file cannot ask for gigabytes.
+        if image.width * image.height > PIXELS_MAX:
+            raise ValueError(f"it has {image.width} x {image.height} pixels")
+        pixels: NDArray[np.uint8] = numpy.asarray(image.convert("RGB"))
+    return pixels

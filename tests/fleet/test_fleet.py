@@ -1,0 +1,141 @@
+"""Fleet: both networks at once, an id on both, absent networks, the stop of all."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from tests.fleet.scripted import OURS, ScriptedNetwork
+
+from strands_robots import errors
+from strands_robots.envelope import error
+from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
+from strands_robots.fleet.fleet import Fleet, connect
+from strands_robots.utils import ValidationError
+
+
+@pytest.fixture
+def device_connect() -> ScriptedNetwork:
+    return ScriptedNetwork(DEVICE_CONNECT, {"arm-1": OURS, "both": OURS})
+
+
+@pytest.fixture
+def mesh() -> ScriptedNetwork:
+    return ScriptedNetwork(MESH, {"arm-2": OURS, "both": OURS})
+
+
+@pytest.fixture
+def fleet(device_connect: ScriptedNetwork, mesh: ScriptedNetwork) -> Any:
+    with Fleet([device_connect, mesh]) as joined:
+        yield joined
+
+
+def test_robots_of_both_networks_are_found(fleet: Fleet) -> None:
+    found = [(robot.id, robot.network) for robot in fleet.robots()]
+    assert found == [("arm-1", DEVICE_CONNECT), ("arm-2", MESH), ("both", DEVICE_CONNECT)]
+    assert [robot.id for robot in fleet.where(network=MESH)] == ["arm-2"]
+    assert [robot.id for robot in fleet.where(kind="gantry")] == []
+    assert "arm-2" in fleet
+    assert "arm-9" not in fleet
+    assert fleet["arm-1"] is fleet["arm-1"]
+
+
+def test_absent_robot_is_refused_with_similar_names(fleet: Fleet) -> None:
+    with pytest.raises(errors.NoSuchRobotError, match="Near it: arm-"):
+        fleet["arm-9"]
+
+
+def test_motion_of_an_id_on_both_is_refused_naming_both(
+    fleet: Fleet, device_connect: ScriptedNetwork, mesh: ScriptedNetwork
+) -> None:
+    both = fleet["both"]
+    with pytest.raises(errors.AmbiguousRobotError, match="device_connect and mesh"):
+        both.move_to(x=1)
+    with pytest.raises(errors.AmbiguousRobotError), both.control():
+        pytest.fail("controlled")
+    assert both.status()["status"] == "success"
+    assert [call[1] for call in device_connect.calls] == ["getStatus"]
+    assert not mesh.calls
+
+
+def test_halt_of_an_id_on_both_reaches_both(
+    fleet: Fleet, device_connect: ScriptedNetwork, mesh: ScriptedNetwork
+) -> None:
+    assert fleet["both"].halt().stopped is True
+    assert (device_connect.stopped, mesh.stopped) == (["both"], ["both"])
+    mesh.stops = error("no brakes", stopped=False)
+    verdict = fleet["both"].halt()
+    assert verdict.stopped is False
+    assert list(verdict.not_stopped) == ["both on mesh"]
+
+
+def test_robot_that_comes_up_on_the_other_network_makes_its_motions_ambiguous(
+    fleet: Fleet, mesh: ScriptedNetwork
+) -> None:
+    arm = fleet["arm-1"]
+    assert arm.move_to(x=1)
+    mesh.robots["arm-1"] = OURS
+    with pytest.raises(errors.AmbiguousRobotError):
+        arm.move_to(x=1)
+
+
+def test_network_that_cannot_be_reached_is_absent_with_its_reason(
+    device_connect: ScriptedNetwork, mesh: ScriptedNetwork
+) -> None:
+    mesh.unreachable = "no mesh answers"
+    with Fleet([device_connect, mesh]) as fleet:
+        assert fleet.absent == {MESH: "no mesh answers"}
+        assert [robot.id for robot in fleet.robots()] == ["arm-1", "both"]
+        with pytest.raises(errors.NoSuchRobotError, match="Not joined: mesh, no mesh answers"):
+            fleet["arm-2"]
+    device_connect.unreachable = "no broker"
+    with (
+        pytest.raises(errors.UnreachableError, match=r"no broker; mesh: no mesh answers"),
+        Fleet([device_connect, mesh]),
+    ):
+        pytest.fail("joined")
+
+
+def test_stop_of_all_gives_verdicts_by_id(fleet: Fleet, mesh: ScriptedNetwork) -> None:
+    mesh.stops = error("no brakes", stopped=False)
+    verdicts = fleet.stop()
+    assert {name: verdict.stopped for name, verdict in verdicts.items()} == {
+        "arm-1": True,
+        "arm-2": False,
+        "both": False,
+    }
+
+
+def test_stop_of_all_names_a_network_that_fails(fleet: Fleet, mesh: ScriptedNetwork) -> None:
+    mesh.stops = OSError("cable")
+    verdicts = fleet.stop()
+    assert verdicts["arm-1"].stopped
+    assert not verdicts["the robots on mesh"].stopped
+
+
+def test_networks_are_left_at_the_end(device_connect: ScriptedNetwork, mesh: ScriptedNetwork) -> None:
+    with Fleet([device_connect, mesh]):
+        assert device_connect.joined
+        assert mesh.joined
+    assert not device_connect.joined
+    assert not mesh.joined
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        ({"connect": ["tcp/192.0.2.1:7447"]}, "needs authentication: certificates \\(tls_ca, tls_cert, tls_key\\)"),
+        ({"nats": ["nats://127.0.0.1:4222"], "multicast": True}, "nats names a broker"),
+        ({"tls_ca": "/absent"}, "tls_ca /absent is no file"),
+        ({"name": "a.b"}, "name must be"),
+    ],
+)
+def test_connect_refuses_arguments_by_name(arguments: Any, named: str) -> None:
+    with pytest.raises(ValidationError, match=named):
+        connect(**arguments)
+
+
+def test_connect_without_arguments_is_this_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STRANDS_MESH", "false")
+    assert connect().absent == {MESH: "it is switched off"}
+    assert connect(mesh=False).absent == {MESH: "it is switched off"}
