@@ -22,7 +22,7 @@ from strands_robots.fleet.refusals import refusal_of_text
 from strands_robots.safety.peer_answers import enrolled_peers, stop_distrust
 from strands_robots.safety.statements import ALARM
 from strands_robots.safety.stopping import explain, grade
-from strands_robots.serving.verbs import REQUIRED, Kind, Verb
+from strands_robots.serving.verb_schema import described
 from strands_robots.utils import MissingExtraError, ValidationError, finite
 
 if TYPE_CHECKING:
@@ -31,12 +31,8 @@ if TYPE_CHECKING:
 DESCRIBE_S = 5.0
 """Seconds in which a peer has to describe its verbs."""
 
-EXECUTE_S = 30.0
-"""Seconds that a policy lasts where no duration is given."""
-
 LOOK_S = 0.05
 PARALLEL = 32
-_TYPES = {str: "string", float: "number", int: "integer", bool: "boolean", list: "array", dict: "object"}
 _ALIASES = {"getStatus": "status", "getState": "state", "getFeatures": "features"}
 """Reads of every robot by their names on Device Connect, which the mesh has always called otherwise."""
 
@@ -105,7 +101,7 @@ class MeshNetwork:
         )
         own = row.get("own_verbs")
         named = [{"name": name, "labels": {"own": "true"}} for name in own] if isinstance(own, list) else []
-        return [*(function_of(PEER_VERBS[name]) for name in actions), *named]
+        return [*(described(PEER_VERBS[name]) for name in actions), *named]
 
     def call(self, robot: str, verb: str, arguments: Mapping[str, Any], timeout: float) -> Envelope:
         """Send the peer an action."""
@@ -214,29 +210,6 @@ class MeshNetwork:
                 return False
             time.sleep(LOOK_S)
         return True
-
-
-def function_of(verb: Verb) -> dict[str, Any]:
-    """Return a verb of ours as a robot describes it on the wire."""
-    properties = {
-        each.name: {
-            "type": _TYPES.get(each.type, "string"),
-            "description": each.meaning,
-            **({} if each.default is REQUIRED else {"default": each.default}),
-        }
-        for each in verb.parameters
-    }
-    lasts = {"lasts_s": str(EXECUTE_S)} if verb.lasts and "duration" in properties else {}
-    return {
-        "name": verb.name,
-        "description": verb.summary,
-        "parameters": {
-            "type": "object",
-            "properties": properties,
-            "required": [each.name for each in verb.parameters if each.default is REQUIRED],
-        },
-        "labels": {"direction": "read" if verb.kind is Kind.READ else "write", **lasts},
-    }
 
 
 def _has_robot(row: Mapping[str, Any]) -> bool:

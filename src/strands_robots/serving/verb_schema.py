@@ -20,14 +20,16 @@ Labels = dict[str, str | list[str]]
 
 
 def labels_of(verb: Verb) -> Labels:
-    """Return the labels of a verb: direction, and what an own one is."""
+    """Return the labels of a verb: direction, its robot's own or not, seconds to return."""
     kind: Labels = {"direction": "read"} if verb.kind is Kind.READ else {"direction": "write"}
     if verb.kind is not Kind.READ and verb.critical:
         kind["safety"] = "critical"
     if verb.own:
         kind["own"] = "true"
-    if verb.lasts_s:
-        kind["lasts_s"] = f"{verb.lasts_s:g}"
+    duration = verb.by_name.get("duration") if verb.lasts else None
+    lasts_s = verb.lasts_s if duration is None else float(duration.default)
+    if lasts_s:
+        kind["lasts_s"] = f"{lasts_s:g}"
     return kind
 
 
