@@ -83,7 +83,7 @@ class ScriptedNetwork:
             raise UnknownVerbError("Method not found")
         return success("done", verb=verb)
 
-    def stop(self, robot: str, timeout: float = STOP_S) -> Envelope | None:
+    def stop(self, robot: str, timeout: float = STOP_S, robot_name: str = "") -> Envelope | None:
         if robot not in self.robots:
             return None
         self.stopped.append(robot)

@@ -75,10 +75,10 @@ class NetworkAdapter(Protocol):
             RefusalError: the call got no answer, or was refused as such.
         """
 
-    def stop(self, robot: str, timeout: float = STOP_S) -> Envelope | None:
+    def stop(self, robot: str, timeout: float = STOP_S, robot_name: str = "") -> Envelope | None:
         """Stop a robot and return its answer, None where it is not on this network.
 
-        No answer in time is an envelope with ``stopped`` None.
+        ``robot_name`` stops one robot of a world alone. No answer in time is an envelope with ``stopped`` None.
         """
 
     def stop_all(self, timeout: float = STOP_S) -> dict[str, Envelope]:

@@ -89,9 +89,10 @@ class DeviceConnectNetwork:
                 raise
             raise refusal from exc
 
-    def stop(self, robot: str, timeout: float = STOP_S) -> Envelope | None:
+    def stop(self, robot: str, timeout: float = STOP_S, robot_name: str = "") -> Envelope | None:
         """Stop the device by ``stop``, else by ``stopMotion``."""
-        answer = self._connected.stop(robot, timeout if self.bears(robot) else min(timeout, UNKNOWN_STOP_S))
+        within = timeout if self.bears(robot) else min(timeout, UNKNOWN_STOP_S)
+        answer = self._connected.stop(robot, within, robot_name)
         unknown = answer.get("status") == "error" and answer.get("stopped") is None
         return None if unknown and not self.bears(robot) else answer
 

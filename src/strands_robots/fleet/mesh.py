@@ -129,11 +129,12 @@ class MeshNetwork:
             raise refusal_of_text(robot, verb, why)
         raise UnreachableError(why or "the mesh did not carry the call", robot=robot, verb=verb)
 
-    def stop(self, robot: str, timeout: float = STOP_S) -> Envelope | None:
+    def stop(self, robot: str, timeout: float = STOP_S, robot_name: str = "") -> Envelope | None:
         """Stop the peer; *stopped* counts only where an enrolled robot has signed it."""
         if not self._waited_for(robot, longest=FIND_S):
             return None
-        reply = self._joined_mesh.send(robot, {"action": "stop"}, timeout)
+        one = {"robot_name": robot_name} if robot_name else {}
+        reply = self._joined_mesh.send(robot, {"action": "stop", **one}, timeout)
         return _stop_answer(robot, reply, enrolled_peers())
 
     def stop_all(self, timeout: float = STOP_S) -> dict[str, Envelope]:

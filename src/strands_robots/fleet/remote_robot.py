@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Self
 
 from strands_robots.envelope import Envelope, is_error
@@ -39,6 +40,10 @@ EVENTS_MAX = 10_000
 
 PIXELS_MAX = 4096 * 4096
 HALTED_MAX = 64
+ROBOTS_MAX = 1000
+
+ROBOT_NAME = "robot_name"
+"""Argument that names one robot of a world."""
 
 OF_THE_HOLDER = ("renewControl", "releaseControl", "resume")
 """Verbs that write and move nothing; they go to the robot that reads go to."""
@@ -81,6 +86,11 @@ class RemoteRobot:
     def id(self) -> str:
         """Its id on the network."""
         return self._found.id
+
+    @property
+    def address(self) -> str:
+        """The id that its network knows it by; of a robot of a world the world's."""
+        return self.id
 
     @property
     def type(self) -> str:
@@ -142,7 +152,10 @@ class RemoteRobot:
 
     def state(self) -> dict[str, Any]:
         """Return its measured state."""
-        return self._call(self._network.reads["state"], {}, None)
+        reads = self._network.reads
+        # A world on Device Connect tells its joints with its status.
+        known = not self.verbs or reads["state"] in self.verbs
+        return self._call(reads["state"] if known else reads["status"], {}, None)
 
     def features(self) -> dict[str, Any]:
         """Return its observations and actions with their units."""
@@ -154,7 +167,7 @@ class RemoteRobot:
         Args:
             timeout: seconds without an event after which the iteration ends; None waits for ever.
         """
-        return EventFeed(self.id, self._network, timeout)
+        return EventFeed(self.address, self._network, timeout)
 
     def picture(self, camera: str = "", width: int = 640, height: int = 480) -> NDArray[np.uint8]:
         """Return a picture of a camera as an array of height x width x 3, RGB, 0 to 255.
@@ -188,10 +201,10 @@ class RemoteRobot:
         began, networks = time.monotonic(), tuple(self._networks()) or (self._network,)
         logger.debug("%s is halted: %s", self.id, reason)
         if len(networks) == 1:
-            answers = [_stopped(self.id, networks[0])]
+            answers = [self._stopped_on(networks[0])]
         else:
             with ThreadPoolExecutor(len(networks), "fleet-halt") as pool:
-                answers = list(pool.map(lambda each: _stopped(self.id, each), networks))
+                answers = list(pool.map(self._stopped_on, networks))
         bearers = [(each, said) for each, said in zip(networks, answers, strict=True) if said is not None]
         verdicts = [
             verdict_of_answer(said, self.id if len(bearers) == 1 else f"{self.id} on {each.name}")
@@ -223,6 +236,19 @@ class RemoteRobot:
         finally:
             held, self._lease = self._lease, before
             held.release()
+
+    @property
+    def robots(self) -> Mapping[str, RobotOfWorld]:
+        """The robots of a world by name, each a robot like any other; else none.
+
+        Raises:
+            RefusalError: the world does not answer.
+        """
+        if not any(ROBOT_NAME in each.parameters.get("properties", {}) for each in self.verbs.values()):
+            return {}
+        named = self.status().get("robots")
+        names = [each for each in named if isinstance(each, str)] if isinstance(named, Mapping | list) else []
+        return {name: RobotOfWorld(self, name) for name in names[:ROBOTS_MAX]}
 
     def __getattr__(self, name: str) -> Callable[..., dict[str, Any]]:
         # Copying and pickling ask for underscore names before there is a description.
@@ -256,7 +282,7 @@ class RemoteRobot:
     def _describe(self) -> None:
         """Ask the network for the robot's verbs, and name the methods."""
         try:
-            description = RobotDescription.of(self._network.describe(self.id))
+            description = self._bounded(self._network.describe(self.address))
         except RefusalError as exc:
             logger.warning("%s: its verbs cannot be read: %s", self.id, exc)
             return
@@ -270,6 +296,18 @@ class RemoteRobot:
         }
         self._methods = {}
         self._description = description
+
+    def _bounded(self, functions: object) -> RobotDescription:
+        """Read what the network has of its verbs."""
+        return RobotDescription.of(functions)
+
+    def _sent(self, verb: VerbDescription | None, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Return the arguments as they are sent."""
+        del verb
+        return arguments
+
+    def _stopped_on(self, network: NetworkAdapter) -> object:
+        return _stopped(self.address, network)
 
     def rediscovered(self, found: FoundRobot, network: NetworkAdapter) -> None:
         """Take what a new discovery found; its verbs are read again when they are used."""
@@ -305,7 +343,7 @@ class RemoteRobot:
         if timeout is None:
             timeout = _patience(description, arguments)
         try:
-            answer: Envelope = self._network.call(self.id, verb, arguments, timeout)
+            answer: Envelope = self._network.call(self.address, verb, self._sent(description, arguments), timeout)
         except UnknownVerbError:
             raise self._unknown(verb) from None
         if is_error(answer):
@@ -314,7 +352,7 @@ class RemoteRobot:
 
     def _refuse_ambiguous(self, verb: str) -> None:
         networks = self._networks()
-        bearers = [each for each in networks if each.bears(self.id)] if len(networks) > 1 else ()
+        bearers = [each for each in networks if each.bears(self.address)] if len(networks) > 1 else ()
         if len(bearers) > 1:
             named = " and ".join(each.name for each in bearers)
             raise AmbiguousRobotError(
@@ -326,6 +364,57 @@ class RemoteRobot:
         called = ", ".join(name for name in self.verbs if python_name(name) == verb)
         remedy = f"Reach it by call(): {called}." if called else near(verb, named, "verbs")
         return UnknownVerbError(f"It has no verb {verb[:100]}", robot=self.id, verb=verb, remedy=remedy)
+
+
+class RobotOfWorld(RemoteRobot):
+    """One robot of a remote world, which is a robot like any other.
+
+    Args:
+        world: that has it.
+        name: in the world.
+    """
+
+    def __init__(self, world: RemoteRobot, name: str) -> None:
+        super().__init__(FoundRobot(f"{world.id}/{name}", world.type, name), world._network, world._networks)
+        self._world, self._name = world, name
+
+    @property
+    def address(self) -> str:
+        """The id of its world."""
+        return self._world.id
+
+    def state(self) -> dict[str, Any]:
+        """Return its measured state: ``joints`` by name."""
+        answer = super().state()
+        robots = answer.pop("robots", None)
+        joints = robots.get(self._name) if isinstance(robots, Mapping) else None
+        return {**answer, "joints": joints if isinstance(joints, Mapping) else {}}
+
+    def features(self) -> dict[str, Any]:
+        """Return its observations and actions with their units."""
+        answer = super().features()
+        robots = answer.pop("robots", None)
+        own = robots.get(self._name) if isinstance(robots, Mapping) else None
+        return {**answer, **(own if isinstance(own, Mapping) else {})}
+
+    def _bounded(self, functions: object) -> RobotDescription:
+        whole = super()._bounded(functions)
+        return replace(whole, verbs={name: verb for name, each in whole.verbs.items() if (verb := _of_one(each))})
+
+    def _sent(self, verb: VerbDescription | None, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+        named = verb is not None and ROBOT_NAME in self._world.verbs[verb.name].parameters.get("properties", {})
+        return {**arguments, ROBOT_NAME: self._name} if named else arguments
+
+    def _stopped_on(self, network: NetworkAdapter) -> object:
+        return _stopped(self.address, network, self._name)
+
+
+def _of_one(verb: VerbDescription) -> VerbDescription | None:
+    """Return a verb of a world as one robot has it; None for one of all robots."""
+    properties = dict(verb.parameters.get("properties", {}))
+    if properties.pop(ROBOT_NAME, None) is None and verb.kind == "motion":
+        return None
+    return replace(verb, parameters={**verb.parameters, "properties": properties})
 
 
 _RESERVED = frozenset(dir(RemoteRobot))
@@ -399,9 +488,9 @@ def combined(robot: str, verdicts: Sequence[StopVerdict], elapsed_ms: float) -> 
     )
 
 
-def _stopped(robot: str, network: NetworkAdapter) -> object:
+def _stopped(robot: str, network: NetworkAdapter, robot_name: str = "") -> object:
     try:
-        return network.stop(robot, STOP_S)
+        return network.stop(robot, STOP_S, robot_name)
     except NoSuchRobotError:
         return None
     except Exception as exc:  # noqa: BLE001 - a stop that fails is a verdict, whatever it raised

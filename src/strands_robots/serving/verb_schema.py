@@ -20,7 +20,7 @@ Labels = dict[str, str | list[str]]
 
 
 def labels_of(verb: Verb) -> Labels:
-    """Return the labels of a verb: direction, its robot's own or not, seconds to return."""
+    """Return the labels of a verb: direction, whose it is, seconds to return."""
     kind: Labels = {"direction": "read"} if verb.kind is Kind.READ else {"direction": "write"}
     if verb.kind is not Kind.READ and verb.critical:
         kind["safety"] = "critical"
