@@ -195,13 +195,13 @@ def near(wanted: str, names: Iterable[str]) -> str:
 
 
 def fitting(rows: Iterable[T], most: int) -> list[T]:
-    """Return the first rows whose JSON is within so many bytes together."""
-    kept, size = list[T](), 0
+    """Return the rows whose JSON is within so many bytes together, the first ones first."""
+    kept, left = list[T](), most
     for each in rows:
-        size += len(json.dumps(each)) + 2
-        if size > most:
-            break
-        kept.append(each)
+        size = len(json.dumps(each)) + 2
+        if size <= left:
+            left -= size
+            kept.append(each)
     return kept
 
 
