@@ -15,6 +15,7 @@ from strands_robots.cli.network import Network
 from strands_robots.device_connect.backends import loopback_config
 from strands_robots.device_connect.discovery import Peer
 from strands_robots.envelope import Envelope, success
+from strands_robots.serving.advertised import AdvertisedVerb, find_verb
 
 Run = Callable[..., Result]
 
@@ -42,6 +43,12 @@ class FakeFleet:
 
     def peers(self, timeout: float = 2.0) -> list[Peer]:
         return self.found
+
+    def describe(self, device: str, timeout: float = 1.0) -> Peer:
+        return next((peer for peer in self.found if peer.id == device), Peer(device))
+
+    def verb(self, device: str, name: str) -> AdvertisedVerb | None:
+        return find_verb(self.describe(device).functions, name)
 
     def call(self, *called: Any) -> Envelope:
         self.called.append(called)

@@ -147,3 +147,72 @@ def test_signatures_and_encoded_bytes_are_for_programs_alone(run: Run, fleet: Fa
     assert f"<{len(picture)} characters, shown by --json>" in said
     assert "of_a_file_whose_name_is_no_signature_though_it_is_long" in said
     assert json.loads(run("call", "arm-1", "getStatus", "--json").stdout) == fleet.answer
+
+
+BREW = {
+    "name": "brewCoffee",
+    "description": "Brew coffee.",
+    "parameters": {
+        "properties": {
+            "cups": {"type": "integer", "minimum": 1, "maximum": 8, "unit": "cups"},
+            "label": {"type": "string"},
+            "strength": {"enum": ["mild", "strong"]},
+            "recipe": {"type": "object"},
+            "lease_id": {"type": "string"},
+        },
+        "required": ["cups"],
+    },
+    "labels": {"direction": "write", "own": "true", "lasts_s": "90"},
+}
+
+
+def barista() -> Peer:
+    return Peer("bar-1", "strands_robot", functions=(BREW, {"name": "resume"}))
+
+
+def test_call_sends_what_the_description_says_and_waits_as_long_as_the_verb_lasts(run: Run, fleet: FakeFleet) -> None:
+    fleet.found = [barista()]
+    given = ("cups=5", "label=5", "strength=mild", 'recipe={"milk": 1}', "lease_id=12")
+    assert run("call", "bar-1", "brewCoffee", *given).exit_code == 0
+    sent = {"cups": 5, "label": "5", "strength": "mild", "recipe": {"milk": 1}, "lease_id": "12"}
+    assert fleet.called == [("bar-1", "brewCoffee", sent, 100.0)]
+
+
+@pytest.mark.parametrize(
+    ("argument", "said"),
+    [
+        ("cups=nine", "cups must be a whole number"),
+        ("cups=9", "cups must be 1 to 8 cups"),
+        ("strength=weak", "mild, strong"),
+        ("recipe=[1]", "recipe must be an object as JSON"),
+        ("sugar=1", "its arguments: cups, label, strength, recipe"),
+    ],
+)
+def test_argument_that_does_not_fit_the_description_is_exit_2(
+    run: Run, fleet: FakeFleet, argument: str, said: str
+) -> None:
+    fleet.found = [barista()]
+    result = run("call", "bar-1", "brewCoffee", argument)
+    assert result.exit_code == 2
+    assert said in result.stderr
+    assert fleet.called == []
+
+
+@pytest.mark.parametrize("function", ["getStatus", "listCameras", "stop", "stopMotion"])
+def test_quick_call_asks_for_no_description(
+    run: Run, fleet: FakeFleet, function: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr(FakeFleet, "describe")
+    assert run("call", "arm-1", function).exit_code == 0
+    assert fleet.called == [("arm-1", function, {}, 10.0)]
+
+
+def test_call_without_a_function_lists_them_with_their_domains(run: Run, fleet: FakeFleet) -> None:
+    fleet.found = [barista(), Peer("echo-1", functions=({"name": "echo"}, {"name": "\x1b[2J", "parameters": 5}))]
+    said = run("call", "bar-1").stdout
+    assert "brewCoffee (its own)" in said
+    assert "cups: integer, 1 to 8 cups; [label: string]; [strength: mild | strong]" in said
+    assert "lease_id" not in said
+    bare = run("peers", "echo-1").stdout
+    assert "This device has no lock, no lease and no stop." in bare
+    assert "\x1b" not in bare

@@ -31,9 +31,9 @@ from strands_robots.safety.sightings import sightings
 ORIGIN = "http://127.0.0.1:8800"
 PASSPHRASE = "Plenty of 4 different words"
 FORMS = (
-    {"name": "execute", "kind": "motion", "summary": "", "parameters": []},
-    {"name": "getPose", "kind": "read", "summary": "", "parameters": []},
-    {"name": "getPicture", "kind": "read", "summary": "", "parameters": []},
+    {"name": "execute", "kind": "motion", "lasts_s": 0.0, "summary": "", "parameters": []},
+    {"name": "getPose", "kind": "read", "lasts_s": 0.0, "summary": "", "parameters": []},
+    {"name": "getPicture", "kind": "read", "lasts_s": 0.0, "summary": "", "parameters": []},
 )
 
 

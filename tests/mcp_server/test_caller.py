@@ -13,6 +13,7 @@ from strands_robots.device_connect.client import DeviceTimeoutError, NoSuchDevic
 from strands_robots.envelope import Envelope, error, is_error, success, text_of
 from strands_robots.mcp import caller as module
 from strands_robots.mcp.caller import Caller
+from strands_robots.serving.advertised import AdvertisedVerb, find_verb
 
 RUNNING = success("under way", task_id="moveTo-1", task_status="running")
 
@@ -185,3 +186,68 @@ async def test_client_that_moves_a_robot_acquires_it_by_the_secret_of_its_motion
     assert fleet.sent("acquireControl")["lease_id"] == fleet.sent("moveTo")["lease_id"]
     go_on.set()
     assert not is_error(await motion)
+
+
+def own_verb(name: str = "brewCoffee", *leases: str, **more: Any) -> AdvertisedVerb:
+    properties = {each: {"type": "string"} for each in ("cups", *leases)}
+    labels = {"direction": "write", "own": "true", "lasts_s": "90"}
+    found = find_verb([{"name": name, "parameters": {"properties": properties}, "labels": labels, **more}], name)
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize("leases", [("lease_id", "lease_ttl_s"), ()])
+async def test_own_verb_carries_the_lease_that_it_takes_and_is_waited_for(
+    leases: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fleet, waits = FakeFleet(brewCoffee=success("brewed")), list[float]()
+    call = fleet.call_async
+
+    async def timed(robot: str, verb: str, params: Mapping[str, Any], within: float) -> Envelope:
+        waits.append(within)
+        return await call(robot, verb, params, within)
+
+    monkeypatch.setattr(fleet, "call_async", timed)
+    answer = await client_of(fleet).act("bar-1", own_verb("brewCoffee", *leases), {"cups": 2})
+    assert text_of(answer) == "brewed"
+    assert set(fleet.sent("brewCoffee")) == {"cups", *leases}
+    assert waits == [100.0]
+    assert fleet.stops == 0
+
+
+async def test_held_lease_goes_with_no_verb_that_does_not_take_it() -> None:
+    fleet = FakeFleet(
+        brewCoffee=success("brewed"),
+        acquireControl=success("held", lease_id="secret", robot_name=""),
+        getStatus=success("idle"),
+        renewControl=success("renewed"),
+    )
+    client = client_of(fleet)
+    await client.acquire("bar-1", 60.0, "")
+    await client.act("bar-1", own_verb(), {})
+    assert fleet.sent("brewCoffee") == {}
+    await client.act("bar-1", own_verb("brewCoffee", "lease_id"), {})
+    assert fleet.sent("brewCoffee") == {"lease_id": "secret"}
+
+
+async def test_motion_that_goes_on_after_its_answer_is_followed_to_its_end() -> None:
+    fleet = FakeFleet(brewCoffee=RUNNING, getStatus=success("over", task_status="completed"))
+    answer = await client_of(fleet).act("bar-1", own_verb("brewCoffee", "lease_id"), {})
+    assert text_of(answer) == "under way"
+    assert [verb for verb, _ in fleet.calls] == ["brewCoffee", "getStatus"]
+
+
+async def test_own_verb_whose_call_is_cancelled_is_halted(monkeypatch: pytest.MonkeyPatch) -> None:
+    fleet, begun = FakeFleet(), asyncio.Event()
+
+    async def hangs(robot: str, verb: str, params: Mapping[str, Any], within: float) -> Envelope:
+        begun.set()
+        await asyncio.Event().wait()
+        raise AssertionError
+
+    monkeypatch.setattr(fleet, "call_async", hangs)
+    acting = asyncio.ensure_future(client_of(fleet).act("bar-1", own_verb(), {"robot_name": ["no name"]}))
+    await begun.wait()
+    acting.cancel()
+    await asyncio.wait([acting])
+    assert fleet.stops >= 1

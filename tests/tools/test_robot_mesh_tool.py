@@ -12,6 +12,7 @@ import pytest
 from fixtures.mesh_robots import Arm, World
 from fixtures.waiting import eventually
 
+from strands_robots.device_connect.discovery import Peer
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.mesh import init_mesh, safety
 from strands_robots.mesh.session import clear_peers
@@ -19,6 +20,7 @@ from strands_robots.mesh.transport import zenoh_config
 from strands_robots.mesh.transport.zenoh_config import Posture
 from strands_robots.safety import stop_roster
 from strands_robots.safety.roster import Roster
+from strands_robots.serving.advertised import AdvertisedVerb, find_verb
 from strands_robots.tools import networks, robot_mesh
 from strands_robots.tools.mesh_roster import mesh_network
 from strands_robots.tools.networks import DeviceConnect, NativeMesh
@@ -391,3 +393,67 @@ def test_missing_strands_agents_names_the_extra_in_one_sentence() -> None:
     output = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout
     assert "'.[agent]'" in output
     assert len(output.splitlines()) == 1
+
+
+BREW = {
+    "name": "brewCoffee",
+    "description": "Brew coffee.",
+    "parameters": {"properties": {"cups": {"type": "integer", "minimum": 1, "maximum": 8}}, "required": ["cups"]},
+    "labels": {"direction": "write", "own": "true", "lasts_s": "90"},
+}
+
+
+class FakeFleet:
+    """A connection to one robot with a verb of its own, and to a device that is none of ours."""
+
+    stale = ""
+
+    def __init__(self) -> None:
+        self.called: list[tuple[Any, ...]] = []
+
+    def peers(self) -> list[Peer]:
+        ours = tuple({"name": name} for name in ("resume", "acquireControl", "stop"))
+        return [Peer("bar-1", functions=(BREW, *ours)), Peer("echo-1", functions=({"name": "echo"},))]
+
+    def verb(self, device: str, name: str) -> AdvertisedVerb | None:
+        return find_verb([BREW], name)
+
+    def call(self, *called: Any) -> Envelope:
+        self.called.append(called)
+        return success("done")
+
+
+@pytest.fixture
+def fleet(monkeypatch: pytest.MonkeyPatch) -> FakeFleet:
+    fake = FakeFleet()
+    monkeypatch.setattr(networks, "network", DeviceConnect)
+    monkeypatch.setattr(networks, "_on_fleet", lambda work: work(fake))
+    return fake
+
+
+def test_own_verb_is_called_with_its_arguments_for_as_long_as_it_lasts(fleet: FakeFleet) -> None:
+    robot_mesh(action="call", target="bar-1", verb="brewCoffee", arguments={"cups": 2})
+    robot_mesh(action="call", target="bar-1", verb="ownUnknown")
+    assert fleet.called == [("bar-1", "brewCoffee", {"cups": 2}, 125.0), ("bar-1", "ownUnknown", {}, 35.0)]
+
+
+def test_peers_name_own_verbs_with_their_parameters_and_devices_that_cannot_be_stopped(fleet: FakeFleet) -> None:
+    bar, echo = robot_mesh(action="peers")["peers"]
+    assert bar["functions"] == ["brewCoffee", "resume", "acquireControl", "stop"]
+    assert bar["own_verbs"] == {"brewCoffee": "(cups: integer, 1 to 8) Brew coffee."}
+    assert "note" not in bar
+    assert echo["note"] == "This device has no lock, no lease and no stop."
+
+
+def test_own_verbs_of_a_mesh_peer_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    row = {
+        "peer_id": "bar-1",
+        "type": "robot",
+        "reachable": True,
+        "robot_kind": "robot",
+        "own_verbs": ["brewCoffee", 5],
+    }
+    monkeypatch.setattr(networks, "_on_mesh", lambda work: work(SimpleNamespace(peers=[row])))
+    monkeypatch.setattr(networks, "discover", lambda mesh: None)
+    (bar,) = NativeMesh().peers()["peers"]
+    assert "moveTo" in bar["functions"] and bar["functions"][-1] == "brewCoffee"

@@ -137,8 +137,9 @@ def describe(link: LinkConfig) -> str:
     return f"Zenoh: {'; '.join(ways)}; {proof}."
 
 
-def call_device(fleet: FleetClient, device: str, function: str, params: Mapping[str, Any], seconds: float) -> Envelope:
-    """Call a function of a device and return its answer.
+@contextmanager
+def answering(fleet: FleetClient, device: str) -> Iterator[None]:
+    """Ask a device while the block runs.
 
     Raises:
         CliError: no such device or no answer (exit code 3), or the call was refused as such (exit code 1).
@@ -150,32 +151,43 @@ def call_device(fleet: FleetClient, device: str, function: str, params: Mapping[
     )
 
     try:
-        return fleet.call(device, function, params, seconds)
+        yield
     except NoSuchDeviceError as exc:
         raise CliError(plain(f"{exc.args[0]}{near_devices(fleet, device)}", 2000), Exit.SILENT) from exc
     except DeviceTimeoutError as exc:
         raise CliError(plain(exc.args[0], 2000), Exit.SILENT) from exc
     except CallRefusedError as exc:
-        known = [peer.functions for peer in fleet.peers(1.0) if peer.id == device] if exc.code == NO_METHOD else []
-        near = _near(function, [str(each.get("name", "")) for functions in known for each in functions])
-        said = f"{str(exc).rstrip('.')}.{near}" if near else str(exc)
-        raise CliError(plain(said, 2000), Exit.REFUSED, jsonrpc_code=exc.code) from exc
+        raise CliError(plain(str(exc), 2000), Exit.REFUSED, jsonrpc_code=exc.code) from exc
+
+
+def call_device(fleet: FleetClient, device: str, function: str, params: Mapping[str, Any], seconds: float) -> Envelope:
+    """Call a function of a device and return its answer; raises as :func:`answering`."""
+    try:
+        with answering(fleet, device):
+            return fleet.call(device, function, params, seconds)
+    except CliError as failure:
+        if failure.fields.get("jsonrpc_code") == NO_METHOD and (near := near_verbs(fleet, device, function)):
+            said = plain(f"{failure.reason.rstrip('.')}.{near}", 2000)
+            raise CliError(said, failure.code, **failure.fields) from failure
+        raise
+
+
+def near_verbs(fleet: FleetClient, device: str, function: str) -> str:
+    """Return a sentence with the verbs of a device that resemble an absent one."""
+    from strands_robots.serving.advertised import near, verb_names  # noqa: PLC0415 - only a refusal needs it
+
+    try:
+        return near(function, verb_names(fleet.describe(device).functions))
+    except (LookupError, TimeoutError, RuntimeError):
+        return ""
 
 
 def near_devices(fleet: FleetClient, device: str) -> str:
     """Return a sentence with the ids that resemble an absent one."""
+    from strands_robots.serving.advertised import near  # noqa: PLC0415 - only a name that is not there needs it
+
     names = [peer.id for peer in fleet.peers(1.0)]
-    return "" if device in names else _near(device, names)
-
-
-def _near(wanted: str, names: list[str]) -> str:
-    """Return a sentence with the names that resemble ``wanted``, else with all."""
-    import difflib  # noqa: PLC0415 - only a name that is not there needs it
-
-    alike = difflib.get_close_matches(wanted, names, n=3, cutoff=0.5)
-    if alike:
-        return f" Near it: {', '.join(alike)}."
-    return f" There {'is' if len(names) == 1 else 'are'}: {', '.join(sorted(names))}." if names else ""
+    return "" if device in names else near(device, names)
 
 
 def temporary_mesh_id(name: str) -> str:

@@ -1,9 +1,8 @@
-"""``peers``: list the robots on the network. ``call``: call one function of a robot."""
+"""``peers``: list robots, and what they can do. ``call``: call a robot's verb."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -11,14 +10,18 @@ import typer
 from rich.text import Text
 
 from strands_robots.cli.command import OnMesh, Timeout, assignments, command
-from strands_robots.cli.network import SOURCE, Network, call_device, describe
-from strands_robots.cli.output import LATE_S, CliError, Exit, Screen, first_line, label, plain, readable, table
+from strands_robots.cli.network import SOURCE, Network, answering, call_device, describe
+from strands_robots.cli.output import LATE_S, CliError, Exit, Screen, label, plain, readable, table
 from strands_robots.cli.readiness import other_user
 from strands_robots.envelope import is_error, text_of
-from strands_robots.utils import WAIT_S, device_id, number
+from strands_robots.utils import WAIT_S, ValidationError, device_id, number
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from strands_robots.device_connect import FleetClient
     from strands_robots.device_connect.discovery import Peer
+    from strands_robots.serving.advertised import AdvertisedVerb
 
 
 CALL_S = 10.0
@@ -72,7 +75,7 @@ def call(
     network: Network,
     *,
     device: Annotated[str, typer.Argument(help="The device's id.")],
-    function: Annotated[str, typer.Argument(help="Such as getStatus.")],
+    function: Annotated[str | None, typer.Argument(help="Such as getStatus; without one, list them.")] = None,
     arguments: Annotated[list[str] | None, typer.Argument(metavar="KEY=VALUE...")] = None,
     timeout: Annotated[
         float | None,
@@ -81,19 +84,33 @@ def call(
     source: Annotated[str, typer.Option("--as", help="Name of the caller that goes with the call.")] = SOURCE,
     on_mesh: OnMesh = False,
 ) -> None:
-    """Call a function of a device. A value is read as JSON where that is possible, else as text."""
-    params = assignments(arguments or [])
+    """Call a function of a device, or list its functions.
+
+    A value is read as the function's description has it; without one as JSON where that is possible, else as text.
+    """
+    given = arguments or []
+    params = assignments(given)
+    stated = None if timeout is None else number("--timeout", timeout, above=0, high=3600)
     whose = ""
-    seconds = number("--timeout", _usual_wait(function) if timeout is None else timeout, above=0, high=3600)
     if on_mesh:
         from strands_robots.tools.networks import NativeMesh  # noqa: PLC0415 - loaded when a network is used
 
+        if function is None:
+            raise CliError("call --mesh takes a function, such as status.", Exit.USAGE)
         network.use_mesh()
-        answer = NativeMesh().call(device, function, params, seconds)
+        answer = NativeMesh().call(device, function, params, stated or _usual_wait(function))
     else:
         with network.fleet(source) as fleet:
             whose = other_user(fleet.link)
             try:
+                if function is None:
+                    _list_functions(screen, fleet, device)
+                    return
+                with answering(fleet, device):
+                    verb = fleet.verb(device, function) if given or not _quick(function) else None
+                if verb is not None:
+                    params = _typed(verb, given, params)
+                seconds = stated or _usual_wait(function) + (verb.lasts_s if verb is not None else 0.0)
                 answer = call_device(fleet, device, function, params, seconds)
             except CliError as failure:
                 raise CliError(f"{failure.reason} {whose}".rstrip(), failure.code, **failure.fields) from failure
@@ -107,14 +124,45 @@ def call(
             screen.say(f"  {key}: {value if isinstance(value, str) else json.dumps(value, default=str)}")
 
 
+def _quick(function: str) -> bool:
+    """Return True for a read or a stop, which is known to be answered at once."""
+    return function.startswith(("get", "list", "stop"))
+
+
 def _usual_wait(function: str) -> float:
     """Return the seconds to wait for a function's answer."""
-    if function.startswith(("get", "list", "stop")):
+    if _quick(function):
         return CALL_S
     from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS  # noqa: PLC0415 - saves its import elsewhere
 
     verb = ARM_MOTION_VERBS.get(function)
     return MOTION_S if verb is not None and verb.lasts else CALL_S
+
+
+def _typed(verb: AdvertisedVerb, given: Sequence[str], params: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the arguments with the types that a function's description states.
+
+    Raises:
+        ValidationError: naming an argument that it does not have, or a value that does not fit.
+    """
+    from strands_robots.serving.advertised import typed  # noqa: PLC0415 - loaded when a network is used
+    from strands_robots.serving.verbs import LEASE_ID  # noqa: PLC0415 - as above
+
+    unknown = verb.unknown(name for name in params if name not in verb.leases)
+    if unknown:
+        raise ValidationError(unknown)
+    texts, known = dict(each.split("=", 1) for each in given), verb.by_name
+    # A lease may consist of digits alone, and is a text all the same.
+    leased = {LEASE_ID: texts[LEASE_ID]} if LEASE_ID in texts else {}
+    given_types = {name: typed(known[name], value, texts[name]) for name, value in params.items() if name in known}
+    return {**params, **given_types, **leased}
+
+
+def _list_functions(screen: Screen, fleet: FleetClient, device: str) -> None:
+    with answering(fleet, device):
+        peer = fleet.describe(device, CALL_S)
+    screen.data({"status": "success", "device": peer.id, "functions": peer.functions})
+    _show_functions(screen, peer)
 
 
 def _facts(peer: Peer) -> dict[str, Any]:
@@ -131,14 +179,13 @@ def _age(peer: Peer) -> Text:
 
 
 def _show_functions(screen: Screen, peer: Peer) -> None:
-    rows = []
-    for each in peer.functions:
-        properties = (each.get("parameters") or {}).get("properties") or {}
-        parameters = ", ".join(f"{name}: {_type_name(schema)}" for name, schema in properties.items())
-        rows.append((each.get("name", ""), parameters, first_line(each.get("description"))))
+    from strands_robots.serving.advertised import absent_safety, verbs_of  # noqa: PLC0415 - loaded when a network is used
+
+    rows = [
+        (f"{each.name} (its own)" if each.own else each.name, each.takes, each.summary)
+        for each in verbs_of(peer.functions)
+    ]
     screen.show(table(f"{plain(peer.id)}, last heard {_age(peer)}", ("function", "parameters", "what it does"), rows))
+    if absent := absent_safety(peer.functions):
+        screen.say(absent, "yellow")
     screen.say(f"Events: {', '.join(peer.events)}")
-
-
-def _type_name(schema: object) -> str:
-    return str(schema.get("type", "any")) if isinstance(schema, Mapping) else "any"

@@ -331,7 +331,7 @@ class PageSession:
         if form["kind"] != "read":
             self._may_drive()
             params = {**params, **self._control.lease(key)}
-        return await feed.call(robot, verb, params, CALL_S + WAIT_S)
+        return await feed.call(robot, verb, params, CALL_S + WAIT_S + form["lasts_s"])
 
     def _note_halt(self, network: str, robot: str, stopped: bool | None) -> None:
         client = self._socket.client

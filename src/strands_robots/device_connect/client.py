@@ -14,15 +14,15 @@ import time
 import uuid
 from collections.abc import Callable, Collection, Coroutine, Generator, Mapping
 from concurrent.futures import Future
-from dataclasses import dataclass
-from typing import Any, Self, TypeVar
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 from device_connect_edge.messaging.exceptions import MessagingError, RequestTimeoutError
 
 from strands_robots.bounded_json import LONG_MAX, json_object
 from strands_robots.device_connect.backends import LinkConfig, open_client
 from strands_robots.device_connect.backends.base import NoResponderError
-from strands_robots.device_connect.discovery import HEARTBEATS_S, Discovery, Peer, parts
+from strands_robots.device_connect.discovery import DESCRIBE_S, HEARTBEATS_S, Discovery, Peer, parts
 from strands_robots.device_connect.enrollment import network_of
 from strands_robots.device_connect.shutdown import LOOP_JOIN_TIMEOUT_S
 from strands_robots.envelope import Envelope, error
@@ -32,7 +32,13 @@ from strands_robots.safety.statements import Purpose
 from strands_robots.safety.stopping import Outcome, explain, grade
 from strands_robots.utils import ValidationError, device_id, finite, shown, text
 
+if TYPE_CHECKING:
+    from strands_robots.serving.advertised import AdvertisedVerb
+
 T = TypeVar("T")
+
+STOPPING = frozenset({"stop", "stopMotion", "emergencyStop", "releaseTorque"})
+"""Functions that take energy away."""
 
 COLLECT_MARGIN_S = 3.0
 """Seconds that a discovery may last beyond its own deadline, on a loaded machine."""
@@ -168,6 +174,28 @@ class FleetClient:
             MessagingError: the network cannot carry the call.
         """
         return self.run(self._call(device, function, dict(params or {}), timeout), timeout + 3.0)
+
+    def describe(self, device: str, timeout: float = DESCRIBE_S) -> Peer:
+        """Have a device describe itself; raises as :meth:`call`."""
+        described = self.call(device, "requestRegistration", {}, timeout)
+        return replace(Peer.of(described), heard_at=time.monotonic())
+
+    def verb(self, device: str, name: str) -> AdvertisedVerb | None:
+        """Return a verb as its device describes it, None where it does not do so in time.
+
+        What stops a robot is not asked about, so that it waits for no description.
+
+        Raises:
+            NoSuchDeviceError: no device has the id ``device``.
+        """
+        from strands_robots.serving.advertised import find_verb  # noqa: PLC0415 - loaded when it is used
+
+        if name in STOPPING:
+            return None
+        try:
+            return find_verb(self.describe(device).functions, name)
+        except (TimeoutError, RuntimeError):
+            return None
 
     def call_each(
         self, calls: Mapping[str, Mapping[str, Any]], function: str, timeout: float = 10.0

@@ -121,14 +121,13 @@ class Peer:
         """Read a presence message or a registration; a field that it lacks is empty."""
         identity, status = _object(description, "identity"), _object(description, "status")
         capabilities = _object(description, "capabilities")
-        functions = [each for each in capabilities.get("functions") or () if isinstance(each, Mapping)]
-        events = [each for each in capabilities.get("events") or () if isinstance(each, Mapping)]
+        functions, events = _objects(capabilities, "functions"), _objects(capabilities, "events")
         return cls(
             id=str(description.get("device_id", "")),
             type=str(identity.get("device_type", "")),
             model=str(identity.get("model") or ""),
             status=status,
-            functions=tuple(functions),
+            functions=functions,
             events=tuple(str(each.get("name", "")) for each in events),
             location=str(status.get("location") or ""),
         )
@@ -421,3 +420,8 @@ def parts(subject: str) -> list[str]:
 def _object(message: Mapping[str, Any], key: str) -> Mapping[str, Any]:
     value = message.get(key)
     return value if isinstance(value, Mapping) else {}
+
+
+def _objects(message: Mapping[str, Any], key: str) -> tuple[Mapping[str, Any], ...]:
+    values = message.get(key)
+    return tuple(each for each in values if isinstance(each, Mapping)) if isinstance(values, list) else ()

@@ -17,7 +17,7 @@ import secrets
 import time
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeGuard
 
 from mcp.server.mcpserver import Context
 from mcp.types import (
@@ -35,6 +35,7 @@ from strands_robots.mcp.access import ClientAccess
 from strands_robots.mcp.results import jpeg_of, result
 from strands_robots.safety.approval import Approval, Grants, digest, state_dir
 from strands_robots.safety.state_files import StateFileError
+from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS
 from strands_robots.utils import ValidationError
 
 logger = logging.getLogger(__name__)
@@ -47,6 +48,12 @@ ASKED_S = 300.0
 
 ASKED_MAX = 64
 FULL_SPEED = "2 rad/s a joint"
+KNOWN = frozenset({"execute", "acquireControl", *ARM_MOTION_VERBS})
+"""Verbs of which the question can say how far and how fast they move."""
+
+SHOWN_MAX = 600
+"""Characters of a motion's arguments that the question shows."""
+
 KEY = "approval"
 WITHOUT_PARTS = "2026-07-28"
 """The first revision in which a question is a result, and its answer comes with the call anew."""
@@ -173,12 +180,15 @@ async def _question(access: ClientAccess, robot: str, verb: str, params: Mapping
     named = {name: params[name] for name in ("robot_name",) if name in params}
     pose = await access.caller.read(robot, "getPose", named)
     seen = await access.caller.read(robot, "getPicture", {"width": 640, "height": 480})
-    asked = {name: value for name, value in params.items() if name not in {"speed", "wait"}}
+    # Of a verb of the robot's own nothing is known, so that all of it is shown.
+    told = {"speed", "wait"} if verb in KNOWN else set[str]()
+    asked = json.dumps({name: value for name, value in params.items() if name not in told}, default=str)
+    cut = f"... ({len(asked)} characters)" if len(asked) > SHOWN_MAX else ""
     lines = [
         f"Let the real robot {json.dumps(robot)} move?",
-        f"What: {verb} {json.dumps(asked, default=str)[:600]}",
+        f"What: {verb} {asked[:SHOWN_MAX]}{cut}",
         f"How far: {_how_far(verb, params, pose)}",
-        f"How fast: {_how_fast(params)}",
+        f"How fast: {_how_fast(verb, params)}",
     ]
     return "\n".join(lines), jpeg_of(seen) or ""
 
@@ -186,16 +196,18 @@ async def _question(access: ClientAccess, robot: str, verb: str, params: Mapping
 def _how_far(verb: str, params: Mapping[str, Any], pose: Envelope) -> str:
     if verb == "acquireControl":
         return "nothing yet; it is kept from other programs, and each motion is asked about"
-    if verb == "moveBy":
-        offset = [params.get(name, 0.0) for name in ("dx", "dy", "dz")]
+    if verb not in KNOWN:
+        return "not known before; it is a verb of the robot's own"
+    offset = [params.get(name, 0.0) for name in ("dx", "dy", "dz")]
+    if verb == "moveBy" and all(map(_is_number, offset)):
         return f"the tip by {math.hypot(*offset) * 1000:.0f} mm"
     tip = [pose.get(name) for name in "xyz"]
     goal = [params.get(name) for name in "xyz"]
-    if all(isinstance(each, int | float) for each in (*tip, *goal)):
+    if all(map(_is_number, (*tip, *goal))):
         return f"the tip by {math.dist(tip, goal) * 1000:.0f} mm"  # type: ignore[arg-type]
     joints, now = params.get("joints"), pose.get("joints")
     if isinstance(joints, Mapping) and isinstance(now, Mapping):
-        turns = [abs(to - now[name]) for name, to in joints.items() if isinstance(now.get(name), int | float)]
+        turns = [abs(to - now[name]) for name, to in joints.items() if _is_number(to) and _is_number(now.get(name))]
         if turns:
             return f"a joint by up to {max(turns):.0f} degrees"
     if verb == "setGripper":
@@ -203,9 +215,16 @@ def _how_far(verb: str, params: Mapping[str, Any], pose: Envelope) -> str:
     return "not known before; anywhere within its reach"
 
 
-def _how_fast(params: Mapping[str, Any]) -> str:
-    if "speed" in params:
-        return f"up to {params['speed'] * 100:.0f} % of full speed, {FULL_SPEED}"
-    if "duration" in params:
-        return f"up to full speed, {FULL_SPEED}, for at most {params['duration']:g} s"
+def _how_fast(verb: str, params: Mapping[str, Any]) -> str:
+    if verb not in KNOWN:
+        return "not known before"
+    speed, lasts = params.get("speed"), params.get("duration")
+    if _is_number(speed):
+        return f"up to {speed * 100:.0f} % of full speed, {FULL_SPEED}"
+    if _is_number(lasts):
+        return f"up to full speed, {FULL_SPEED}, for at most {lasts:g} s"
     return f"up to full speed, {FULL_SPEED}"
+
+
+def _is_number(value: object) -> TypeGuard[int | float]:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

@@ -22,7 +22,8 @@ from strands_robots.envelope import Envelope, error, is_error, success, text_of
 from strands_robots.mcp.queries import NoTurnError, Queries
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.safety.stopping import Outcome, grade
-from strands_robots.serving.verbs import LEASE_ID, LEASE_TTL_S, TTL_MAX_S, TTL_MIN_S
+from strands_robots.serving.advertised import AdvertisedVerb, find_verb
+from strands_robots.serving.verbs import LEASE_ID, LEASE_NAMES, LEASE_TTL_S, TTL_MAX_S, TTL_MIN_S
 from strands_robots.tools.networks import stop_and_lock, stop_everything
 from strands_robots.utils import ValidationError, number
 
@@ -91,20 +92,29 @@ class Caller:
         """Note a call of the client; it is there, so its leases are renewed."""
         self._used_at = time.monotonic()
 
-    async def read(self, robot: str, verb: str, params: Mapping[str, Any] | None = None) -> Envelope:
-        """Call a verb that moves nothing."""
+    async def read(
+        self, robot: str, verb: str, params: Mapping[str, Any] | None = None, lasts_s: float = 0.0
+    ) -> Envelope:
+        """Call a verb that moves nothing, and may last so long."""
         try:
-            return await self._call(robot, verb, params or {}, ANSWER_S)
+            return await self._call(robot, verb, params or {}, ANSWER_S + lasts_s)
         except DeviceTimeoutError as exc:
             return error(str(exc))
 
-    async def query(self, robot: str, verb: str, params: Mapping[str, Any] | None = None) -> Envelope:
+    async def query(
+        self, robot: str, verb: str, params: Mapping[str, Any] | None = None, lasts_s: float = 0.0
+    ) -> Envelope:
         """Do as :meth:`read`, in the client's turn: no burst of reads fills the robot."""
         try:
             async with self._queries.turn(robot, ANSWER_S):
-                return await self.read(robot, verb, params)
+                return await self.read(robot, verb, params, lasts_s)
         except NoTurnError as refused:
             return error(str(refused))
+
+    async def describe(self, robot: str) -> Peer | Envelope:
+        """Return a robot as it describes itself now, or why it does not."""
+        description = await self.read(robot, "requestRegistration")
+        return description if is_error(description) else Peer.of(description)
 
     async def move(self, robot: str, verb: str, params: Mapping[str, Any], *, wait: bool) -> Envelope:
         """Carry out a motion of an arm; a call that is given up halts it.
@@ -142,6 +152,22 @@ class Caller:
                 if not runs(answer, one):
                     break
             return answer
+
+        return await self._halting(target, lease, to_the_end)
+
+    async def act(self, robot: str, verb: AdvertisedVerb, params: Mapping[str, Any]) -> Envelope:
+        """Carry out a verb as the robot describes it, to its end; halted as :meth:`move`."""
+        target = await self._target(robot, params)
+        lease = self._lease_of(target, verb.leases)
+
+        async def to_the_end(motion: _Halting) -> Envelope:
+            answer = await motion.begin(verb.name, {**params, **lease}, ANSWER_S + verb.lasts_s)
+            status = answer
+            # Where its answer says that it goes on, as that of a drive does, the end is waited for.
+            while verb.leases and not is_error(status) and runs(status, ""):
+                await asyncio.sleep(POLL_S)
+                status = await self._followed(robot, "getStatus", {}, ANSWER_S)
+            return status if is_error(status) else answer
 
         return await self._halting(target, lease, to_the_end)
 
@@ -262,7 +288,8 @@ class Caller:
 
     async def _target(self, robot: str, params: Mapping[str, Any], *, leased: bool = False) -> Target:
         """Return the robot that is meant, of a world the first where none is named."""
-        name = params.get("robot_name", "")
+        stated = params.get("robot_name", "")
+        name = stated if isinstance(stated, str) else ""
         if name or not (leased or any(each == robot for each, _ in self._leases)):
             return robot, name
         if robot not in self._first:
@@ -297,28 +324,22 @@ class Caller:
 
     async def _for_motion(self, target: Target, verb: str) -> dict[str, Any]:
         """Return the held lease, or one for this motion where the robot knows such."""
+        if (robot := target[0], verb) not in self._binding and not self._lease(target):
+            description = await self.describe(robot)
+            published = find_verb(description.functions, verb) if isinstance(description, Peer) else None
+            if isinstance(description, Peer) and LEASE_TTL_S not in (published.leases if published else ()):
+                return {}
+            # One that did not answer is asked again.
+            if published is not None:
+                self._binding.add((robot, verb))
+        return self._lease_of(target, LEASE_NAMES)
+
+    def _lease_of(self, target: Target, takes: frozenset[str]) -> dict[str, Any]:
+        """Return the held lease, or one for this motion, as far as the verb takes it."""
         held = self._lease(target)
-        if held or not await self._binds(target[0], verb):
-            return held
-        return {LEASE_ID: self._secret(target[0]), LEASE_TTL_S: SILENCE_S}
-
-    async def _binds(self, robot: str, verb: str) -> bool:
-        """Return whether a robot's verb is published to take a motion's lease.
-
-        True where the robot does not answer.
-        """
-        if (robot, verb) in self._binding:
-            return True
-        description = await self.read(robot, "requestRegistration")
-        if is_error(description):
-            return True
-        functions = Peer.of(description).functions
-        published = next((each.get("parameters") for each in functions if each.get("name") == verb), None)
-        names = published.get("properties") if isinstance(published, Mapping) else None
-        if not isinstance(names, Mapping) or LEASE_TTL_S not in names:
-            return False
-        self._binding.add((robot, verb))
-        return True
+        if held:
+            return held if LEASE_ID in takes else {}
+        return {LEASE_ID: self._secret(target[0]), LEASE_TTL_S: SILENCE_S} if LEASE_TTL_S in takes else {}
 
     def _secret(self, robot: str) -> str:
         return self._secrets.setdefault(robot, secrets.token_hex(16))

@@ -26,7 +26,7 @@ from strands_robots.mcp.approval import Approvals
 from strands_robots.mcp.caller import Caller
 from strands_robots.mcp.resources import RobotResources
 from strands_robots.mcp.results import refused_arguments, result, unknown_arguments, with_note
-from strands_robots.mcp.tools import add_control, add_motions, add_reads, add_stops
+from strands_robots.mcp.tools import add_calls, add_control, add_motions, add_reads, add_stops
 from strands_robots.safety.sightings import flush_sightings
 from strands_robots.serving import robot_verbs  # noqa: F401 - so that the first stop of a client loads nothing
 from strands_robots.serving.stop_arguments import network_emergency_stop, network_stop
@@ -40,6 +40,7 @@ STOPS = {"stop": network_stop, "emergency_stop": network_emergency_stop}
 
 INSTRUCTIONS = """Robots on a network. Look before you move: list_robots, describe_robot, then get_picture,
 get_objects or get_state. Units are metres and degrees in the robot's base frame, x forward, y left, z up.
+describe_robot has every verb with its parameters; call_robot calls those that have no tool of their own.
 A motion answers when it has ended. Believe its fields, not your plan: error_mm is how far it ended from where you
 asked, holding whether something is between the jaws, why the reason of its end.
 stop ends a motion at any time. A stop that is not confirmed means that the robot may still move: say so to the user.
@@ -121,6 +122,7 @@ def build(
     add_stops(server, access)
     if not read_only:
         add_motions(server, access, approvals)
+        add_calls(server, access, approvals)
         add_control(server, access, approvals)
     resources.add_to(server, access)
 

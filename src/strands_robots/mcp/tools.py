@@ -15,16 +15,20 @@ from functools import partial
 from typing import Annotated, Any, Literal, TypeAlias
 
 from mcp.server.mcpserver import Context, MCPServer
-from mcp.types import CallToolResult, InputRequiredResult, ToolAnnotations
+from mcp.types import InputRequiredResult, ToolAnnotations
 from pydantic import Field
 
 from strands_robots.cli.resume import ask_robots, lockable_robots
+from strands_robots.device_connect.discovery import Peer
 from strands_robots.envelope import Envelope, error, is_error, success
 from strands_robots.mcp.access import AccessOf
 from strands_robots.mcp.approval import Approvals, Wish
 from strands_robots.mcp.caller import acquire_arguments, move_arguments
 from strands_robots.mcp.results import Result, facts, picture, quoted, result, row
+from strands_robots.mcp.verbs import INSTEAD, described, wanted
+from strands_robots.serving.advertised import AdvertisedVerb
 from strands_robots.serving.stop_arguments import stop_scope
+from strands_robots.utils import shown
 
 PAGE_BYTES = 2600
 """Size of a page of robots; it is in an answer twice, as text and as structured content."""
@@ -77,14 +81,9 @@ def add_reads(server: MCPServer[Any], access: AccessOf, standing: Callable[[], s
 
     @server.tool(annotations=READ)
     async def describe_robot(context: Context[Any, Any], robot: Robot) -> Result:
-        """Describe one robot: type, model, and its verbs."""
-        peers = await asyncio.to_thread(access(context).caller.fleet.peers)
-        found = next((peer for peer in peers if peer.id == robot), None)
-        if found is None:
-            return result(error("No robot with this id. list_robots names those that there are."))
-        return result(
-            success("Described.", **row(found), verbs=[str(each.get("name", "")) for each in found.functions])
-        )
+        """Describe one robot: type, model, verbs, and the JSON Schema of each."""
+        found = await access(context).caller.describe(robot)
+        return result(described(found) if isinstance(found, Peer) else found)
 
     @server.tool(annotations=READ)
     async def get_state(context: Context[Any, Any], robot: Robot) -> Result:
@@ -177,19 +176,7 @@ def add_stops(server: MCPServer[Any], access: AccessOf) -> None:
 def add_motions(server: MCPServer[Any], access: AccessOf, approvals: Approvals) -> None:
     """Add the tools that move."""
 
-    async def carried_out(
-        context: Context[Any, Any], robot: str, verb: str, params: Mapping[str, Any], *, wait: bool
-    ) -> CallToolResult | InputRequiredResult:
-        client = access(context)
-
-        async def run() -> Envelope:
-            async with _progress(context, partial(client.caller.read, robot, "getStatus")):
-                if verb == "execute":
-                    return await client.caller.run_policy(robot, params, wait=wait)
-                return await client.caller.move(robot, verb, params, wait=wait)
-
-        sent = params if verb == "execute" else move_arguments(params, wait=wait)
-        return await approvals.carry_out(context, client, Wish(robot, verb, params, sent, run))
+    carried_out = partial(_carried_out, access, approvals)
 
     @server.tool(annotations=MOTION)
     async def move(  # noqa: PLR0917 - tools are called by names
@@ -259,6 +246,35 @@ def add_motions(server: MCPServer[Any], access: AccessOf, approvals: Approvals) 
         return await carried_out(context, robot, "execute", {**params, **_given(robot_name=robot_name)}, wait=wait)
 
 
+def add_calls(server: MCPServer[Any], access: AccessOf, approvals: Approvals) -> None:
+    """Add the tool that calls any verb."""
+
+    @server.tool(annotations=MOTION)
+    async def call_robot(
+        context: Context[Any, Any],
+        robot: Robot,
+        verb: Annotated[str, Field(description="A verb of describe_robot", max_length=100)],
+        arguments: Annotated[dict[str, Any] | None, Field(description="By name, as its parameters say")] = None,
+    ) -> Answer:
+        """Call any verb of a robot; a motion answers at its end."""
+        given, caller = dict(arguments or {}), access(context).caller
+        if verb in INSTEAD:
+            return result(error(f"call_robot does not call {verb}: {INSTEAD[verb]}."))
+        peer = await caller.describe(robot)
+        found = wanted(peer, verb, given) if isinstance(peer, Peer) else peer
+        if not isinstance(found, AdvertisedVerb):
+            return result(found)
+        if found.reads:
+            return picture(await caller.query(robot, verb, given, found.lasts_s))
+        # Our verbs keep their meaning: a policy is followed to its end, and an arm's motion by its task.
+        if found.own or (verb != "execute" and "wait" not in found.by_name):
+            return await _carried_out(access, approvals, context, robot, verb, given, own=found)
+        wait = given.pop("wait", True)
+        if not isinstance(wait, bool):
+            return result(error(f"wait must be true or false, not {shown(wait)}."))
+        return await _carried_out(access, approvals, context, robot, verb, given, wait=wait)
+
+
 def add_control(server: MCPServer[Any], access: AccessOf, approvals: Approvals) -> None:
     """Add the tools of the control lease."""
 
@@ -280,6 +296,35 @@ def add_control(server: MCPServer[Any], access: AccessOf, approvals: Approvals) 
     async def release_control(context: Context[Any, Any], robot: Robot, robot_name: InWorld = "") -> Result:
         """Free a robot that you hold, for others."""
         return result(await access(context).caller.release(robot, robot_name))
+
+
+async def _carried_out(  # noqa: PLR0917 - who asks, and what of which robot
+    access: AccessOf,
+    approvals: Approvals,
+    context: Context[Any, Any],
+    robot: str,
+    verb: str,
+    params: Mapping[str, Any],
+    *,
+    wait: bool = True,
+    own: AdvertisedVerb | None = None,
+) -> Answer:
+    """Carry out a motion, with the approval of the client's user if it needs one.
+
+    ``own`` is the description of a verb whose meaning is not known here.
+    """
+    client = access(context)
+
+    async def run() -> Envelope:
+        async with _progress(context, partial(client.caller.read, robot, "getStatus")):
+            if own is not None:
+                return await client.caller.act(robot, own, params)
+            if verb == "execute":
+                return await client.caller.run_policy(robot, params, wait=wait)
+            return await client.caller.move(robot, verb, params, wait=wait)
+
+    sent = params if own is not None or verb == "execute" else move_arguments(params, wait=wait)
+    return await approvals.carry_out(context, client, Wish(robot, verb, params, sent, run))
 
 
 @contextlib.asynccontextmanager

@@ -52,6 +52,9 @@ ESTOP_S = 1.5
 
 AGAIN_S, LOOK_S = 1.0, 0.05
 
+OWN_BYTES = 16_000
+"""Size of what the list of robots says on one robot's own verbs."""
+
 
 def ignore_outcome(outcome: StopOutcome) -> None:
     """Do without the outcome: the envelope says it."""
@@ -95,7 +98,8 @@ class NativeMesh:
 
     def peers(self) -> Envelope:
         """List every peer in reach, with its type, state and actions."""
-        from strands_robots.serving.peer_verbs import KINDS  # noqa: PLC0415 - loaded when it is used
+        from strands_robots.serving.advertised import own_names  # noqa: PLC0415 - loaded when it is used
+        from strands_robots.serving.peer_verbs import KINDS  # noqa: PLC0415 - as above
 
         def listed(mesh: Mesh) -> Envelope:
             discover(mesh)
@@ -105,7 +109,7 @@ class NativeMesh:
                         "id": row["peer_id"],
                         "type": row["type"],
                         "status": row.get("task_status", ""),
-                        "functions": list(KINDS.get(str(row.get("robot_kind")), ())),
+                        "functions": [*KINDS.get(str(row.get("robot_kind")), ()), *own_names(row.get("own_verbs"))],
                     }
                     for row in mesh.peers
                     if row["reachable"]
@@ -328,7 +332,22 @@ class DeviceConnect:
     """Robots on Device Connect; a robot without an answer is an error."""
 
     def peers(self) -> Envelope:
-        """List every device that answers, with its type, state and functions."""
+        """List every device that answers, with its type, state and functions.
+
+        Verbs of its own come with their parameters, in the robot's words.
+        """
+        from strands_robots.serving.advertised import absent_safety, fitting, verbs_of  # noqa: PLC0415 - loaded when it is used
+
+        def described(functions: object) -> dict[str, Any]:
+            verbs, absent = verbs_of(functions), absent_safety(functions)
+            own = dict(
+                fitting(((each.name, f"({each.takes}) {each.summary}") for each in verbs if each.own), OWN_BYTES)
+            )
+            return {
+                "functions": [each.name for each in verbs],
+                **({"own_verbs": own} if own else {}),
+                **({"note": absent} if absent else {}),
+            }
 
         def listed(fleet: FleetClient) -> Envelope:
             rows = [
@@ -336,7 +355,7 @@ class DeviceConnect:
                     "id": peer.id,
                     "type": peer.type,
                     "status": peer.status.get("availability", ""),
-                    "functions": [str(each.get("name", "")) for each in peer.functions],
+                    **described(peer.functions),
                 }
                 for peer in fleet.peers()
             ]
@@ -350,8 +369,13 @@ class DeviceConnect:
         return _on_fleet(lambda fleet: fleet.call(target, "execute", params, ANSWER_S))
 
     def call(self, target: str, action: str, arguments: Mapping[str, Any], seconds: float = ANSWER_S) -> Envelope:
-        """Call any verb of the device."""
-        return _on_fleet(lambda fleet: fleet.call(target, action, dict(arguments), seconds))
+        """Call any verb of the device, and wait as long as it lasts by its description."""
+
+        def called(fleet: FleetClient) -> Envelope:
+            verb = fleet.verb(target, action)
+            return fleet.call(target, action, dict(arguments), seconds + (verb.lasts_s if verb is not None else 0.0))
+
+        return _on_fleet(called)
 
     def status(self, target: str) -> Envelope:
         """Call the device's ``getStatus``."""

@@ -92,8 +92,9 @@ def test_motion_is_called_watched_and_stopped(machine: Machine, arm: dict[str, A
 
 
 def test_refusals_and_silence_have_their_own_exit_codes(machine: Machine, arm: dict[str, Any]) -> None:
-    assert machine.json("call", "arm-1", "execute", "instruction=3")[0] == 1
-    assert machine.json("call", "arm-1", "execute", "instruction=wave", "speed=9")[0] == 1
+    assert machine.json("call", "arm-1", "execute", "instruction=wave", "duration=-1")[0] == 1
+    assert machine.json("call", "arm-1", "execute", "instruction=wave", "speed=9")[0] == 2
+    assert machine.json("call", "arm-1", "execute", "instruction=wave", "duration=long")[0] == 2
     assert machine.json("call", "arm-1", "fly")[0] == 1
     assert machine.json("call", "arm-9", "getStatus")[0] == 3
     assert machine.json("stop", "arm-9")[0] == 3
@@ -177,7 +178,8 @@ def test_caller_not_on_the_allowlist_cannot_move_the_robot(machine: Machine) -> 
         ("serve", "so100", "--peer-id", "a.b"),
         ("serve", "so100", "--listen", "tcp/0.0.0.0:0"),
         ("serve",),
-        ("call", "arm-1"),
+        ("call",),
+        ("call", "arm-1", "--mesh"),
         ("fly",),
     ],
 )

@@ -25,6 +25,7 @@ CALLS: dict[str, dict[str, Any]] = {
     "move": {"to": {"x": 0.2, "y": 0.0, "z": 0.1}},
     "grasp": {"action": "pick", "object": ORDER},
     "run_policy": {"instruction": ORDER},
+    "call_robot": {"verb": "execute", "arguments": {"instruction": ORDER}},
     "acquire_control": {},
     "wait_for": {"task_id": "INJECTED"},
 }

@@ -31,6 +31,9 @@ class Field {
     if (parameter.type === "boolean") {
       this.input = el("select", { id }, el("option", { value: "true", text: S.yes }), el("option", { value: "false", text: S.no }));
       this.input.value = String(parameter.default ?? true);
+    } else if (parameter.enum.length) {
+      this.input = choose(id, parameter.enum.map(String), empty);
+      if (parameter.default !== null) this.input.value = String(parameter.default);
     } else if (parameter.choices === "directions") this.input = choose(id, DIRECTIONS, empty);
     else if (parameter.choices === "cameras") this.input = choose(id, robot.cameras(), empty);
     else if (parameter.choices === "robots") this.input = choose(id, robot.parts(), empty);
@@ -43,7 +46,7 @@ class Field {
     const label = (parameter.unit ? `${parameter.name}, ${parameter.unit}` : parameter.name) + (parameter.required ? ` (${S.required})` : "");
     this.joints = parameter.choices === "joints" && robot.has("getPose") ? el("div", { class: "joint-fields" }) : null;
     this.node = el("div", { class: "field" }, el("label", { for: id, text: label }), this.input,
-      el("small", { id: `${id}-meaning`, text: parameter.meaning }), this.joints);
+      el("small", { id: `${id}-meaning`, text: [parameter.meaning, S.within(parameter)].filter(Boolean).join(" ") }), this.joints);
   }
 
   async fill(shown) {
@@ -79,10 +82,14 @@ export function valueOf(parameter, text) {
     if (parameter.required) throw new Error(S.missing(parameter.name));
     return undefined;
   }
+  // What was chosen is a text, and the robot gets the value that it named.
+  if (parameter.enum && parameter.enum.length) return parameter.enum.find((each) => String(each) === given);
   if (parameter.type === "boolean") return given === "true";
   if (["number", "integer"].includes(parameter.type)) {
     const value = Number(given);
     if (!Number.isFinite(value)) throw new Error(S.badNumber(parameter.name));
+    if (parameter.type === "integer" && !Number.isInteger(value)) throw new Error(S.notWhole(parameter.name));
+    if (value < (parameter.low ?? value) || value > (parameter.high ?? value)) throw new Error(S.outOfBounds(parameter));
     return value;
   }
   if (["object", "array"].includes(parameter.type)) {
@@ -101,7 +108,7 @@ export class VerbForm {
     this.said = el("div", { class: "said", role: "status", tabindex: 0, "aria-label": S.result(form.name) });
     const run = el("button", { type: "submit", class: "primary", text: S.run, disabled: form.kind !== "read" && !canMove && !STOPS.includes(form.name) });
     this.node = el("form", { novalidate: true, "data-verb": form.name },
-      el("div", { class: "asked" }, el("h4", {}, el("code", { text: form.name })), el("p", { class: "small", text: form.summary }), ...shown.map((each) => each.node), run),
+      el("div", { class: "asked" }, el("h4", {}, el("code", { text: form.name })), el("p", { class: "small", text: form.summary }), form.own ? el("p", { class: "small own", text: S.ownVerb }) : null, ...shown.map((each) => each.node), run),
       this.said,
       folded.length ? el("details", { class: "more" }, el("summary", { text: S.more(folded.length) }), ...folded.map((each) => each.node)) : null);
     this.node.addEventListener("submit", (event) => { event.preventDefault(); this.run(); });

@@ -1,3 +1,5 @@
+const bounds = ({ low, high }) => (low === null ? `at most ${high}` : high === null ? `at least ${low}` : `${low} to ${high}`);
+
 // Every English sentence of the page.
 export const S = {
   theme: "Light or dark",
@@ -149,6 +151,11 @@ export const S = {
   badJson: (name) => `${name} is no JSON.`,
   missing: (name) => `${name} is missing.`,
   badNumber: (name) => `${name} is no number.`,
+  notWhole: (name) => `${name} is no whole number.`,
+  outOfBounds: (parameter) => `${parameter.name} must be ${bounds(parameter)}${parameter.unit ? ` ${parameter.unit}` : ""}.`,
+  within: (parameter) => (parameter.low === null && parameter.high === null ? "" : `(${bounds(parameter)}${parameter.unit ? ` ${parameter.unit}` : ""})`),
+  ownKind: (kind) => `own, ${kind}`,
+  ownVerb: "The robot's own verb, in the robot's words. Only the buttons STOP and Halt are the page's.",
   sending: "Sent...",
   noAnswer: "No answer: the page was disconnected.",
   timeline: "What happened",

@@ -1,0 +1,72 @@
+"""Verbs of a robot's own on the page: bounds, choices, and nothing that looks like the page's own buttons."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from fixtures.page_driving import open_robot, verb_form
+from fixtures.served_page import FORMS, ServedPage
+from fixtures.waiting import eventually
+
+pytest.importorskip("playwright.sync_api")
+
+from strands_robots.dashboard.verb_forms import forms_of
+
+pytestmark = [pytest.mark.system, pytest.mark.timeout(300)]
+
+ATTACK = "<img src=x onerror=\"document.title='owned'\">\x1b[2J"
+OWN = {"direction": "write", "own": "true"}
+OWN_FORMS = forms_of(
+    [
+        {
+            "name": "brewCoffee",
+            "description": f"Brew coffee. {ATTACK}",
+            "parameters": {
+                "properties": {
+                    "cups": {"type": "integer", "minimum": 1, "maximum": 8, "unit": "cups", "description": ATTACK},
+                    "strength": {"enum": ["mild", "strong"], "default": "mild"},
+                    "sugar": {"enum": [0, 0.5, 1]},
+                },
+                "required": ["cups", "sugar"],
+            },
+            "labels": OWN,
+        },
+        {"name": "halt", "description": "Halt everything.", "labels": OWN},
+        {"name": "resume"},
+    ]
+)
+
+
+def test_own_verb_is_filled_in_within_its_bounds_and_sent_with_its_types(page: Any, served: ServedPage) -> None:
+    served.robot("arm-1", forms=(*FORMS, *OWN_FORMS))
+    open_robot(page)
+    form = verb_form(page, "brewCoffee")
+    cups = form.get_by_label("cups, cups (required)")
+    form.get_by_label("sugar (required)").select_option("0.5")
+    for wrong, said in (("9", "cups must be 1 to 8 cups."), ("1.5", "cups is no whole number.")):
+        cups.fill(wrong)
+        form.get_by_role("button", name="Run").click()
+        eventually(lambda said=said: said in form.locator(".said").inner_text(), what=said)  # type: ignore[misc]
+    assert served.feed.asked("brewCoffee") == []
+    assert "(1 to 8 cups)" in form.inner_text()
+    cups.fill("2")
+    form.get_by_label("strength").evaluate("each => { each.closest('details').open = true; }")
+    form.get_by_label("strength").select_option("strong")
+    form.get_by_role("button", name="Run").click()
+    eventually(lambda: served.feed.asked("brewCoffee"), what="the call")
+    assert served.feed.asked("brewCoffee")[0] == {"cups": 2, "sugar": 0.5, "strength": "strong"}
+
+
+def test_own_verb_is_plain_text_and_says_that_it_is_the_robots(page: Any, served: ServedPage) -> None:
+    served.robot("arm-1", forms=(*FORMS, *OWN_FORMS))
+    open_robot(page)
+    form = verb_form(page, "brewCoffee")
+    assert "<img src=x" in form.inner_text()
+    assert form.locator("img").count() == 0
+    assert "owned" not in page.title()
+    halt = page.locator("button.verb[data-verb='halt']")
+    assert halt.inner_text().split("\n") == ["halt", "own, moves"]
+    form = verb_form(page, "halt")
+    assert "The robot's own verb" in form.inner_text()
+    assert form.get_by_role("button").all_inner_texts() == ["Run"]
