@@ -9,7 +9,9 @@ from typing import Any
 
 import pytest
 from device_connect_edge.drivers import DeviceDriver, rpc
+from fixtures.barista import Barista
 from fixtures.mcp_site import WAVE, McpSite
+from fixtures.waiting import eventually
 
 pytest.importorskip("mcp.server.mcpserver", reason="needs the extra mcp", exc_type=ImportError)
 
@@ -45,6 +47,14 @@ class Kettle(DeviceDriver):  # type: ignore[misc]
     async def boil(self, litres: float) -> dict[str, Any]:
         """Boil water."""
         return {"boiled": litres}
+
+
+@pytest.fixture(scope="module")
+def barista(site: McpSite) -> Iterator[Barista]:
+    robot = Barista()
+    runtime = init_device_connect_sync(robot, peer_id="barista-1", link=loopback_config(site.port))
+    yield robot
+    stop_device_connect(runtime)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -144,3 +154,32 @@ async def test_real_hardware_is_moved_after_the_users_yes_alone(site: McpSite, m
         assert (await called(client, "metal-1", "releaseTorque", motor_ids="pan")).is_error
     assert 'What: releaseTorque {"motor_ids": "pan"}' in asked[2]
     assert "How far: not known before; it is a verb of the robot's own" in asked[2]
+
+
+async def test_own_verb_is_described_called_refused_and_stopped_in_its_middle(site: McpSite, barista: Barista) -> None:
+    async with site.client(elicitation_callback=_approving) as client:
+        said = (await client.call_tool("describe_robot", {"robot": "barista-1"})).structured_content["data"]
+        brew = {each["name"]: each for each in said["verbs"]}["brewCoffee"]
+        assert brew["own"]
+        assert brew["parameters"]["properties"]["cups"]["maximum"] == 8
+        assert (await called(client, "barista-1", "brewCoffee", cups=1)).structured_content["data"]["cups"] == 1
+        refused = await called(client, "barista-1", "brewCoffee", cups=9)
+        assert "cups must be" in refused.structured_content["text"]
+        assert (await called(client, "barista-1", "beansLeft")).structured_content["data"]["result"] == 250.0
+        for _ in range(2):
+            brewing = asyncio.ensure_future(called(client, "barista-1", "brewCoffee", cups=8))
+            await asyncio.to_thread(eventually, barista.brewing.is_set)
+            stopped = await client.call_tool("stop", {"robot": "barista-1"})
+            assert not stopped.is_error, stopped.structured_content
+            assert not barista.brewing.is_set()
+            await brewing
+        # A call that is given up stops the robot.
+        brewing = asyncio.ensure_future(called(client, "barista-1", "brewCoffee", cups=8))
+        await asyncio.to_thread(eventually, barista.brewing.is_set)
+        brewing.cancel()
+        await asyncio.wait([brewing])
+        await asyncio.to_thread(eventually, lambda: not barista.brewing.is_set())
+
+
+async def _approving(context: object, params: Any) -> ElicitResult:
+    return ElicitResult(action="accept", content={"approve": True})
