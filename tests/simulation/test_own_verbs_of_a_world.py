@@ -11,6 +11,7 @@ from fixtures.waiting import eventually
 
 from strands_robots import Permit, Simulation, verb
 from strands_robots.safety.stop_executor import stop_executor
+from strands_robots.serving.control import leases_of
 from strands_robots.serving.own_verbs import own_verbs
 from strands_robots.serving.pipeline import Command, Pipeline, Result
 from strands_robots.serving.robot_verbs import WORLD_VERBS
@@ -64,3 +65,12 @@ def test_verb_that_moves_by_built_in_motions_ends_with_a_stop(world: Nodding, wh
         assert answers[0].result["task_status"] == "stopped"
         assert not world.gate.under_way
     assert serve(world, "moveJoints", joints={"wrist_flex": 0.0}, speed=1.0).result["status"] == "success"
+
+
+def test_verb_of_the_world_is_refused_while_one_of_its_robots_is_held(world: Nodding) -> None:
+    world.add_robot("right", model="so100")
+    held = leases_of(world, hardware=False).of("right").acquire("other", "agent", 60.0)
+    assert held["lease_id"]
+    answer = serve(world, "nodAlong").result
+    assert (answer["status"], answer["refused"], answer["holder"]) == ("error", "control", "other")
+    assert world.nods == 0

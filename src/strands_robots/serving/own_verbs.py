@@ -7,7 +7,7 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from strands_robots.contract import body_of, stops_motions
+from strands_robots.contract import WorldRobot, body_of, stops_motions
 from strands_robots.envelope import Envelope, jsonable, success
 from strands_robots.serving.robot_verbs import ARM_VERBS, WORLD_VERBS
 from strands_robots.serving.verb_schema import described
@@ -20,6 +20,11 @@ VERBS_MAX = 100
 
 DESCRIPTION_MAX_BYTES = 64 * 1024
 """Size of the description of a robot's own verbs, in JSON."""
+
+UNPROVEN = (
+    "A stop waits until it has returned. That none of its own writes follows is its author's word: it is not proven."
+)
+"""Note on each motion, whose writes do not pass a body of ours."""
 
 STOPS = frozenset({"stop", "halt", "estop", "emergencyStop", "stopMotion", "stopTask", "stopPolicy", "stopTeleoperate"})
 """Names that a caller would take for a stop, which no verb of a robot's own may be."""
@@ -96,6 +101,9 @@ def _served(body: object, declared: DeclaredVerb) -> Verb:
         returns=declared.returns,
         run=run,
         lasts=declared.lasts > 0,
+        # It may move any robot of a world, so a lease on one of them refuses it.
+        of_world=isinstance(body, WorldRobot),
+        note=UNPROVEN if declared.motion else "",
         own=True,
         lasts_s=declared.lasts,
     )

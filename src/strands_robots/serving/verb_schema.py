@@ -38,6 +38,8 @@ def text_of(verb: Verb) -> str:
     lines = [verb.summary]
     if verb.parameters:
         lines += ["", "Args:", *(f"    {each.name}: {each.meaning}" for each in verb.parameters)]
+    if verb.note:
+        lines += ["", verb.note]
     return "\n".join(lines)
 
 
