@@ -1,4 +1,4 @@
-"""Port, identity, joint units and temperatures of a LeRobot device."""
+"""Port, identity, features, joint units and temperatures of a LeRobot device."""
 
 from __future__ import annotations
 
@@ -102,6 +102,17 @@ def _adapter(port: str, by_id: Path) -> str:
 def _text(owner: Any, name: str) -> str:
     value = getattr(owner, name, None)
     return value.strip() if isinstance(value, str) else ""
+
+
+def is_picture(feature: Any) -> bool:
+    """Return True for a feature that is a picture's height, width and channels."""
+    return isinstance(feature, tuple | list) and len(feature) == 3
+
+
+def feature_type(feature: Any) -> Any:
+    """Return a feature as data: the name of its type, or its shape."""
+    shape = list(feature) if isinstance(feature, tuple | list) else str(feature)
+    return getattr(feature, "__name__", None) or shape
 
 
 UNITS = {"RANGE_M100_100": "normalized", "RANGE_0_100": "percent", "DEGREES": "degrees"}
