@@ -17,7 +17,7 @@ from fixtures.planes import own_plane
 from fixtures.waiting import eventually
 
 from strands_robots.hardware import HardwareRobot
-from strands_robots.hardware.stated_joints import still_action
+from strands_robots.hardware.stated_joints import stated_joints, still_action
 from strands_robots.safety.orders import StopOrder, new_epoch
 from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS
 
@@ -129,6 +129,30 @@ def test_radians_of_a_device_are_degrees_of_its_caller() -> None:
         assert robot.device.positions["pan.pos"] == pytest.approx(0.785398, abs=1e-5)
 
 
+class Normalized:
+    """One motor of LeRobot's, normalized from -100 to 100 over half a turn."""
+
+    def __init__(self, counts: int) -> None:
+        motor = SimpleNamespace(model="servo", norm_mode=SimpleNamespace(name="RANGE_M100_100"))
+        entry = SimpleNamespace(range_min=1024, range_max=1024 + 2047.5, drive_mode=0)
+        self.bus = SimpleNamespace(
+            motors={"pan": motor}, calibration={"pan": entry}, model_resolution_table={"servo": counts}
+        )
+        self.action_features = {"pan.pos": float}
+
+    def get_observation(self) -> dict[str, float]:
+        return {"pan.pos": 0.0}
+
+
+def test_calibrated_motor_is_told_in_degrees_from_the_middle_of_its_range() -> None:
+    bounds = {"pan.pos": (-100.0, 100.0)}
+    (joint,) = stated_joints(Normalized(4096), bounds)
+    assert (joint.name, joint.refusal, joint.low, joint.high) == ("pan", "", -90.0, 90.0)
+    assert joint.position(45.0) * joint.factor == pytest.approx(50.0)
+    (unknown,) = stated_joints(Normalized(1024), bounds)
+    assert "told in normalized" in unknown.refusal
+
+
 def test_joint_ranges_of_the_robot_are_its_limits() -> None:
     bare = BarePanTilt()
     bare.joint_units = {"pan.pos": "degrees", "tilt.pos": "degrees"}  # type: ignore[attr-defined]
@@ -183,7 +207,8 @@ def test_motion_that_would_last_for_hours_is_refused(robot: HardwareRobot) -> No
 
 
 def test_what_is_not_asked_for_stays_where_it_was_told_to_be() -> None:
-    device = SimpleNamespace(action_features={"pan.pos": float, "push": float}, joint_units={"pan.pos": "degrees"})
+    units = {"pan.pos": "degrees", "push": "newtons"}
+    device = SimpleNamespace(action_features=dict.fromkeys(units, float), joint_units=units)
     bounds = {"pan.pos": (-1.0, 1.0), "grip.pos": (0.0, 100.0), "x.vel": (-1.0, 1.0), "push": (0.0, 1.0)}
     told = still_action(device, bounds, {"grip.pos": 20.0}, {"grip.pos": 24.0, "pan.pos": 0.5, "x.vel": 0.1, "push": 1})
     assert told == {"x.vel": 0.0, "pan.pos": 0.5, "grip.pos": 20.0}

@@ -152,6 +152,19 @@ def half_ranges(device: Any) -> dict[str, float]:
     }
 
 
+COUNTS = 4096
+"""Counts of one turn of the encoders by which calibrations are read here."""
+
+
+def of_known_encoder(device: Any) -> frozenset[str]:
+    """Return the motors whose encoder has :data:`COUNTS` a turn, as their bus says."""
+    table = getattr(_bus(device), "model_resolution_table", None)
+    counts: Mapping[Any, Any] = table if isinstance(table, Mapping) else {}
+    return frozenset(
+        str(name) for name, motor in _motors(device).items() if counts.get(getattr(motor, "model", None)) == COUNTS
+    )
+
+
 def has_temperatures(device: Any) -> bool:
     """Return True when every motor of the one bus has the temperature register."""
     bus = _bus(device)
