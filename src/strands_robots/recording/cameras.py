@@ -121,7 +121,12 @@ def has_cameras(robot: Any) -> bool:
     own = getattr(body, "has_cameras", None)
     if isinstance(own, bool):
         return own
-    if callable(getattr(body, "camera_frames", None)) or _drawing(robot) is not None:
+    if callable(getattr(body, "camera_frames", None)):
+        return True
+    if (
+        any(callable(getattr(body, draw, None)) for draw in ("camera_picture", "render"))
+        and _drawing(robot) is not None
+    ):
         return True
     features = getattr(body, "observation_features", None)
     shapes = list(features.values()) if isinstance(features, Mapping) else []

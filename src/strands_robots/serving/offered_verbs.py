@@ -6,7 +6,7 @@ import logging
 from collections.abc import Mapping
 from typing import Any
 
-from strands_robots.contract import WorldRobot, body_of
+from strands_robots.contract import body_of
 from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS
 from strands_robots.serving.verbs import Verb
 
@@ -32,10 +32,11 @@ def _arm_verbs(robot: Any) -> frozenset[str] | None:
     own = getattr(body_of(robot), "arm_verbs", None)
     if not callable(own):
         return None
-    if not isinstance(robot, WorldRobot):
+    robots = getattr(robot, "list_robots", None)
+    if not callable(robots):
         return frozenset(own())
     found: frozenset[str] = frozenset()
-    for name in robot.list_robots():
+    for name in robots():
         found |= own(name)
         if len(found) == len(ARM_MOTION_VERBS):
             break
