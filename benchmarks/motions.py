@@ -92,7 +92,7 @@ class Bench:
             motion, self.held = grasp.pick(start, target, None)
         except ValidationError as exc:
             return Told(str(exc), refused=True)
-        wanted = self.held.centre(motion.end)
+        wanted = self.held.centre(start.arm.chain.forward(motion.end_joints))
         return self.judged(motion, sight.Sight(start.objects, name, wanted, sight.CARRIED_MM))
 
     def place(self, position: Floats, on: str = "") -> Told:

@@ -9,13 +9,16 @@ import threading
 import time
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, ParamSpec
 
 from strands_robots.contract import RUNNING
 from strands_robots.envelope import Envelope, error, success
-from strands_robots.policies.rollout import Body, Rollout, RolloutObservers
+from strands_robots.kinematics.arm_parts import ArmParts
+from strands_robots.kinematics.arm_task import ArmTask
+from strands_robots.kinematics.stated_joint import StatedJoint
+from strands_robots.policies.base import Action
+from strands_robots.policies.rollout import Body, Rollout
 from strands_robots.recording.cameras import frames_of
 from strands_robots.safety.gate import Permit, answered
 from strands_robots.safety.stop_log import stop_logger
@@ -25,7 +28,7 @@ from strands_robots.utils import ValidationError, choice, identifier, missing_ex
 if TYPE_CHECKING:  # numpy and MuJoCo are loaded with the first motion
     from strands_robots.kinematics.arm import Arm, ArmState
     from strands_robots.kinematics.detector import Asking, ObjectDetector
-    from strands_robots.kinematics.motion import Motion
+    from strands_robots.kinematics.motion import JointSpace, Motion
     from strands_robots.kinematics.moves import Start
     from strands_robots.kinematics.objects import Held, SeenObject
     from strands_robots.kinematics.sight import Sight
@@ -46,60 +49,7 @@ LOOK_S = 2.0
 HOME = "home"
 """Place that every arm has: the home pose of its model."""
 
-MOTION = "motion"
-"""What a planned motion is called where a policy's name stands."""
-
 PlanMotion = Callable[["Start"], "Motion"]
-
-
-@dataclass
-class ArmTask:
-    """One motion, running or ended.
-
-    Attributes:
-        outcome: how it ended, once it was asked for; it stays as it was then.
-        sight: the objects before and after it; None where none can be seen.
-        looked: set once the objects were looked at after it.
-    """
-
-    task_id: str
-    rollout: Rollout
-    motion: Motion
-    outcome: dict[str, Any] | None = None
-    sight: Sight | None = None
-    looked: threading.Event = field(default_factory=threading.Event)
-
-    @property
-    def running(self) -> bool:
-        """True until the motion has ended; a look at its end does not count."""
-        return self.rollout.running
-
-    @property
-    def unseen(self) -> bool:
-        """True while the end of a completed motion is looked at."""
-        return self.rollout.state == "completed" and self.sight is not None and not self.looked.is_set()
-
-    def join(self, seconds: float) -> None:
-        """Wait for the end and the look at it."""
-        until = time.monotonic() + seconds
-        self.rollout.join(seconds)
-        if self.unseen:
-            self.looked.wait(max(0.0, until - time.monotonic()))
-
-
-def motion_rollout(body: Body, motion: Motion, permit: Permit, hz: float, observers: RolloutObservers) -> Rollout:
-    """Return the rollout that plays a motion; what it grips in the end it keeps."""
-    return Rollout(
-        body,
-        motion,
-        permit=permit,
-        instruction=motion.instruction,
-        policy_name=MOTION,
-        duration=motion.duration,
-        hz=hz,
-        observers=observers,
-        ends_at_rest=True,
-    )
 
 
 def planned(verb: Callable[P, Envelope]) -> Callable[P, Envelope]:
@@ -158,6 +108,22 @@ class ArmMixin:
         frames = frames_of(self)
         return detected(self.detector, {} if frames is None else frames())
 
+    def arm_parts(self, robot_name: str = "") -> ArmParts:
+        """Return what a body has of an arm; nothing is loaded, read or waited for."""
+        return ArmParts()
+
+    def arm_verbs(self, robot_name: str = "") -> frozenset[str]:
+        """Return the names of the verbs of an arm that a body carries out now."""
+        return self.arm_parts(robot_name).verbs(sees=self.knows_objects or self.detector is not None)
+
+    def stated_joints(self, robot_name: str = "") -> Sequence[StatedJoint]:
+        """Return the joints that a body without a model states; none with a model."""
+        return ()
+
+    def still_action(self, robot_name: str = "") -> Action:
+        """Return the targets that keep a body without a model where it was told to be."""
+        return {}
+
     @abstractmethod
     def start_motion(self, robot_name: str, verb: str, plan: Callable[[float, Permit], Motion]) -> Rollout:
         """Plan with the control rate (Hz) and start, once the body is found free.
@@ -207,7 +173,14 @@ class ArmMixin:
         *,
         around: bool = True,
     ) -> Envelope:
-        """Move joints to positions in degrees, by name; the others stay."""
+        """Move joints to positions in degrees, by name; the others stay.
+
+        A robot without a model moves them between the limits that it states: ``checked`` is then ``limits``, for
+        nothing is known of contacts.
+        """
+        stated = self.stated_joints(robot_name)
+        if stated:
+            return self._move_stated(stated, joints, speed, wait, robot_name)
         from strands_robots.kinematics import moves  # noqa: PLC0415 - loaded with the first motion
 
         return self._move(
@@ -316,7 +289,7 @@ class ArmMixin:
             motion, grasped = grasp.pick(start, target, approach)
             held.append(grasped)
             if looked is not None:
-                looked.wanted = grasped.centre(motion.end)
+                looked.wanted = grasped.centre(start.arm.chain.forward(motion.end_joints))
             return motion
 
         looked = None if seen is None else sight.Sight(seen, target.name, within_mm=sight.CARRIED_MM)
@@ -519,7 +492,6 @@ class ArmMixin:
             except ValidationError as exc:
                 raise ValidationError(f"{str(exc).rstrip('.')}; around=false moves without it.") from exc
             sight = Sight(seen) if self.knows_objects else None
-        planned: list[Motion] = []
 
         def planned_at(hz: float, permit: Permit) -> Motion:
             observed = arm.state(_observed(body)[1])
@@ -527,7 +499,40 @@ class ArmMixin:
             held = self._held.get(body.name) if self._holding(body.name, arm, observed) else None
             until = time.monotonic() + PLAN_S
             going = lambda: permit.valid and time.monotonic() < until  # noqa: E731 - one argument of the next call
-            motion = plan(Start(arm, state, hz, speed, seen if around else (), held, going))
+            return plan(Start(arm, state, hz, speed, seen if around else (), held, going))
+
+        return self._play(verb, body, planned_at, wait, started=started, sight=sight)
+
+    def _move_stated(
+        self, stated: Sequence[StatedJoint], joints: Mapping[str, float], speed: float, wait: bool, robot_name: str
+    ) -> Envelope:
+        from strands_robots.kinematics import joint_motion  # noqa: PLC0415 - numpy, with the first motion
+
+        body, goals = self.body(robot_name), joint_motion.chosen(stated, joints)
+
+        def planned_at(hz: float, permit: Permit) -> Motion:
+            space = joint_motion.StatedJoints(tuple(goals))
+            state = space.state(_observed(body)[1]).told(space.told(self.targets(body.name)))
+            still = self.still_action(body.name)
+            return joint_motion.move_joints(goals, state, still, joints, hz=hz, speed=speed)
+
+        return self._play("moveJoints", body, planned_at, wait)
+
+    def _play(
+        self,
+        verb: str,
+        body: Body,
+        plan: Callable[[float, Permit], Motion],
+        wait: bool,
+        *,
+        started: Callable[[], object] = lambda: None,
+        sight: Sight | None = None,
+    ) -> Envelope:
+        """Plan a motion, start it, and answer at its end or at once."""
+        planned: list[Motion] = []
+
+        def planned_at(hz: float, permit: Permit) -> Motion:
+            motion = plan(hz, permit)
             motion.clock = getattr(body, "clock", motion.clock)
             motion.stall_lag = getattr(body, "stall_lag", motion.stall_lag)
             motion.currents = getattr(body, "get_currents", None)
@@ -565,14 +570,14 @@ class ArmMixin:
     def _measured(self, task: ArmTask, *, running: bool) -> dict[str, Any]:
         rollout, motion, sight = task.rollout, task.motion, task.sight
         state = rollout.state
-        reached, error_mm = self._reached(motion)
+        end = motion.arm.reached(motion.state, motion.goal, motion.wanted)
         why = "it is under way"
         holding = None if running else self._holding(rollout.robot, motion.arm, motion.state)
         if not running:
             why = motion.contact or rollout.error or "it was stopped"
             if state == "completed":
                 problem = (
-                    motion.problem(error_mm, holding) or (sight.problem() if sight is not None else "")
+                    motion.problem(end["error_mm"], holding) or (sight.problem() if sight is not None else "")
                     if motion.finished
                     else "its time was over before it was done"
                 )
@@ -584,28 +589,14 @@ class ArmMixin:
             "verb": motion.verb,
             "task_status": "running" if running else state,
             "asked": dict(motion.asked),
-            "reached": reached,
-            "error_mm": error_mm,
+            **end,
             "holding": holding,
             **(sight.row() if sight is not None else {}),
             "duration": round(rollout.elapsed_s, 3),
             "why": why,
         }
 
-    def _reached(self, motion: Motion) -> tuple[dict[str, float] | None, float | None]:
-        if motion.state is None:
-            return None, None
-        pose = motion.arm.chain.forward(motion.state.joints)
-        x, y, z = (round(float(v), 5) for v in pose.position)
-        reached = {"x": x, "y": y, "z": z, "approach": round(pose.approach_deg, 2)}
-        if motion.state.opening is not None:
-            reached["gripper"] = round(motion.state.opening, 4)
-        if motion.goal is None:
-            return reached, None
-        offset = pose.position - motion.goal
-        return reached, round(1000 * float(offset @ offset) ** 0.5, 2)
-
-    def _holding(self, name: str, arm: Arm, state: ArmState | None = None) -> bool | None:
+    def _holding(self, name: str, arm: JointSpace, state: ArmState | None = None) -> bool | None:
         """Return what the jaw tells, None while it moves or was told otherwise since.
 
         Args:

@@ -101,6 +101,28 @@ async def test_jog_of_a_key_of_a_real_arm_moves_the_joint_of_its_model(page: Pag
     await until(page.jogged)
 
 
+@pytest.mark.parametrize(("unit", "at"), [("degrees", 10.0), ("radians", 0.17453292519943295)])
+async def test_joint_of_a_robot_without_a_model_is_jogged_from_its_state(page: Page, unit: str, at: float) -> None:
+    page.feed.answers["getPose"] = [error("no model of pan_tilt is known")]
+    page.feed.answers["getState"] = [success("here", joints={"pan.pos": at, "lift.pos": 3.0})]
+    await page.take()
+    assert page.control.begin(KEY, {**JOG, "axis": "pan.pos"}, {"pan.pos": unit}) == ""
+    await page.beating(lambda: page.feed.asked("moveJoints"))
+    assert page.feed.asked("moveJoints")[0]["joints"] == {"pan.pos": pytest.approx(55.0)}
+
+
+async def test_joint_without_a_known_unit_is_not_jogged_and_the_reason_is_told(page: Page) -> None:
+    page.feed.answers["getPose"] = [error("no model of pan_tilt is known")]
+    page.feed.answers["getState"] = [success("here", joints={"pan.pos": 10.0})]
+    await page.take()
+    await page.jog()
+    await page.beating(page.jogged)
+    told = page.jogged()
+    assert told is not None
+    assert told["why"] == "no model of pan_tilt is known"
+    assert page.feed.asked("moveJoints") == []
+
+
 async def test_jog_without_a_beat_for_200_ms_is_stopped(page: Page) -> None:
     await page.take()
     began = time.monotonic()

@@ -11,9 +11,7 @@ from fixtures.toy_robots import ToyRobot, ToyWorld
 from strands_robots.device_connect._compat import rpc
 from strands_robots.device_connect.robot_driver import RobotDeviceDriver
 from strands_robots.device_connect.simulation_driver import SimulationDeviceDriver
-from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS
 from strands_robots.serving.control_verbs import CONTROL_VERBS
-from strands_robots.serving.picture_verbs import PICTURE_VERBS
 
 DRIVERS = [RobotDeviceDriver(ToyRobot()), SimulationDeviceDriver(ToyWorld())]
 TYPES = {"string", "integer", "number", "boolean", "object", "array"}
@@ -58,22 +56,12 @@ def test_the_types_are_those_of_the_arguments() -> None:
     [
         (
             DRIVERS[0],
-            {
-                *("execute", "stop", "releaseTorque", "resume", "getStatus", "getFeatures", "getState"),
-                *ARM_MOTION_VERBS,
-                *PICTURE_VERBS,
-                *CONTROL_VERBS,
-            },
+            {"execute", "stop", "resume", "getStatus", "getFeatures", "getState", *CONTROL_VERBS},
             {"taskStarted", "taskComplete", "streamStep", "stateUpdate", "emergencyStop", *CONTROL_EVENTS},
         ),
         (
             DRIVERS[1],
-            {
-                *("execute", "stop", "resume", "getStatus", "getFeatures", "step", "reset"),
-                *ARM_MOTION_VERBS,
-                *CONTROL_VERBS,
-                *PICTURE_VERBS,
-            },
+            {"execute", "stop", "resume", "getStatus", "getFeatures", "step", "reset", *CONTROL_VERBS},
             {
                 *("policyStarted", "policyComplete", "observationUpdate", "streamStep", "stateUpdate", "emergencyStop"),
                 *CONTROL_EVENTS,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -15,6 +16,7 @@ from typing import Any
 
 from strands_robots.dashboard.feed import FleetFeed
 from strands_robots.envelope import Envelope, error, is_error, text_of
+from strands_robots.policies.base import numbers
 from strands_robots.safety.stopping import grade
 from strands_robots.serving.control import HUMAN
 from strands_robots.serving.take_assertion import sign_take
@@ -38,6 +40,9 @@ METRES = (0.1, 0.04, 0.015, 0.005)
 DRIVE_S = 20.0
 DRIVEN = f"a drive ends after {DRIVE_S:g} s; press again to go on."
 """A base does not say whether its drive was halted meanwhile, so no second one follows by itself."""
+
+DEGREES_OF = {"degrees": 1.0, "radians": math.degrees(1.0), "metres": 1.0}
+"""Degrees in one unit of a joint, or metres of a slide."""
 
 LINEAR_M_S, ANGULAR_RAD_S = 0.3, 0.8
 """Speed of a base at full jog speed."""
@@ -319,9 +324,13 @@ class HandControl:
                 pose = await self._until_release(held, jog, "getPose", {"robot_name": jog.axis.part}, [])
                 if pose is None:
                     return ""
-                if is_error(pose):
-                    return text_of(pose)
                 joints = pose["joints"] if isinstance(pose.get("joints"), Mapping) else {}
+                if is_error(pose):
+                    # A robot without a model has no pose, and may have joints.
+                    state = await self._until_release(held, jog, "getState", {}, [])
+                    joints = stated_positions(state or {}, jog.units)
+                    if not joints:
+                        return "" if state is None else text_of(pose)
             problem = ""
             for verb, params in jog.axis.stretches(joints, jog.units):
                 answer = await self._until_release(held, jog, verb, {**params, **self._lease_of(held)}, begun)
@@ -389,6 +398,13 @@ class HandControl:
     @staticmethod
     def _lease_of(held: HeldRobot) -> dict[str, str]:
         return {LEASE_ID: held.lease_id, **({"robot_name": held.part} if held.part else {})}
+
+
+def stated_positions(state: Mapping[str, Any], units: Mapping[str, str]) -> dict[str, float]:
+    """Return the joints of known unit in degrees, of a slide in metres."""
+    joints = state.get("joints")
+    known = numbers(joints) if isinstance(joints, Mapping) else {}
+    return {key: at * DEGREES_OF[units[key]] for key, at in known.items() if units.get(key) in DEGREES_OF}
 
 
 def _taken(answer: Envelope) -> str:

@@ -15,6 +15,7 @@ import re
 from collections.abc import Awaitable, Callable, Iterable, Iterator
 from concurrent.futures import Future
 from typing import Any, TypeVar, cast
+from weakref import WeakKeyDictionary
 
 from device_connect_edge import device as framework
 from device_connect_edge import drivers
@@ -183,10 +184,15 @@ class Runtime(DeviceRuntime):  # type: ignore[misc]  # the framework has no type
         # The framework encodes the whole description for each message.
         self._announcer = announcer
         if announcer is not None:
+            _ANNOUNCED[self] = encoded_capabilities(self._driver)
             build = presence_builder(
-                announcer._device_id, encoded_capabilities(self._driver), announcer._identity, announcer._status
+                announcer._device_id, lambda: _ANNOUNCED[self], announcer._identity, announcer._status
             )
             announcer._build_payload = build
+
+    async def _register(self, force: bool = False) -> None:
+        _ANNOUNCED[self] = encoded_capabilities(self._driver)
+        await super()._register(force=force)
 
     def _warn_if_predicate_extra_missing(self) -> None:
         """Log the framework's start-up line about an optional package at DEBUG only."""
@@ -358,6 +364,33 @@ class Runtime(DeviceRuntime):  # type: ignore[misc]  # the framework has no type
         left = self._lost_at + HOLD_EVENTS_S - self._loop.time()
         with contextlib.suppress(TimeoutError):  # the caller checks whether the link is back
             await asyncio.wait_for(self._linked.wait(), max(left, 0.0))
+
+
+_ANNOUNCED: WeakKeyDictionary[Any, str] = WeakKeyDictionary()
+"""Description by which each runtime has announced its device."""
+
+
+def describe_anew(runtime: Any, driver: DeviceDriver) -> None:
+    """Announce a device again where its description has changed; on its loop."""
+    if not isinstance(runtime, DeviceRuntime):
+        return
+    described, before = encoded_capabilities(driver), _ANNOUNCED.get(runtime)
+    if described == before:
+        return
+    _ANNOUNCED[runtime] = described
+    if before is not None:
+        runtime._track_task(asyncio.create_task(_announce(runtime, driver)))
+
+
+async def _announce(runtime: Any, driver: DeviceDriver) -> None:
+    announcer = runtime._d2d_announcer
+    if not runtime._d2d_mode:
+        await runtime._register(force=True)
+    elif announcer is not None:
+        # The framework's own announcer repeats what it was made with.
+        announcer._capabilities = driver.capabilities.model_dump()
+        with contextlib.suppress(MessagingError):  # its next regular message says the same
+            await runtime.messaging.publish(announcer.subject, announcer._build_payload())
 
 
 def link_of(runtime: Any) -> LinkConfig | None:

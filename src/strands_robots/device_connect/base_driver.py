@@ -22,7 +22,7 @@ from device_connect_edge.types import DeviceStatus, EventDef, FunctionDef
 
 from strands_robots import settings
 from strands_robots.contract import Haltable, Robot, RolloutEvent, Unsubscribe, observe
-from strands_robots.device_connect._compat import CollectedOnce, Runtime, emit, observed, on, rpc
+from strands_robots.device_connect._compat import CollectedOnce, Runtime, describe_anew, emit, observed, on, rpc
 from strands_robots.device_connect.runtime_stops import stops_of
 from strands_robots.device_connect.safety_registration import (
     LEAVE_TIMEOUT_S,
@@ -44,6 +44,7 @@ from strands_robots.safety.stop_executor import stop_executor
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.control_changes import ControlChange
+from strands_robots.serving.offered_verbs import offered
 from strands_robots.serving.own_verbs import own_verbs
 from strands_robots.serving.pipeline import Command, Pipeline, RefusalReason, Refused, Result, busy
 from strands_robots.serving.stop_arguments import noted
@@ -68,7 +69,7 @@ FIRST_LOOK_S = 0.02
 
 _FUNCTIONS: WeakKeyDictionary[type, tuple[FunctionDef, ...]] = WeakKeyDictionary()
 _EVENTS: WeakKeyDictionary[type, tuple[EventDef, ...]] = WeakKeyDictionary()
-_DESCRIBED: WeakKeyDictionary[type, tuple[str, str]] = WeakKeyDictionary()
+_DESCRIBED: WeakKeyDictionary[type, dict[tuple[str, frozenset[str]], str]] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,6 +169,7 @@ class RobotDriver(CollectedOnce):
         super().__init__()
         self.robot = robot
         self.own_verbs = own_verbs(robot)
+        self._described: dict[tuple[str, frozenset[str]], str] = {}
         self.hardware = hardware
         self.authorization = authorization or Authorization(hardware=hardware, robot=robot.tool_name_str)
         self.registration: SafetyRegistration | None = None
@@ -433,11 +435,12 @@ class RobotDriver(CollectedOnce):
 
     @property
     def functions(self) -> list[FunctionDef]:
-        """Return the functions that can be called, read once for each class."""
+        """Return what the robot can be called for now, read once for each class."""
         if type(self) not in _FUNCTIONS:
             _FUNCTIONS[type(self)] = tuple(super().functions)
+        missing = self.made.keys() - offered(self.robot, self.made)
         own = [FunctionDef(**described(verb)) for verb in self.own_verbs.values()]
-        return [*_FUNCTIONS[type(self)], *own]
+        return [*(each for each in _FUNCTIONS[type(self)] if each.name not in missing), *own]
 
     def _get_functions(self) -> dict[str, Callable[..., Any]]:
         functions = super()._get_functions()
@@ -454,19 +457,17 @@ class RobotDriver(CollectedOnce):
         return list(_EVENTS[type(self)])
 
     def described(self) -> str:
-        """Return the capabilities as JSON, encoded once for a class and its labels.
+        """Return the capabilities as JSON, encoded once for a class, labels and verbs.
 
         Raises:
             TypeError, ValueError: JSON cannot carry them.
         """
-        labels = json.dumps(self.labels, allow_nan=False)
-        known = _DESCRIBED.get(type(self))
-        if self.own_verbs or known is None or known[0] != labels:
-            known = labels, json.dumps(self.capabilities.model_dump(), allow_nan=False)
-            if self.own_verbs:
-                return known[1]
-            _DESCRIBED[type(self)] = known
-        return known[1]
+        key = json.dumps(self.labels, allow_nan=False), frozenset(offered(self.robot, self.made))
+        # A robot with verbs of its own is described like no other of its class.
+        known = self._described if self.own_verbs else _DESCRIBED.setdefault(type(self), {})
+        if key not in known:
+            known[key] = json.dumps(self.capabilities.model_dump(), allow_nan=False)
+        return known[key]
 
     @property
     def status(self) -> DeviceStatus:
@@ -481,6 +482,7 @@ class RobotDriver(CollectedOnce):
 
     def heartbeat(self) -> dict[str, Any]:
         """Return what every heartbeat carries besides the id and the time."""
+        describe_anew(self.runtime, self)
         return {**_status_fields(self.activity), "state": jsonable(self.activity.facts)}
 
     def set_device(self, device: Any) -> None:
@@ -512,6 +514,8 @@ class RobotDriver(CollectedOnce):
         """Start telling the state; the robot manages its own hardware connection."""
         if self.runtime is None or self._watchers:
             return
+        # Before it is announced: a change from now on is told.
+        describe_anew(self.runtime, self)
         await self._register()
         opened = self.authorization.opened()
         if opened is not None:
@@ -628,6 +632,7 @@ class RobotDriver(CollectedOnce):
         activity = self.activity = await self._looked()
         # The runtime announces this very mapping in its presence.
         self.runtime.status.update(_status_fields(activity))
+        describe_anew(self.runtime, self)
         return activity
 
     async def _on_rollout(self, event: RolloutEvent) -> None:

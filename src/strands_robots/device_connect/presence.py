@@ -42,19 +42,17 @@ def encoded_capabilities(driver: DeviceDriver) -> str:
 
 
 def presence_builder(
-    device_id: str, capabilities: str, identity: Presence, status: Mapping[str, Any]
+    device_id: str, capabilities: Callable[[], str], identity: Presence, status: Mapping[str, Any]
 ) -> Callable[[], bytes]:
-    """Return a builder of presence messages that encodes the description once.
+    """Return a builder of presence messages that encodes nothing but the status.
 
     Args:
         device_id: whose presence.
-        capabilities: in JSON.
+        capabilities: returns them in JSON, as they are described now.
         identity: stays as it is.
         status: read anew for each message.
     """
-    described = (
-        f'{{"device_id": {json.dumps(device_id)}, "capabilities": {capabilities}, "identity": {json.dumps(identity)}'
-    )
+    device, own = json.dumps(device_id), json.dumps(identity)
 
     def build() -> bytes:
         now = time.time()
@@ -63,6 +61,7 @@ def presence_builder(
             "ts": now,
             "d2d": True,
         }
+        described = f'{{"device_id": {device}, "capabilities": {capabilities()}, "identity": {own}'
         return f"{described}, {json.dumps(changing)[1:]}".encode()
 
     return build

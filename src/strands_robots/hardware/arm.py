@@ -14,15 +14,13 @@ from typing import Any
 
 import mujoco
 
+from strands_robots.hardware.arm_parts import model_name
 from strands_robots.hardware.device_facts import calibration, half_ranges, joint_units, kind
 from strands_robots.kinematics.arm import Arm, JawMap, JointMap
 from strands_robots.kinematics.chain import MODELS, ArmJoint, Chain, built_in
 from strands_robots.kinematics.model_file import load_model
 from strands_robots.policies.base import Ranges
 from strands_robots.utils import ValidationError, shown
-
-MODEL_OF = {"so100_follower": "so101", "so101_follower": "so101", "so_follower": "so101"}
-"""The built-in model of each of LeRobot's arms."""
 
 SPAN_TOLERANCE_RAD = 0.4
 """Greatest difference between a joint's calibrated half range and the model's; more means another zero."""
@@ -57,7 +55,7 @@ def arm_of(device: Any, bounds: Ranges, model: str | None = None, speeds: Mappin
 
 def chain_of(device: Any, model: str | None) -> Chain:
     """Return the chain of a device. Raises :class:`ValidationError` without a model."""
-    name = model or MODEL_OF.get(kind(device), "")
+    name = model_name(device, model)
     if not name:
         raise ValidationError(f"no model of {kind(device)} is known; give model, an MJCF file of the arm.")
     if (MODELS / f"{name}.xml").is_file():

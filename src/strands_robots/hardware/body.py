@@ -375,6 +375,7 @@ class DeviceBody:
 
     def _release(self, motors: Collection[str] = ()) -> None:
         """Switch torque off motor by motor, so that a silent one delays no other."""
+        self.targets = {}
         silent = {}
         for motor, (bus, own) in self._torque.items():
             if motors and motor not in motors:

@@ -1,4 +1,4 @@
-"""Port, identity, joint units and temperatures of a LeRobot device."""
+"""Port, identity, features, joint units and temperatures of a LeRobot device."""
 
 from __future__ import annotations
 
@@ -104,6 +104,17 @@ def _text(owner: Any, name: str) -> str:
     return value.strip() if isinstance(value, str) else ""
 
 
+def is_picture(feature: Any) -> bool:
+    """Return True for a feature that is a picture's height, width and channels."""
+    return isinstance(feature, tuple | list) and len(feature) == 3
+
+
+def feature_type(feature: Any) -> Any:
+    """Return a feature as data: the name of its type, or its shape."""
+    shape = list(feature) if isinstance(feature, tuple | list) else str(feature)
+    return getattr(feature, "__name__", None) or shape
+
+
 UNITS = {"RANGE_M100_100": "normalized", "RANGE_0_100": "percent", "DEGREES": "degrees"}
 """Our name for each of LeRobot's ``MotorNormMode``: from -100 to 100, from 0 to 100, and degrees."""
 
@@ -139,6 +150,19 @@ def half_ranges(device: Any) -> dict[str, float]:
         for motor, entry in calibration(device).items()
         if hasattr(entry, "range_max") and hasattr(entry, "range_min")
     }
+
+
+COUNTS = 4096
+"""Counts of one turn of the encoders by which calibrations are read here."""
+
+
+def of_known_encoder(device: Any) -> frozenset[str]:
+    """Return the motors whose encoder has :data:`COUNTS` a turn, as their bus says."""
+    table = getattr(_bus(device), "model_resolution_table", None)
+    counts: Mapping[Any, Any] = table if isinstance(table, Mapping) else {}
+    return frozenset(
+        str(name) for name, motor in _motors(device).items() if counts.get(getattr(motor, "model", None)) == COUNTS
+    )
 
 
 def has_temperatures(device: Any) -> bool:

@@ -4,22 +4,36 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
 from strands_robots import settings
-from strands_robots.arm_mixin import ArmMixin, motion_rollout
+from strands_robots.arm_mixin import ArmMixin
 from strands_robots.audit import queue_safety_event
 from strands_robots.bus_access import joint_read_source
 from strands_robots.contract import Observer, Unsubscribe
 from strands_robots.envelope import Envelope, error, is_error, success
+from strands_robots.hardware.arm_parts import arm_parts, model_name
 from strands_robots.hardware.body import READ_TRIES, DeviceBody
-from strands_robots.hardware.device_facts import has_temperatures, joint_units, kind, stable_id, temperatures
+from strands_robots.hardware.device_facts import (
+    feature_type,
+    has_temperatures,
+    is_picture,
+    joint_units,
+    kind,
+    stable_id,
+    temperatures,
+)
+from strands_robots.hardware.stated_joints import stated_joints, still_action
+from strands_robots.hardware.stops import TaskStop, TorqueRelease, failure, unfrozen
+from strands_robots.kinematics.arm_parts import ArmParts
+from strands_robots.kinematics.arm_task import motion_rollout
+from strands_robots.kinematics.stated_joint import StatedJoint
 from strands_robots.policies import create_policy, resolve_provider
-from strands_robots.policies.base import checked_action, is_velocity, numbers
+from strands_robots.policies.base import Action, checked_action, is_velocity, numbers
 from strands_robots.policies.check_rows import RobotFacts
 from strands_robots.policies.profiled import ProfiledPolicy
 from strands_robots.policies.profiles import profiles
@@ -146,8 +160,10 @@ class HardwareRobot(ArmMixin, TeleopMixin):
         """Return observation and action features as data, with ranges."""
         return success(
             f"{len(self._body.bounds)} action keys.",
-            observation_features={key: _kind(feature) for key, feature in self.device.observation_features.items()},
-            action_features={key: _kind(feature) for key, feature in self.device.action_features.items()},
+            observation_features={
+                key: feature_type(feature) for key, feature in self.device.observation_features.items()
+            },
+            action_features={key: feature_type(feature) for key, feature in self.device.action_features.items()},
             ranges={key: [low, high] for key, (low, high) in self._body.bounds.items() if high - low < float("inf")},
             joint_units=self.joint_units,
         )
@@ -237,7 +253,7 @@ class HardwareRobot(ArmMixin, TeleopMixin):
 
     def policy_facts(self) -> RobotFacts:
         """Return what a policy is checked against; the joints are read."""
-        pictures = {key: tuple(shape) for key, shape in self.device.observation_features.items() if _is_size(shape)}
+        pictures = {key: tuple(shape) for key, shape in self.device.observation_features.items() if is_picture(shape)}
         return RobotFacts(
             self.tool_name_str,
             numbers(self._body.get_joints()),
@@ -263,6 +279,33 @@ class HardwareRobot(ArmMixin, TeleopMixin):
         if self._arm is None:
             self._arm = arm_of(self.device, body.bounds, self._model, body.speeds)
         return self._arm
+
+    def arm_parts(self, robot_name: str = "") -> ArmParts:
+        """Return what the device has of an arm; of its model once that is loaded."""
+        body, arm = self.body(robot_name), self._arm
+        return arm_parts(self.device, body.bounds, self._model) if arm is None else arm.parts
+
+    def stated_joints(self, robot_name: str = "") -> Sequence[StatedJoint]:
+        """Return the joints that a device without a known model states."""
+        body = self.body(robot_name)
+        known = model_name(self.device, self._model)
+        return () if known else stated_joints(self.device, body.bounds, body.speeds)
+
+    def still_action(self, robot_name: str = "") -> Action:
+        """Return the targets that leave every joint where it was told to be, or is."""
+        body = self.body(robot_name)
+        _, observed = body.latest_joints or (None, {})
+        return still_action(self.device, body.bounds, body.targets, observed)
+
+    @property
+    def has_cameras(self) -> bool:
+        """True where the device has a camera."""
+        return bool(getattr(self.device, "cameras", None))
+
+    @property
+    def releases_torque(self) -> bool:
+        """True where the torque of the motors can be switched off."""
+        return bool(self._body.motors)
 
     def targets(self, robot_name: str = "") -> Mapping[str, float]:
         """Return the last action; empty once the arm was frozen or let go."""
@@ -337,7 +380,7 @@ class HardwareRobot(ArmMixin, TeleopMixin):
         if task is None or not task.running:
             return success("No task runs.", stopped=True, was_running=False, **self._task_fields())
         task.void()
-        verdict = stop_executor().halt(_TaskStop(self._body, task), self.tool_name_str, "stop_task")
+        verdict = stop_executor().halt(TaskStop(self._body, task), self.tool_name_str, "stop_task")
         fields = {"stopped": bool(verdict.stopped), "was_running": True, **self._task_fields()}
         if verdict.stopped:
             return success(f"Stopped after {task.step_count} steps.", **fields)
@@ -411,7 +454,7 @@ class HardwareRobot(ArmMixin, TeleopMixin):
             with self._body.stopping():
                 yield verdicts
         except Exception as exc:  # noqa: BLE001 - a device may raise anything; the verdict says what
-            verdicts.append(_unfrozen(_failure(self.tool_name_str, exc), moved))
+            verdicts.append(unfrozen(failure(self.tool_name_str, exc), moved))
         else:
             verdicts.append(RolloutsEnd(moved, loops, deadline, then).at_once())
         finally:
@@ -421,7 +464,7 @@ class HardwareRobot(ArmMixin, TeleopMixin):
         """Return the verdict while the bus does not answer."""
         if self._frozen_at == self.gate.generation:
             return RolloutsEnd((), self._voided_loops(), 0.0).unread(why)
-        return _unfrozen(why, dict.fromkeys([*self._halting, *self._moved, *self._moving()]))
+        return unfrozen(why, dict.fromkeys([*self._halting, *self._moved, *self._moving()]))
 
     @answered
     def release_torque(self, motor_ids: str = "") -> Envelope:
@@ -437,7 +480,7 @@ class HardwareRobot(ArmMixin, TeleopMixin):
         asked = tuple(part.strip() for part in motor_ids.split(",") if part.strip())
         for motor in asked:
             choice("motor_ids", motor, self._body.motors)
-        verdict = stop_executor().halt(_TorqueRelease(self, ",".join(asked)), self.tool_name_str, "releaseTorque")
+        verdict = stop_executor().halt(TorqueRelease(self, ",".join(asked)), self.tool_name_str, "releaseTorque")
         answer = {**verdict.envelope(), "released": list(self._body.limp_motors)}
         queue_safety_event(
             "torque_released", self.tool_name_str, {"motors": answer["released"], "stopped": verdict.stopped}
@@ -634,66 +677,7 @@ class HardwareRobot(ArmMixin, TeleopMixin):
         return ""
 
 
-@dataclass(frozen=True)
-class _TaskStop:
-    """Stops a task that was asked to end, and leaves what waits to start."""
-
-    body: DeviceBody
-    task: Rollout
-
-    def halt_ordered(self) -> None:
-        """The caller has noted the task."""
-
-    def halt_here(self, reason: str, deadline: float) -> StopVerdict | PendingVerdict:
-        try:
-            self.body.stop()
-        except Exception as exc:  # noqa: BLE001 - a device may raise anything; the verdict says what
-            return self.unanswered(_failure(self.body.name, exc))
-        return RolloutsEnd((), {"task": self.task}, deadline)
-
-    def unanswered(self, why: str) -> StopVerdict:
-        return StopVerdict(not_stopped={"task": why})
-
-
-@dataclass(frozen=True)
-class _TorqueRelease:
-    """Stops a robot and takes the torque of some motors, or all, away."""
-
-    robot: HardwareRobot
-    motors: str
-
-    def halt_ordered(self) -> None:
-        """Note what moves."""
-        self.robot.halt_ordered()
-
-    def halt_here(self, reason: str, deadline: float) -> StopVerdict | PendingVerdict:
-        return self.robot.release_here(self.motors.split(",") if self.motors else (), deadline)
-
-    def unanswered(self, why: str) -> StopVerdict:
-        return self.robot.unanswered(why)
-
-
-def _failure(name: str, exc: Exception) -> str:
-    problem = f"it could not be frozen: {type(exc).__name__}: {exc}"
-    logger.critical("%s did not stop: %s", name, problem)
-    return problem
-
-
-def _unfrozen(problem: str, moving: Mapping[str, None]) -> StopVerdict:
-    """Return the verdict on a robot that is perhaps not frozen."""
-    return StopVerdict(not_stopped=dict.fromkeys(moving, problem), unknown={} if moving else {"bus": problem})
-
-
 def _picture(camera: Any) -> Any:
     """Return the newest picture; older LeRobot cameras only give new ones."""
     newest = getattr(camera, "read_latest", None)
     return newest() if callable(newest) else camera.async_read()
-
-
-def _is_size(feature: Any) -> bool:
-    return isinstance(feature, tuple | list) and len(feature) == 3
-
-
-def _kind(feature: Any) -> Any:
-    shape = list(feature) if isinstance(feature, tuple | list) else str(feature)
-    return getattr(feature, "__name__", None) or shape

@@ -15,9 +15,16 @@ def default_speeds(device: Any) -> dict[str, float]:
 
     A gripper that is told in percent, a base's velocity and a joint without a known unit have no bound of their own.
     """
+    return {key: JOINT_SPEED_RAD_S * per_radian for key, per_radian in units_per_radian(device).items()}
+
+
+def units_per_radian(device: Any) -> dict[str, float]:
+    """Return the device's units in one radian, by action key, where that is known."""
     halves = half_ranges(device)
-    speeds = {key: _per_radian(unit, halves.get(key.removesuffix(".pos"))) for key, unit in joint_units(device).items()}
-    return {key: JOINT_SPEED_RAD_S * per_radian for key, per_radian in speeds.items() if per_radian}
+    factors = {
+        key: _per_radian(unit, halves.get(key.removesuffix(".pos"))) for key, unit in joint_units(device).items()
+    }
+    return {key: per_radian for key, per_radian in factors.items() if per_radian}
 
 
 def _per_radian(unit: str, half_range: float | None) -> float:

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from strands_robots.kinematics.chain import Chain, Floats
+from strands_robots.kinematics.arm_parts import ArmParts
 from strands_robots.kinematics.trajectory import Bounds
 from strands_robots.policies.base import JOINT_SPEED_RAD_S
 from strands_robots.utils import ValidationError
+
+if TYPE_CHECKING:  # an arm without a model needs no MuJoCo
+    from strands_robots.kinematics.chain import ArmJoint, Chain, Floats
 
 ACCELERATION_RAD_S2 = 8.0
 """Bound of a planned motion at full speed."""
@@ -144,6 +148,17 @@ class Arm:
             return self
         return replace(self, chain=chain, maps=(*self.maps, *_maps(chain)[len(self.maps) :]))
 
+    @property
+    def parts(self) -> ArmParts:
+        """Return what there is of an arm."""
+        movable = any(not joint.refusal for joint in self.whole().joints)
+        return ArmParts(joints=movable, model=True, tip=self.chain.leads_tip, jaws=self.jaw is not None)
+
+    @property
+    def joints(self) -> Sequence[ArmJoint]:
+        """Joints of the chain, in their order."""
+        return self.chain.joints
+
     def state(self, observation: Mapping[str, float]) -> ArmState:
         """Return the arm's state in an observation of its body.
 
@@ -192,6 +207,26 @@ class Arm:
         None without a gripper.
         """
         return None if state.opening is None else state.opening > told + GRIP_MARGIN
+
+    def reached(self, state: ArmState | None, goal: Floats | None, wanted: Mapping[str, float]) -> dict[str, Any]:
+        """Return ``reached``, the pose of the tip and the opening, and ``error_mm``.
+
+        Args:
+            state: what was observed last, None for nothing.
+            goal: where the tip was to be (m), None for nowhere.
+            wanted: where joints were to be, by name; the tip alone is measured.
+        """
+        if state is None:
+            return {"reached": None, "error_mm": None}
+        pose = self.chain.forward(state.joints)
+        x, y, z = (round(float(v), 5) for v in pose.position)
+        reached = {"x": x, "y": y, "z": z, "approach": round(pose.approach_deg, 2)}
+        if state.opening is not None:
+            reached["gripper"] = round(state.opening, 4)
+        if goal is None:
+            return {"reached": reached, "error_mm": None}
+        offset = pose.position - goal
+        return {"reached": reached, "error_mm": round(1000 * float(offset @ offset) ** 0.5, 2)}
 
 
 def _maps(chain: Chain) -> tuple[JointMap, ...]:

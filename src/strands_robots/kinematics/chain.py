@@ -183,6 +183,11 @@ class Chain:
         wider.joints = (*self.joints, *others)
         return wider
 
+    @property
+    def leads_tip(self) -> bool:
+        """True where the tip can be moved to a point."""
+        return len(self.joints) >= ARM_JOINTS_MIN and not any(joint.refusal for joint in self.joints)
+
     def require_arm(self) -> None:
         """Refuse an arm whose tip cannot be moved to a point."""
         refused = next((joint.refusal for joint in self.joints if joint.refusal), "")

@@ -6,15 +6,17 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from strands_robots.kinematics.arm import Action, Arm, ArmState
-from strands_robots.kinematics.chain import Floats, TipPose
+from strands_robots.kinematics.arm import Action, ArmState, JawMap, JointMap
 from strands_robots.kinematics.stall import StallWatch
 from strands_robots.policies.base import PolicyError, Ranges, numbers
 from strands_robots.utils import shown
+
+if TYPE_CHECKING:  # joints without a model are moved without MuJoCo
+    from strands_robots.kinematics.chain import Floats
 
 _QUOTES = "'\""
 
@@ -41,6 +43,46 @@ MARGIN_S = 5.0
 """Seconds beyond its plan that a motion may take."""
 
 
+class MovedJoint(Protocol):
+    """A joint as a motion names it; it turns, or slides."""
+
+    @property
+    def name(self) -> str:
+        """Name in answers."""
+
+    @property
+    def turns(self) -> bool:
+        """True for radians, False for metres."""
+
+
+class JointSpace(Protocol):
+    """Joints that a motion moves: those of an arm's model, or stated by a robot."""
+
+    @property
+    def joints(self) -> Sequence[MovedJoint]:
+        """The joints, in the order of every array of positions."""
+
+    @property
+    def maps(self) -> Sequence[JointMap]:
+        """Maps of the joints to the body's keys, in the same order."""
+
+    @property
+    def jaw(self) -> JawMap | None:
+        """Keys of the gripper, None without one."""
+
+    def state(self, observation: Mapping[str, float]) -> ArmState:
+        """Return the state in an observation; raises :class:`ValidationError`."""
+
+    def told(self, targets: Mapping[str, float]) -> Floats:
+        """Return the joints that a body was told; NaN where that is not known."""
+
+    def holding(self, state: ArmState, told: float) -> bool | None:
+        """Return True where something keeps the jaws open; None without a gripper."""
+
+    def reached(self, state: ArmState | None, goal: Floats | None, wanted: Mapping[str, float]) -> dict[str, Any]:
+        """Return ``reached``, ``error_mm`` and what else the answer has of the end."""
+
+
 @dataclass(frozen=True, slots=True)
 class Segment:
     """Setpoints by control step, and the name of this part of the motion."""
@@ -55,6 +97,7 @@ class Motion:
     """Policy that plays planned segments; its rollout has permit and events.
 
     Attributes:
+        arm: the joints that it moves.
         verb: what was asked for.
         asked: the caller's goal, as it is answered.
         goal: where the tip shall be in the end (m), None for a motion of the gripper alone.
@@ -70,7 +113,7 @@ class Motion:
         segment: name of the segment that is played.
     """
 
-    arm: Arm
+    arm: JointSpace
     verb: str
     asked: Mapping[str, Any]
     segments: Sequence[Segment]
@@ -113,11 +156,6 @@ class Motion:
         return frames / self.hz + SETTLE_S * sum(segment.settles for segment in self.segments) + MARGIN_S
 
     @property
-    def end(self) -> TipPose:
-        """Return the pose of the tip in the end."""
-        return self.arm.chain.forward(self.end_joints)
-
-    @property
     def finished(self) -> bool:
         """True once every setpoint was played."""
         return not self._left and not self._frames
@@ -135,7 +173,7 @@ class Motion:
 
     def _stopped_short(self) -> str:
         """Name the first joint that is far from where it was told to go; empty for none."""
-        joints = self.arm.chain.joints if self.state is not None else ()
+        joints = self.arm.joints if self.state is not None else ()
         for joint, at in zip(joints, () if self.state is None else self.state.joints, strict=True):
             off = abs(self.wanted.get(joint.name, at) - at)
             if joint.turns and off > NEAR_RAD:
@@ -181,7 +219,7 @@ class Motion:
         read = None if currents is None else lambda: self._by_joint(currents())
         index = self._watch.stalled(self.clock(), told, state.joints, read)
         if index is not None:
-            joint = self.arm.chain.joints[index]
+            joint = self.arm.joints[index]
             at = f"{np.degrees(state.joints[index]):.0f} degrees" if joint.turns else f"{state.joints[index]:.3f} m"
             self.contact = f"{joint.name} was blocked at {at}: it met something, or its servo is too weak"
             raise PolicyError(self.contact)

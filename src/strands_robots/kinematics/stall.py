@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from strands_robots.kinematics.chain import Floats
+if TYPE_CHECKING:  # MuJoCo is not needed to watch joints
+    from strands_robots.kinematics.chain import Floats
 
 WINDOWS_S = (0.12, 0.22)
 """Times over which a joint is compared with its setpoints; the longer one is for slow motions."""

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from strands_robots.kinematics.chain import Floats
+from strands_robots.utils import DURATION_MAX_S, ValidationError
+
+if TYPE_CHECKING:  # MuJoCo is not needed to time a path of joints
+    from strands_robots.kinematics.chain import Floats
 
 _GRID = 400
 """Points of a trajectory; between them it is straight."""
@@ -42,7 +46,15 @@ class Trajectory:
         return np.array([np.interp(seconds, self.times, column) for column in self.points.T])
 
     def sampled(self, hz: float) -> Floats:
-        """Return the setpoints of each control step after the first, the end included."""
+        """Return the setpoints of each control step after the first, the end included.
+
+        Raises:
+            ValidationError: the motion is so slow that it would last longer than an hour.
+        """
+        if not self.duration <= DURATION_MAX_S:  # also where it cannot be computed
+            raise ValidationError(
+                f"speed must let the motion end within {DURATION_MAX_S:g} s, not in {self.duration:.3g} s."
+            )
         steps = int(np.ceil(self.duration * hz - 1e-9))
         return np.array([self.at((index + 1) / hz) for index in range(steps)]).reshape(steps, self.points.shape[1])
 

@@ -23,6 +23,7 @@ from strands_robots.mesh.safety import status_of
 from strands_robots.mesh.teleop import TeleopReceivers
 from strands_robots.mesh.throttle import AuditThrottle
 from strands_robots.mesh.transport import Declaration, Sample, TransportError, undeclare
+from strands_robots.recording.cameras import has_cameras
 from strands_robots.safety.identity import SigningIdentity
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS
@@ -41,10 +42,24 @@ CHILDREN_MAX = 64
 class OneRobot:
     """One robot of a world, seen as a world that holds nothing else."""
 
+    whole = False
+    """Physics is stepped and reset by the world alone."""
+
     def __init__(self, world: WorldRobot, name: str) -> None:
         self._world = world
         self.tool_name_str = name
         self.gate = world.gate
+
+    @property
+    def has_cameras(self) -> bool:
+        """True where the world has cameras."""
+        return has_cameras(self._world)
+
+    def arm_verbs(self, robot_name: str = "") -> frozenset[str]:
+        """Return the verbs of an arm that the world carries out for it."""
+        own = getattr(self._world, "arm_verbs", None)
+        verbs: frozenset[str] = own(self.tool_name_str) if callable(own) else frozenset()
+        return verbs
 
     def list_robots(self) -> list[str]:
         return [name for name in self._world.list_robots() if name == self.tool_name_str]

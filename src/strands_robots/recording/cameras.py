@@ -112,6 +112,29 @@ def _selected(frames: Mapping[str, Any], names: Sequence[str]) -> LazyFrames:
     return LazyFrames({name: partial(frames.__getitem__, name) for name in frames if name in names})
 
 
+def has_cameras(robot: Any) -> bool:
+    """Return True where a robot has a camera, as far as it can say without a picture.
+
+    From its ``has_cameras``, else by what draws or takes pictures, else by the shapes in ``observation_features``.
+    """
+    body = body_of(robot)
+    own = getattr(body, "has_cameras", None)
+    if isinstance(own, bool):
+        return own
+    if callable(getattr(body, "camera_frames", None)):
+        return True
+    if (
+        any(callable(getattr(body, draw, None)) for draw in ("camera_picture", "render"))
+        and _drawing(robot) is not None
+    ):
+        return True
+    features = getattr(body, "observation_features", None)
+    shapes = list(features.values()) if isinstance(features, Mapping) else []
+    return callable(getattr(body, "get_observation", None)) and any(
+        isinstance(shape, tuple | list) and len(shape) == 3 for shape in shapes
+    )
+
+
 def camera_list(robot: Any) -> list[str]:
     """Return the names of a robot's cameras, the one that is meant by none first."""
     if _draws(robot):

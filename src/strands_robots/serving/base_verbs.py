@@ -24,6 +24,12 @@ def _of_base(method: str, cannot: str) -> Run:
     return run
 
 
+def _navigates(robot: Robot) -> bool:
+    """Return True for a base with a navigation stack."""
+    body = body_of(robot)
+    return callable(getattr(body, "start_navigation", None)) and getattr(body, "nav_action", None) is not None
+
+
 DRIVE = Verb(
     "drive",
     Kind.MOTION,
@@ -39,6 +45,7 @@ DRIVE = Verb(
         ),
     ),
     returns="task_status",
+    method="start_drive",
     run=_of_base("start_drive", "drive: this robot is no mobile base."),
 )
 NAVIGATE_TO = Verb(
@@ -65,6 +72,8 @@ NAVIGATE_TO = Verb(
         ),
     ),
     returns="task_status",
+    method="start_navigation",
+    suits=_navigates,
     run=_of_base("start_navigation", "navigateTo: this robot has no navigation stack."),
 )
 

@@ -16,6 +16,7 @@ from strands_robots.envelope import Envelope, error, success
 from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS, for_robot
 from strands_robots.serving.base_verbs import DRIVE, NAVIGATE_TO
 from strands_robots.serving.control_verbs import CONTROL_VERBS
+from strands_robots.serving.offered_verbs import offered
 from strands_robots.serving.picture_verbs import PICTURE_VERBS
 from strands_robots.serving.policy_arguments import known_provider, policy_host, repository, vector
 from strands_robots.serving.reachy_verbs import REACHY_VERBS
@@ -23,11 +24,14 @@ from strands_robots.serving.robot_verbs import (
     GET_FEATURES,
     GET_STATE,
     WORLD_VERBS,
+    is_world,
     release_torque,
+    releases_torque,
     reset_world,
     start,
     status,
     step_world,
+    takes_tasks,
 )
 from strands_robots.serving.verb_schema import described
 from strands_robots.serving.verbs import (
@@ -83,6 +87,11 @@ def _peer_verb(name: str, kind: Kind, summary: str, parameters: tuple[Parameter,
     return Verb(name, kind, summary, parameters, drops_unknown=True, **carried_out)
 
 
+def _follows(robot: Robot) -> bool:
+    """Return True for a robot that takes the actions of a leader's stream."""
+    return callable(getattr(body_of(robot), "send_action", None)) and not isinstance(body_of(robot), ReachyDriver)
+
+
 def _of_reachy(verb: Verb) -> Verb:
     """Return a verb of Reachy Mini that every other robot refuses."""
     carry_out = verb.run
@@ -93,7 +102,7 @@ def _of_reachy(verb: Verb) -> Verb:
             return error(f"{verb.name}: this robot is no Reachy Mini.")
         return carry_out(body, arguments)
 
-    return replace(verb, drops_unknown=True, run=run)
+    return replace(verb, drops_unknown=True, run=run, suits=lambda robot: isinstance(body_of(robot), ReachyDriver))
 
 
 _COMMON = {"getStatus", "resume", "releaseTorque", *CONTROL_VERBS}
@@ -107,28 +116,40 @@ PEER_VERBS = table(
         _peer_verb("stop", Kind.STOP, "Stop the robot, or the named robot of a world.", (_PEER_ROBOT,)),
         _peer_verb("features", Kind.READ, GET_FEATURES.summary, method="get_features"),
         _peer_verb("state", Kind.READ, GET_STATE.summary, method="get_state"),
-        _peer_verb("execute", Kind.MOTION, "Run a policy and wait for its end.", _PEER_POLICY, lasts=True),
-        _peer_verb("start", Kind.MOTION, "Start a policy and return at once.", _PEER_POLICY, run=start),
+        _peer_verb(
+            "execute", Kind.MOTION, "Run a policy and wait for its end.", _PEER_POLICY, lasts=True, suits=takes_tasks
+        ),
+        _peer_verb(
+            "start", Kind.MOTION, "Start a policy and return at once.", _PEER_POLICY, run=start, suits=takes_tasks
+        ),
         _peer_verb(
             "step",
             Kind.MOTION,
             WORLD_VERBS["step"].summary,
             (_optional("steps", int, "Physics steps to take, 1 to 10000", between(1, 10_000)),),
             run=step_world,
+            suits=is_world,
             of_world=True,
         ),
-        _peer_verb("reset", Kind.MOTION, WORLD_VERBS["reset"].summary, run=reset_world, of_world=True),
-        _peer_verb("teleop_status", Kind.READ, "Read the counters of every input stream."),
-        _peer_verb("teleop_receive", Kind.MOTION, "Follow a leader's input stream.", (_SOURCE, _DEVICE)),
+        _peer_verb("reset", Kind.MOTION, WORLD_VERBS["reset"].summary, run=reset_world, suits=is_world, of_world=True),
+        _peer_verb("teleop_status", Kind.READ, "Read the counters of every input stream.", suits=_follows),
+        _peer_verb(
+            "teleop_receive", Kind.MOTION, "Follow a leader's input stream.", (_SOURCE, _DEVICE), suits=_follows
+        ),
         _peer_verb(
             "teleop_stop",
             Kind.READ,
             "Close the named input stream, or all of them.",
             (_optional("source_peer_id", str, _SOURCE.meaning, identifier), _DEVICE),
             urgent=True,
+            suits=_follows,
         ),
         release_torque_verb(
-            _optional("motor_ids", str, MOTOR_IDS.meaning, MOTOR_IDS.check), drops_unknown=True, run=release_torque
+            _optional("motor_ids", str, MOTOR_IDS.meaning, MOTOR_IDS.check),
+            drops_unknown=True,
+            method="release_torque",
+            run=release_torque,
+            suits=releases_torque,
         ),
         _peer_verb("resume", Kind.RESUME, RESUME.summary, (_PEER_ASSERTION,), urgent=True),
         _peer_verb("ping", Kind.READ, "Answer that the peer is there."),
@@ -146,6 +167,7 @@ PEER_VERBS = table(
 TELEOP_VERBS = tuple(name for name in PEER_VERBS if name.startswith("teleop_"))
 
 _OF_ALL = ("status", "stop", "features", "state", "resume", "ping", "describe", *CONTROL_VERBS)
+_OF_NO_ROBOT = ("ping", "describe")
 _OF_TASKS = ("execute", "start", *(name for name in PEER_VERBS if name.startswith("teleop_")))
 _OF_ARMS = (*_OF_TASKS, "releaseTorque", *ARM_MOTION_VERBS, *PICTURE_VERBS)
 
@@ -166,8 +188,8 @@ def description_of(robot: Robot | None, own: Mapping[str, Verb] = MappingProxyTy
         robot: None for a peer without one.
         own: the verbs that the robot declares.
     """
-    names = ("ping", "describe") if robot is None else KINDS[kind_of(robot)]
-    verbs = [*(PEER_VERBS[name] for name in names), *own.values()]
+    carried_out = {name: PEER_VERBS[name] for name in _OF_NO_ROBOT} if robot is None else offered(robot, PEER_VERBS)
+    verbs = [*carried_out.values(), *own.values()]
     return success(f"{len(verbs)} verbs.", functions=[described(each) for each in verbs])
 
 

@@ -6,7 +6,7 @@ import base64
 
 from strands_robots.contract import Robot
 from strands_robots.envelope import Envelope, error, success
-from strands_robots.recording.cameras import PICTURE_MAX_BYTES, camera_list, jpeg, take_picture
+from strands_robots.recording.cameras import PICTURE_MAX_BYTES, camera_list, has_cameras, jpeg, take_picture
 from strands_robots.serving.verbs import Arguments, Kind, Parameter, Verb, between, table
 from strands_robots.utils import MissingExtraError, ValidationError, text
 
@@ -46,7 +46,9 @@ def picture(robot: Robot, camera: str, width: int = WIDTH, height: int = HEIGHT)
 
 PICTURE_VERBS = table(
     [
-        Verb("listCameras", Kind.READ, "Read the names of the cameras.", returns="cameras", run=_list),
+        Verb(
+            "listCameras", Kind.READ, "Read the names of the cameras.", returns="cameras", run=_list, suits=has_cameras
+        ),
         Verb(
             "getPicture",
             Kind.READ,
@@ -64,6 +66,7 @@ PICTURE_VERBS = table(
             ),
             returns="camera, width, height, format, jpeg",
             run=_get_picture,
+            suits=has_cameras,
         ),
     ]
 )

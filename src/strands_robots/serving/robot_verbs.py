@@ -239,6 +239,30 @@ def release_torque(robot: Robot, arguments: Arguments) -> Envelope:
     return answer
 
 
+def releases_torque(robot: Any) -> bool:
+    """Return True where a robot can switch its torque off."""
+    body = body_of(robot)
+    return callable(getattr(body, "release_torque", None)) and getattr(body, "releases_torque", True) is not False
+
+
+def takes_tasks(robot: Any) -> bool:
+    """Return True for a robot that follows policies, and a world with one in it."""
+    if _holds_robots(robot):
+        return bool(robot.list_robots())
+    body = body_of(robot)
+    return callable(getattr(body, "start_task", None)) and getattr(body, "takes_tasks", True) is not False
+
+
+def is_world(robot: Any) -> bool:
+    """Return True for a world, whose physics can be stepped and reset."""
+    return _holds_robots(robot) and getattr(robot, "whole", True) is not False
+
+
+def _holds_robots(robot: Any) -> bool:
+    # Asked for every heartbeat; to check the whole contract takes 20 us.
+    return callable(getattr(robot, "list_robots", None))
+
+
 GET_FEATURES = Verb(
     "getFeatures",
     Kind.READ,
@@ -262,6 +286,7 @@ ARM_VERBS = table(
             (INSTRUCTION, POLICY_PROVIDER, DURATION, POLICY_PORT),
             returns="task_status",
             method="start_task",
+            suits=takes_tasks,
         ),
         Verb(
             "stop",
@@ -269,7 +294,7 @@ ARM_VERBS = table(
             "Stop everything that moves the robot now; the answer says whether it stopped.",
             returns="stopped, halted, not_stopped, unknown, elapsed_ms",
         ),
-        release_torque_verb(MOTOR_IDS, run=release_torque),
+        release_torque_verb(MOTOR_IDS, method="release_torque", run=release_torque, suits=releases_torque),
         RESUME,
         Verb(
             "getStatus",
@@ -295,6 +320,7 @@ WORLD_VERBS = table(
             (INSTRUCTION, POLICY_PROVIDER, DURATION, ROBOT_NAME),
             returns="robot_name",
             run=_execute,
+            suits=takes_tasks,
         ),
         Verb(
             "stop",
@@ -320,6 +346,7 @@ WORLD_VERBS = table(
             (N_STEPS,),
             returns="sim_time, step_count",
             run=step_world,
+            suits=is_world,
             critical=False,
             of_world=True,
         ),
@@ -328,6 +355,7 @@ WORLD_VERBS = table(
             Kind.MOTION,
             "Halt everything and put the world back to its initial state.",
             run=reset_world,
+            suits=is_world,
             critical=False,
             of_world=True,
         ),

@@ -23,6 +23,9 @@ Check = Callable[[str, object], Any]
 Run = Callable[[Any, Arguments], object]
 """Carries a verb out on a robot; returns an envelope. What it raises is reported as a failure inside the device."""
 
+Suits = Callable[[Any], bool]
+"""Says whether a robot can carry a verb out now."""
+
 REQUIRED: Any = object()
 """Stands for the default of a parameter that has none."""
 
@@ -116,8 +119,11 @@ class Verb:
 
     Attributes:
         summary: one sentence for callers; with ``returns`` it is the description that agents read.
-        method: the robot's method that carries the verb out, with the verb's arguments as its own.
-        run: a function in place of it, where the arguments differ. A verb with neither is the network peer's own.
+        method: the robot's method that carries the verb out, with the verb's arguments as its own. A robot that lacks
+            it does not offer the verb.
+        suits: returns False for a robot that cannot carry the verb out; None leaves that to ``method``. It is asked
+            often and on event loops, so it reads and waits for nothing.
+        run: a function that calls it, or acts in place of it. A verb with neither is the network peer's own.
         critical: False for a motion that no bystander has to fear.
         drops_unknown: arguments that it does not have, or that are None, are left out instead of refused, and an
             optional one that was not given stays out: the mesh's wire has it so.
@@ -139,6 +145,7 @@ class Verb:
     returns: str = ""
     method: str = ""
     run: Run | None = None
+    suits: Suits | None = None
     critical: bool = True
     drops_unknown: bool = False
     lasts: bool = False

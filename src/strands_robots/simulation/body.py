@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from strands_robots.kinematics.arm import Arm
+from strands_robots.kinematics.arm_parts import ArmParts
 from strands_robots.kinematics.chain import Chain
 from strands_robots.policies.base import Observation, checked_speeds
 from strands_robots.safety.gate import Permit
@@ -104,9 +105,18 @@ class RobotBody:
     @property
     def arm(self) -> Arm:
         """The robot's arm, planned in the frame of its base. Raises without one."""
-        plan = next(each for each in self._present()[0].stage.plan.robots if each.name == self.name)
-        made, speeds = arm_of(plan.source, plan.position[2], plan.tip), self.speeds
+        made, speeds = arm_of(*self._source), self.speeds
         return replace(made, speeds=speeds) if speeds else made
+
+    @property
+    def arm_parts(self) -> ArmParts:
+        """Parts of an arm that the robot has."""
+        return _parts_of(*self._source)
+
+    @property
+    def _source(self) -> tuple[ModelSource, float, str]:
+        plan = next(each for each in self._present()[0].stage.plan.robots if each.name == self.name)
+        return plan.source, plan.position[2], plan.tip
 
     @property
     def joint_units(self) -> dict[str, str]:
@@ -225,6 +235,14 @@ def arm_of(source: ModelSource, height: float, tip: str = "") -> Arm:
         ValidationError: the model has no arm.
     """
     return Arm.of(Chain(load_named(source), source.label, -height, tip))
+
+
+@cache
+def _parts_of(source: ModelSource, height: float, tip: str) -> ArmParts:
+    try:
+        return arm_of(source, height, tip).parts
+    except ValidationError:
+        return ArmParts()
 
 
 def _mobile(snapshot: Snapshot, robot: RobotParts) -> bool:

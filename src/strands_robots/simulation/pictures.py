@@ -24,6 +24,9 @@ from strands_robots.utils import flag
 class PicturesMixin:
     """Pictures of a world that has the members declared here."""
 
+    has_cameras = True
+    """Every world has an overview."""
+
     physics: Physics
     _renderer: Renderer
 

@@ -10,10 +10,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 from strands_robots import settings
-from strands_robots.arm_mixin import ArmMixin, motion_rollout
+from strands_robots.arm_mixin import ArmMixin
 from strands_robots.contract import Observer, Unsubscribe
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.kinematics.arm import Arm
+from strands_robots.kinematics.arm_parts import ArmParts
+from strands_robots.kinematics.arm_task import motion_rollout
 from strands_robots.kinematics.motion import Motion
 from strands_robots.kinematics.objects import SeenObject
 from strands_robots.policies import create_policy
@@ -518,6 +520,13 @@ class Simulation(PicturesMixin, ArmMixin, TeleopMixin):
             ValidationError: no such robot, or one without an arm.
         """
         return self.body(robot_name).arm
+
+    def arm_parts(self, robot_name: str = "") -> ArmParts:
+        """Return what one robot has of an arm; nothing for one that is not there."""
+        try:
+            return self.body(robot_name).arm_parts
+        except ValidationError:
+            return ArmParts()
 
     def targets(self, robot_name: str = "") -> dict[str, float]:
         """Return the setpoints of one robot, as :attr:`RobotBody.targets`."""

@@ -45,6 +45,7 @@ from strands_robots.device_connect.simulation_driver import SimulationDeviceDriv
 from strands_robots.drivers.ros.mobile_base import MobileBaseRobot
 from strands_robots.ros.memory import MemoryLink
 from strands_robots.safety.plane import plane
+from strands_robots.serving.offered_verbs import offered
 from strands_robots.utils import ValidationError
 
 
@@ -88,7 +89,7 @@ def test_simulation_is_found_called_and_departs(link: LinkConfig, world: ToyWorl
     with FleetClient(link, "tester") as fleet:
         (peer,) = fleet.peers(20)
         assert (peer.id, peer.type, peer.model) == ("arm-1", "strands_sim", "toy_sim")
-        assert {f["name"] for f in peer.functions} == set(SimulationDeviceDriver.verbs)
+        assert {f["name"] for f in peer.functions} == set(offered(world, SimulationDeviceDriver.verbs))
         assert fleet.call("arm-1", "getStatus")["status"] == "success"
         stop_device_connect(runtime)
         assert fleet.peers(0.6) == []

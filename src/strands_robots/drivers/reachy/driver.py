@@ -217,6 +217,9 @@ class ReachyDriver:
     holds_unconnected = True
     """:meth:`hold` reaches the daemon without the link that frames need."""
 
+    takes_tasks = False
+    """It follows no policy: :meth:`start_task` refuses."""
+
     name = "reachy_mini"
     tool_name_str = "reachy_mini"
     device_type = "reachy_mini"

@@ -77,6 +77,9 @@ class MobileBaseRobot:
         ValidationError: an argument outside its domain.
     """
 
+    takes_tasks = False
+    """It follows no policy: :meth:`start_task` refuses."""
+
     def __init__(
         self,
         node_name: str,
