@@ -182,7 +182,7 @@ def test_base_offers_no_task_and_no_arm() -> None:
 
 
 def test_peers_verbs_are_offered_by_the_same_rules(world: Simulation) -> None:
-    of_peers = {"status", "stop", "features", "state", "resume", "ping", *CONTROL_VERBS}
+    of_peers = {"status", "stop", "features", "state", "resume", "ping", "describe", *CONTROL_VERBS}
     assert set(offered(adapt(Foreign()), PEER_VERBS)) == {*of_peers, "execute", "start"}
     streams = {"teleop_status", "teleop_receive", "teleop_stop"}
     pan_tilt = {*of_peers, "execute", "start", *streams, "moveJoints", "wait"}
