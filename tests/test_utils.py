@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from strands_robots import utils
-from strands_robots.utils import ValidationError, redacted
+from strands_robots.utils import ValidationError, near, plain_text, redacted
 
 ANYTHING = st.one_of(
     st.none(),
@@ -234,3 +234,20 @@ def test_credentials_of_urls_are_left_out(text: str) -> None:
 
 def test_text_without_credentials_stays() -> None:
     assert redacted("nats://host:4222, mail ada@host") == "nats://host:4222, mail ada@host"
+
+
+def test_plain_text_has_nothing_that_a_terminal_acts_on() -> None:
+    hostile = "a\x1b[2J\x1b]52;c;AAAA\x07\u202e\x00\u200b\r\nb\x9b31m"
+    assert (plain_text(hostile), plain_text(hostile, lines=True)) == ("a b", "a \nb")
+    assert plain_text(5) == plain_text(None) == ""
+
+
+def test_cut_text_ends_in_dots() -> None:
+    assert plain_text("x" * 100_000, 10) == "xxxxxxx..."
+
+
+def test_sentence_of_names_has_those_near_or_the_first_ones() -> None:
+    assert near("moveTwo", ["moveTo", "stop"]) == " Near it: moveTo."
+    assert near("zzz", ["stop"]) == " There is: stop."
+    assert near("zzz", []) == ""
+    assert near("zzz", (f"v{number:03}" for number in range(500))).endswith("v019 and 480 more.")

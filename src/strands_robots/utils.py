@@ -1,4 +1,4 @@
-"""Value domains, identifiers and quaternions.
+"""Value domains, identifiers, texts of others and quaternions.
 
 Every check returns the value, typed, or raises :class:`ValidationError` with the argument, the value and the domain
 in its message. The edges (RPC handlers, constructors, wire decoders) call a check once; the code inside trusts its
@@ -10,8 +10,9 @@ from __future__ import annotations
 import ipaddress
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib import import_module
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +40,13 @@ _IDENTIFIER = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*\Z")
 _DEVICE_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*\Z")
 _HOSTNAME = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_-]*[A-Za-z0-9_])?(\.[A-Za-z0-9_]([A-Za-z0-9_-]*[A-Za-z0-9_])?)*\.?\Z")
 _CREDENTIALS = re.compile(r"//[^\s\"']*@")
+_ESCAPE = re.compile(
+    r"\x1b(?:\[[0-?]*[ -/]*[@-~]|[\]PX^_][^\x07\x1b]*(?:\x07|\x1b\\)?|[ -/]*[0-~])|\x9b[0-?]*[ -/]*[@-~]"
+)
 _SHOWN_MAX = 80
+
+NEAR_MAX, NAMES_MAX, NAMED_MAX = 64, 1000, 20
+"""Letters of a name and names that are compared for likeness, and names that a sentence lists."""
 
 
 class ValidationError(StrandsRobotsError, ValueError):
@@ -108,6 +115,41 @@ def shown(value: object) -> str:
     except Exception as exc:  # noqa: BLE001 - a foreign __repr__ may raise anything
         return f"a {type(value).__name__} whose repr raises {type(exc).__name__}"
     return text if len(text) <= _SHOWN_MAX else f"{text[:_SHOWN_MAX]}..."
+
+
+def plain_text(value: object, longest: int = 2000, *, lines: bool = False) -> str:
+    """Return a text of others without what a terminal would act on; "" for no text.
+
+    Args:
+        value: the text as it came.
+        longest: characters after which it is cut.
+        lines: keep line ends; else they become spaces.
+    """
+    if not isinstance(value, str):
+        return ""
+    cut = _ESCAPE.sub("", value[: 2 * longest])
+    spaced = "".join(" " if char.isspace() and char != "\n" else char for char in cut)
+    kept = "".join(char for char in spaced if char.isprintable() or char == "\n")
+    shortened = kept if len(kept) <= longest and len(value) <= 2 * longest else f"{kept[: longest - 3]}..."
+    return shortened.strip() if lines else " ".join(shortened.split())
+
+
+def alike(wanted: str, names: Iterable[str], most: int = 3) -> list[str]:
+    """Return the names that resemble ``wanted``, the nearest first."""
+    import difflib  # noqa: PLC0415 - only a name that is not there needs it
+
+    known = [name for name in islice(names, NAMES_MAX) if len(name) <= NEAR_MAX]
+    return difflib.get_close_matches(wanted[:NEAR_MAX], known, n=most, cutoff=0.4)
+
+
+def near(wanted: str, names: Iterable[str]) -> str:
+    """Return a sentence with the names that resemble one, else with all."""
+    known = sorted(name for name in islice(names, NAMES_MAX) if len(name) <= NEAR_MAX)
+    resembling = alike(wanted, known)
+    if resembling:
+        return f" Near it: {', '.join(resembling)}."
+    more = f" and {len(known) - NAMED_MAX} more" if len(known) > NAMED_MAX else ""
+    return f" There {'is' if len(known) == 1 else 'are'}: {', '.join(known[:NAMED_MAX])}{more}." if known else ""
 
 
 def field_values(instance: Any) -> dict[str, Any]:

@@ -35,15 +35,12 @@ from functools import cached_property
 from typing import Any, TypeVar, get_type_hints, overload
 
 from strands_robots.safety.gate import Permit, gate_of
-from strands_robots.utils import ValidationError, flag, number, shown, text
-from strands_robots.verb_parameters import Domain, VerbParameter, is_permit, parameter_of, plain
+from strands_robots.utils import DURATION_MAX_S, ValidationError, flag, number, plain_text, shown, text
+from strands_robots.verb_parameters import Domain, VerbParameter, is_permit, parameter_of
 
 __all__ = ["DeclaredVerb", "Domain", "Permit", "declared_verbs", "verb"]
 
 F = TypeVar("F", bound=Callable[..., Any])
-
-LASTS_MAX_S = 3600.0
-"""Longest time, in seconds, that a verb may take to return."""
 
 NAME_MAX = 64
 SUMMARY_MAX = 600
@@ -214,7 +211,7 @@ def verb(function: F | None = None, *, motion: bool = True, name: str = "", last
         ValidationError: an argument outside its domain, or ``function`` is no plain method.
     """
     flag("motion", motion)
-    seconds = number("lasts", lasts, low=0.0, high=LASTS_MAX_S)
+    seconds = number("lasts", lasts, low=0.0, high=DURATION_MAX_S)
 
     def declare(method: F) -> F:
         if not inspect.isfunction(method):
@@ -303,7 +300,7 @@ def _read_docstring(words: str) -> tuple[str, dict[str, str], str]:
             returns.append(line)
     summary = "\n".join(paragraphs).strip().split("\n\n")[0]
     return (
-        plain(summary, SUMMARY_MAX),
-        {name: plain(meaning, SUMMARY_MAX) for name, meaning in meanings.items()},
-        plain(" ".join(returns), SUMMARY_MAX),
+        plain_text(summary, SUMMARY_MAX),
+        {name: plain_text(meaning, SUMMARY_MAX) for name, meaning in meanings.items()},
+        plain_text(" ".join(returns), SUMMARY_MAX),
     )

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import inspect
 import math
-import re
 import types
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from strands_robots.safety.gate import Permit
-from strands_robots.utils import ValidationError, finite, flag, mapping, number, shown, text, whole
+from strands_robots.utils import ValidationError, finite, flag, mapping, number, plain_text, shown, text, whole
 
 TEXT_MAX = 2000
 """Characters of a text argument."""
@@ -27,9 +26,15 @@ UNIT_MAX = 32
 
 Check = Callable[[str, object], Any]
 
-_CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2066-\u2069\ufeff]+")
-
-_JSON_TYPES: dict[type, str] = {bool: "boolean", int: "integer", float: "number", str: "string"}
+JSON_TYPES: Mapping[type, str] = {
+    bool: "boolean",
+    int: "integer",
+    float: "number",
+    str: "string",
+    list: "array",
+    dict: "object",
+}
+"""Types of JSON Schema by the types of parameters."""
 
 
 @dataclass(frozen=True)
@@ -91,11 +96,6 @@ class _Kind:
     schema: dict[str, Any] = field(default_factory=dict)
 
 
-def plain(words: object, longest: int = MEANING_MAX) -> str:
-    """Return a text on one line, without control characters, cut to a length."""
-    return " ".join(_CONTROL.sub(" ", str(words)).split())[:longest]
-
-
 def is_permit(hint: Any) -> bool:
     """Return True for the type of a permit, annotated or not."""
     return hint is Permit or (get_origin(hint) is Annotated and get_args(hint)[0] is Permit)
@@ -128,7 +128,7 @@ def parameter_of(where: str, parameter: inspect.Parameter, hint: Any, meaning: s
             except ValidationError as exc:
                 raise ValidationError(f"The default of {where} is outside its domain: {exc}") from None
             schema["default"] = default
-    words = plain(meaning or " ".join(told))
+    words = plain_text(meaning or " ".join(told), MEANING_MAX)
     described = {**schema, "description": words} if words else schema
     check = kind.check if required or parameter.default is not None else _or_none(kind.check)
     return VerbParameter(parameter.name, kind.type, words, check, described, required, default)
@@ -191,7 +191,7 @@ def _number(hint: type, domain: Domain) -> _Kind:
 def _choice(where: str, values: tuple[Any, ...]) -> _Kind:
     kinds = {type(each) for each in values}
     kind = kinds.pop() if len(kinds) == 1 else None
-    if kind not in _JSON_TYPES:
+    if kind not in (bool, int, float, str):
         raise ValidationError(f"{where} must be a Literal of texts, of numbers or of booleans alone.")
 
     def check(name: str, value: object) -> Any:
@@ -200,7 +200,7 @@ def _choice(where: str, values: tuple[Any, ...]) -> _Kind:
             raise ValidationError(f"{name} must be one of {allowed}, not {shown(value)}.")
         return value
 
-    return _Kind(kind, check, {"type": _JSON_TYPES[kind], "enum": list(values)})
+    return _Kind(kind, check, {"type": JSON_TYPES[kind], "enum": list(values)})
 
 
 def _list(item: _Kind | None) -> _Kind:

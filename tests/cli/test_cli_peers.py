@@ -167,7 +167,11 @@ BREW = {
 
 
 def barista() -> Peer:
-    return Peer("bar-1", "strands_robot", functions=(BREW, {"name": "resume"}))
+    return Peer(
+        "bar-1",
+        "strands_robot",
+        functions=(BREW, {"name": "resume", "parameters": {"properties": {"assertion": {"type": "object"}}}}),
+    )
 
 
 def test_call_sends_what_the_description_says_and_waits_as_long_as_the_verb_lasts(run: Run, fleet: FakeFleet) -> None:
@@ -214,5 +218,5 @@ def test_call_without_a_function_lists_them_with_their_domains(run: Run, fleet: 
     assert "cups: integer, 1 to 8 cups; [label: string]; [strength: mild | strong]" in said
     assert "lease_id" not in said
     bare = run("peers", "echo-1").stdout
-    assert "This device has no lock, no lease and no stop." in bare
+    assert "This device has no lockout, no lease and no stop." in bare
     assert "\x1b" not in bare

@@ -45,7 +45,9 @@ BREW: dict[str, Any] = {
 
 
 def test_own_verb_has_a_form_with_its_domains_that_says_whose_it_is() -> None:
-    brew, pick = forms_of([BREW, {"name": "pick"}, {"name": "resume"}])
+    brew, pick = forms_of(
+        [BREW, {"name": "pick"}, {"name": "resume", "parameters": {"properties": {"assertion": {"type": "object"}}}}]
+    )
     assert (brew["own"], brew["kind"], brew["lasts_s"], brew["summary"]) == (True, "motion", 90.0, "Brew coffee.")
     cups, strength = brew["parameters"]
     assert (cups["low"], cups["high"], cups["unit"], cups["enum"]) == (1, 8, "cups", [])
@@ -65,5 +67,5 @@ def test_forms_of_a_hostile_description_are_bounded_plain_text() -> None:
     many = [{**BREW, "name": f"verb{n}", "description": attack, "parameters": deep} for n in range(10_000)]
     forms = forms_of([*many, {"name": 5}, {"name": "x", "parameters": {"properties": {"a": 5}, "required": 3}}])
     assert len(forms) == 100
-    assert forms[0]["summary"] == "<script>alert(1)</script>]0;owned"
+    assert forms[0]["summary"] == "<script>alert(1)</script>"
     assert len(json.dumps(forms, allow_nan=False)) < 100_000

@@ -235,9 +235,9 @@ class TestWhatItIs:
     def test_kinds_of_verbs(self, arm: RemoteRobot) -> None:
         kinds = {name: arm.verbs[name].kind for name in ("moveTo", "getStatus", "stop")}
         assert kinds == {"moveTo": "motion", "getStatus": "read", "stop": "stop"}
-        assert list(arm.verbs["moveTo"].parameters["properties"]) == ["x", "speed"]
+        assert list(arm.verbs["moveTo"].by_name) == ["x", "speed"]
         assert len(arm.verbs) == len(OURS)
-        assert LEASE.keys().isdisjoint(arm.verbs["acquireControl"].parameters["properties"])
+        assert LEASE.keys().isdisjoint(arm.verbs["acquireControl"].by_name)
 
 
 class TestEventsAndPictures:

@@ -9,16 +9,16 @@ from typing import Any
 import pytest
 
 from strands_robots.serving.advertised import (
+    TEXT_MAX,
+    TOTAL_MAX,
+    VERBS_MAX,
     AdvertisedVerb,
-    absent_safety,
+    RobotDescription,
     find_verb,
-    near,
     own_names,
-    plain_data,
     typed,
-    verbs_of,
 )
-from strands_robots.utils import ValidationError
+from strands_robots.utils import ValidationError, near
 
 BREW: dict[str, Any] = {
     "name": "brewCoffee",
@@ -36,7 +36,7 @@ BREW: dict[str, Any] = {
     },
     "labels": {"direction": "write", "safety": "critical", "own": "true", "lasts_s": "90"},
 }
-RESUME = {"name": "resume", "labels": {"direction": "write"}}
+RESUME = {"name": "resume", "parameters": {"properties": {"assertion": {"type": "object"}}}}
 
 
 def brew() -> AdvertisedVerb:
@@ -108,10 +108,28 @@ def deep(levels: int) -> dict[str, Any]:
     return schema
 
 
+def in_items(levels: int) -> dict[str, Any]:
+    schema: dict[str, Any] = {}
+    for _ in range(levels):
+        schema = {"items": schema}
+    return schema
+
+
+def with_parameters(**properties: Any) -> dict[str, Any]:
+    return {**BREW, "parameters": {"properties": properties}}
+
+
 HOSTILE: list[Any] = [
     None,
     5,
     "functions",
+    {"name": "x"},
+    [{"name": each} for each in (3, "a b", "x" * 101, "\u202eevil", "na\u00efve")],
+    [{"name": "a", "parameters": {"properties": {"x": None, "from": {}, "b c": {}, 7: {}}, "required": [[], {}]}}],
+    [{"name": "a", "labels": {"direction": ["read"], "own": {}, "lasts_s": "nan"}}, {"name": "a"}],
+    [with_parameters(**{f"p{number}": {} for number in range(5000)})],
+    [with_parameters(x={str(key): [] for key in range(100_000)})],
+    [with_parameters(x={"type": ["number"], "default": float("nan"), "minimum": 10**400, "enum": {"a": 1}, "unit": 3})],
     [None, 5, "x", [], {}, {"name": 5}, {"name": ""}, {"name": "\x1b[31mstop"}, {"name": "x" * 10_000}],
     [{**BREW, "parameters": each} for each in (None, 5, "x", [], {"properties": []}, {"properties": {"a": 5, 3: {}}})],
     [{**BREW, "labels": each} for each in (None, 5, [], {"direction": ["read"], "own": True, "lasts_s": 90})],
@@ -140,7 +158,8 @@ HOSTILE: list[Any] = [
 @pytest.mark.parametrize("functions", HOSTILE)
 def test_hostile_description_is_read_as_plain_data_within_bounds(functions: Any) -> None:
     began = time.monotonic()
-    for verb in verbs_of(functions):
+    description = RobotDescription.of(functions)
+    for verb in description.verbs.values():
         said = json.dumps([verb.schema(), verb.description, verb.name, verb.takes, verb.lasts_s], allow_nan=False)
         assert len(said) < 64_000
         assert not set("\x1b\x07\u202e\ud800") & set(verb.description + verb.name)
@@ -148,30 +167,85 @@ def test_hostile_description_is_read_as_plain_data_within_bounds(functions: Any)
         assert all(
             typed(each, "x", "x") == "x" for each in verb.parameters if each.type == "string" and not each.choices
         )
-    absent_safety(functions)
+    assert not set("\x1b\x07\u202e\ud800") & set("".join(description.left_out))
     assert time.monotonic() - began < 5.0
 
 
-def test_ten_thousand_verbs_cost_bounded_work_and_each_is_found() -> None:
-    functions = [{**BREW, "name": f"verb{number}"} for number in range(10_000)]
-    assert len(verbs_of(functions)) == 1000
+def test_more_verbs_than_the_bound_are_left_out_and_each_is_found() -> None:
+    functions = [{"name": f"verb{number}"} for number in range(10_000)]
+    read = RobotDescription.of(functions)
+    assert len(read.verbs) == VERBS_MAX
+    assert read.left_out == ("9500 verbs after the first 500",)
     assert find_verb(functions, "verb9999") is not None
     assert len(near("zzz", (each["name"] for each in functions))) < 1000
 
 
-def test_schema_is_cut_at_its_depth() -> None:
-    copied, depth = plain_data(deep(500)), 0
-    while isinstance(copied, dict) and "properties" in copied:
-        copied, depth = (copied["properties"] or {}).get("a"), depth + 2
-    assert depth <= 8
+def test_all_verbs_together_take_no_more_than_the_bound_and_own_ones_come_first() -> None:
+    many = [{"name": f"verb{number}", "description": "x" * 5000} for number in range(400)]
+    read = RobotDescription.of([*many, BREW])
+    taken = sum(len(verb.description) for verb in read.verbs.values())
+    assert 0 < taken <= TOTAL_MAX
+    assert all(len(verb.description) <= TEXT_MAX for verb in read.verbs.values())
+    assert read.left_out[-1].endswith("more")
+    assert list(read.verbs)[-1] == "brewCoffee", "own verbs are read first, and keep their place"
 
 
-def test_device_without_a_lock_is_said_to_have_none() -> None:
-    assert absent_safety([{"name": "echo"}]) == "This device has no lock, no lease and no stop."
-    assert absent_safety([{"name": "stop"}]) == "This device has no lock and no lease."
-    assert absent_safety([RESUME, {"name": "acquireControl"}, {"name": "stop"}]) == ""
-    assert all(verb.own for verb in verbs_of([{"name": "pick"}])), "each verb of such a device is its own"
-    assert [verb.own for verb in verbs_of([RESUME, {"name": "pick"}])] == [False, False]
+def test_bulky_robot_costs_bounded_time() -> None:
+    bulky = with_parameters(
+        **{f"p{number}": dict.fromkeys(map(str, range(10_000)), "\x00" * 5000) for number in range(90)}
+    )
+    began = time.monotonic()
+    read = RobotDescription.of([{**bulky, "name": f"a{number}"} for number in range(10_000)])
+    assert time.monotonic() - began < 5
+    assert read.left_out
+
+
+@pytest.mark.parametrize("schema", [in_items(9), in_items(500), in_items(100_000), deep(500)])
+def test_deep_schema_is_left_out_and_its_verb_stays_and_may_be_given_it(schema: dict[str, Any]) -> None:
+    read = RobotDescription.of([with_parameters(fast={"type": "number"}, deep=schema)])
+    assert list(read.verbs["brewCoffee"].by_name) == ["fast"]
+    assert "parameter deep of brewCoffee, nested deeper than 8" in read.left_out
+    assert read.verbs["brewCoffee"].unknown(["deep"]) == ""
+
+
+def test_choice_with_more_values_than_are_read_is_left_to_the_robot() -> None:
+    verb = RobotDescription.of([with_parameters(cup={"enum": list(range(100))})]).verbs["brewCoffee"]
+    assert verb.by_name["cup"].problem(99) == verb.by_name["cup"].problem(200) == ""
+
+
+def test_second_verb_of_a_name_is_left_out() -> None:
+    read = RobotDescription.of([{"name": "a", "description": "First."}, {"name": "a"}])
+    assert (read.verbs["a"].description, read.left_out) == ("First.", ("a second verb a",))
+
+
+def test_own_verbs_reads_and_stops_are_told_apart() -> None:
+    labels = {"direction": "read", "own": "true", "lasts_s": "90"}
+    read = RobotDescription.of([RESUME, {"name": "beansLeft", "labels": labels}, {"name": "stop", "labels": labels}])
+    verb = read.verbs["beansLeft"]
+    assert (verb.kind, verb.own, verb.lasts_s) == ("read", True, 90.0)
+    assert (read.verbs["stop"].kind, read.verbs["resume"].kind) == ("stop", "motion")
+
+
+@pytest.mark.parametrize(
+    ("names", "lacking", "said"),
+    [
+        (["echo", "resume"], ("lockout", "lease", "stop"), "This device has no lockout, no lease and no stop."),
+        (["stopMotion", "acquireControl"], ("lockout", "lease"), "This device has no lockout and no lease."),
+        (["stop", "acquireControl", "renewControl", "releaseControl"], ("lockout",), "This device has no lockout."),
+    ],
+)
+def test_device_without_a_lockout_is_said_to_have_none(names: list[str], lacking: tuple[str, ...], said: str) -> None:
+    read = RobotDescription.of([{"name": name} for name in names])
+    assert (read.lacking, read.absent) == (lacking, said)
+    assert all(verb.own for verb in read.verbs.values()), "each verb of such a device is its own"
+
+
+def test_robot_of_ours_lacks_nothing_however_many_verbs_it_has() -> None:
+    safety = [{"name": name} for name in ("stop", "acquireControl", "renewControl", "releaseControl")]
+    read = RobotDescription.of([*({"name": f"verb{number}"} for number in range(500)), RESUME, *safety])
+    assert (read.lacking, read.absent) == ((), "")
+    assert "resume" not in read.verbs
+    assert not read.verbs["verb1"].own
 
 
 def test_names_of_presence_are_read_as_data() -> None:

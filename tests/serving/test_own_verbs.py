@@ -43,6 +43,27 @@ def test_name_of_a_stop_or_of_another_verb_is_refused_by_name(name: str) -> None
         own_verbs(with_verb(method, name=name))
 
 
+@pytest.mark.parametrize(
+    "name", ["robot_name", "source_device", "lease_id", "lease_ttl_s", "action", "timeout", "function_name"]
+)
+def test_parameter_of_a_name_that_travels_in_another_sense_is_refused_by_name(name: str) -> None:
+    namespace: dict[str, Any] = {}
+    exec(f"def brew(self, {name}: str) -> None: ...", namespace)
+    with pytest.raises(ValidationError, match=f"brew cannot have the parameter {name}, which goes with a call"):
+        own_verbs(with_verb(namespace["brew"], motion=False))
+
+
+def test_verb_that_callers_could_not_read_is_refused() -> None:
+    def brew(self: object, cups: object) -> None: ...
+
+    cups: Any = int
+    for _ in range(7):
+        cups = list[cups]
+    brew.__annotations__["cups"] = cups
+    with pytest.raises(ValidationError, match="would not see parameter cups of brew, nested deeper than 8"):
+        own_verbs(with_verb(brew, motion=False))
+
+
 def test_motion_that_no_stop_would_end_is_refused_at_registration() -> None:
     def brew(self: object) -> None: ...
 

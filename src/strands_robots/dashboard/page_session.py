@@ -27,11 +27,11 @@ from strands_robots.envelope import Envelope, error, is_error, jsonable, text_of
 from strands_robots.recording.cameras import OVERVIEW
 from strands_robots.safety.stopping import grade
 from strands_robots.safety.unheard import Unheard, unheard_now
+from strands_robots.serving.advertised import STOPS
 from strands_robots.utils import ValidationError, shown, text
 
 logger = logging.getLogger(__name__)
 
-STOPS = ("stop", "stopMotion")
 HALTED = "halted here"
 
 TICK_S, SLOW_TICKS = 0.05, 10

@@ -7,10 +7,11 @@ from collections.abc import Iterable, Mapping
 from itertools import islice
 from typing import Any
 
-from strands_robots.serving.advertised import AdvertisedParameter, AdvertisedVerb, verbs_of
+from strands_robots.serving.advertised import AdvertisedParameter, AdvertisedVerb, RobotDescription
 from strands_robots.serving.control_verbs import CONTROL_VERBS
 from strands_robots.serving.peer_verbs import PEER_VERBS
-from strands_robots.serving.verbs import REQUIRED, Kind, Verb
+from strands_robots.serving.verb_schema import described
+from strands_robots.serving.verbs import Verb
 
 LEFT_OUT = frozenset({*CONTROL_VERBS, "resume", "ping", "teleop_status", "teleop_receive", "teleop_stop"})
 """Verbs that the page has a control of its own for, or none."""
@@ -43,37 +44,17 @@ _CHOICES = (
 """What a parameter's description says of its values: the page lets them be chosen."""
 
 _NUMBERS = ("number", "integer")
-_TYPES = {float: "number", int: "integer", bool: "boolean", str: "string", dict: "object", list: "array"}
 
 
 def forms_of(functions: Iterable[Mapping[str, Any]]) -> tuple[dict[str, Any], ...]:
     """Return the forms of a device's functions, as it describes them on the network."""
-    verbs = (each for each in verbs_of(list(functions)) if each.name not in LEFT_OUT)
+    verbs = (each for each in RobotDescription.of(list(functions)).verbs.values() if each.name not in LEFT_OUT)
     return tuple(_form(each) for each in islice(verbs, FORMS_MAX))
 
 
 def peer_forms(verbs: Iterable[Verb] = tuple(PEER_VERBS.values())) -> tuple[dict[str, Any], ...]:
     """Return the forms of a mesh peer, which has the same verbs as every other."""
-    return forms_of([_described(verb) for verb in verbs])
-
-
-def _described(verb: Verb) -> dict[str, Any]:
-    """Return one of our verbs as a device describes it."""
-    properties = {
-        each.name: {
-            "type": _TYPES.get(each.type, "string"),
-            "description": each.meaning,
-            **({} if each.default is REQUIRED else {"default": each.default}),
-        }
-        for each in verb.parameters
-    }
-    required = [each.name for each in verb.parameters if each.default is REQUIRED]
-    return {
-        "name": verb.name,
-        "description": verb.summary,
-        "parameters": {"properties": properties, "required": required},
-        "labels": {"direction": "read" if verb.kind is Kind.READ else "write"},
-    }
+    return forms_of([described(verb) for verb in verbs])
 
 
 def _form(verb: AdvertisedVerb) -> dict[str, Any]:

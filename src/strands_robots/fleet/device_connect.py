@@ -16,8 +16,7 @@ from strands_robots.errors import (
     UnreachableError,
 )
 from strands_robots.fleet.adapter import DEVICE_CONNECT, FIND_S, STOP_S, FoundRobot, OnEvent, RobotEvent
-from strands_robots.fleet.description import plain_text
-from strands_robots.utils import ValidationError
+from strands_robots.utils import ValidationError, plain_text
 
 if TYPE_CHECKING:
     from strands_robots.device_connect.backends import LinkConfig

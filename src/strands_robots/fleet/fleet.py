@@ -12,10 +12,9 @@ from strands_robots._mesh_switch import mesh_env_request
 from strands_robots.errors import NoSuchRobotError, RefusalError, UnreachableError
 from strands_robots.fleet.adapter import DEVICE_CONNECT, FIND_S, MESH, STOP_S, FoundRobot, NetworkAdapter
 from strands_robots.fleet.link_flags import LinkFlags
-from strands_robots.fleet.refusals import near
 from strands_robots.fleet.remote_robot import RemoteRobot, combined, verdict_of_answer
 from strands_robots.safety.stopping import StopVerdict
-from strands_robots.utils import device_id
+from strands_robots.utils import device_id, near
 
 SOURCE = "strands-robots"
 """Caller's name where none is given."""
@@ -189,12 +188,8 @@ class Fleet:
         if robot not in self._robots:
             self.robots()
         if robot not in self._robots:
-            remedy = " ".join(
-                filter(
-                    None,
-                    [near(robot, self._robots, "robots"), *(f"Not joined: {n}, {w}." for n, w in self.absent.items())],
-                )
-            )
+            absent = "".join(f" Not joined: {name}, {why}." for name, why in self.absent.items())
+            remedy = f"{near(robot, self._robots)}{absent}".strip()
             raise NoSuchRobotError(f"No robot {robot[:100]!r} is in reach", remedy=remedy)
         return self._robots[robot]
 

@@ -17,13 +17,12 @@ from strands_robots import settings
 from strands_robots.envelope import Envelope, error, is_error
 from strands_robots.errors import ArgumentsError, NoAnswerError, NoSuchRobotError, UnreachableError
 from strands_robots.fleet.adapter import FIND_S, MESH, STOP_S, FoundRobot, OnEvent, RobotEvent
-from strands_robots.fleet.description import plain_text
 from strands_robots.fleet.refusals import refusal_of_text
 from strands_robots.safety.peer_answers import enrolled_peers, stop_distrust
 from strands_robots.safety.statements import ALARM
 from strands_robots.safety.stopping import explain, grade
 from strands_robots.serving.verb_schema import described
-from strands_robots.utils import MissingExtraError, ValidationError, finite
+from strands_robots.utils import MissingExtraError, ValidationError, finite, plain_text
 
 if TYPE_CHECKING:
     from strands_robots.mesh import Mesh

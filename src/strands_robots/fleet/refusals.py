@@ -6,8 +6,7 @@ fields, and an answer of the mesh, which is a text, by its words.
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from strands_robots.envelope import text_of
@@ -22,8 +21,8 @@ from strands_robots.errors import (
     RobotError,
     UnknownVerbError,
 )
-from strands_robots.fleet.description import plain_text
 from strands_robots.serving.pipeline import RefusalReason
+from strands_robots.utils import plain_text
 
 WHY_MAX = 500
 
@@ -87,14 +86,3 @@ def refusal_of_text(robot: str, verb: str, text: object, answer: Mapping[str, An
         return known[0](known[1], robot=robot, verb=verb, envelope=answer)
     cause = next((each for words, each in WORDS if words in why), RobotError)
     return cause(why.removeprefix("validation: ") or "it gave no reason", robot=robot, verb=verb, envelope=answer)
-
-
-def near(wanted: str, names: Collection[str], what: str) -> str:
-    """Return a sentence with the names that resemble ``wanted``, else with all."""
-    alike = difflib.get_close_matches(wanted[:100], names, n=3, cutoff=0.5)
-    listed = alike or sorted(names)[:20]
-    return (
-        f"{'Near it' if alike else f'Its {what}' if what == 'verbs' else 'There are'}: {', '.join(listed)}."
-        if listed
-        else ""
-    )

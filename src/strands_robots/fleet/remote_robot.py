@@ -20,11 +20,13 @@ from typing import TYPE_CHECKING, Any, Self
 from strands_robots.envelope import Envelope, is_error
 from strands_robots.errors import AmbiguousRobotError, NoSuchRobotError, RefusalError, RobotError, UnknownVerbError
 from strands_robots.fleet.adapter import STOP_S, FoundRobot, NetworkAdapter, RobotEvent
-from strands_robots.fleet.description import RobotDescription, VerbDescription, plain_text, python_name
+from strands_robots.fleet.description import docstring, python_name, signature
 from strands_robots.fleet.lease import HeldLease
-from strands_robots.fleet.refusals import near, refusal_of
+from strands_robots.fleet.refusals import refusal_of
 from strands_robots.safety.stopping import StopVerdict, graded
-from strands_robots.utils import WAIT_S, number, optional_module
+from strands_robots.serving.advertised import AdvertisedVerb, RobotDescription
+from strands_robots.serving.verbs import LEASE_ID
+from strands_robots.utils import DURATION_MAX_S, WAIT_S, near, number, optional_module, plain_text
 
 if TYPE_CHECKING:
     import numpy as np
@@ -108,7 +110,7 @@ class RemoteRobot:
         return self._network.name
 
     @property
-    def verbs(self) -> Mapping[str, VerbDescription]:
+    def verbs(self) -> Mapping[str, AdvertisedVerb]:
         """Its verbs by their names on the wire."""
         return self._described.verbs
 
@@ -120,18 +122,17 @@ class RemoteRobot:
     @property
     def has_stop(self) -> bool:
         """True where it has a stop."""
-        return any(verb.kind == "stop" for verb in self.verbs.values())
+        return "stop" not in self._described.lacking
 
     @property
     def has_lockout(self) -> bool:
         """True where an emergency stop locks it until the operator's resume."""
-        resume = self.verbs.get("resume")
-        return resume is not None and "assertion" in resume.parameters.get("properties", {})
+        return "lockout" not in self._described.lacking
 
     @property
     def has_lease(self) -> bool:
         """True where :meth:`control` keeps other callers from moving it."""
-        return self.verbs.keys() >= {"acquireControl", "renewControl", "releaseControl"}
+        return "lease" not in self._described.lacking
 
     def call(self, verb: str, /, *, timeout: float | None = None, **arguments: Any) -> dict[str, Any]:
         """Call a verb by its name on the wire and return the robot's answer.
@@ -244,7 +245,7 @@ class RemoteRobot:
         Raises:
             RefusalError: the world does not answer.
         """
-        if not any(ROBOT_NAME in each.parameters.get("properties", {}) for each in self.verbs.values()):
+        if not any(ROBOT_NAME in each.by_name for each in self.verbs.values()):
             return {}
         named = self.status().get("robots")
         names = [each for each in named if isinstance(each, str)] if isinstance(named, Mapping | list) else []
@@ -301,7 +302,7 @@ class RemoteRobot:
         """Read what the network has of its verbs."""
         return RobotDescription.of(functions)
 
-    def _sent(self, verb: VerbDescription | None, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    def _sent(self, verb: AdvertisedVerb | None, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         """Return the arguments as they are sent."""
         del verb
         return arguments
@@ -314,12 +315,11 @@ class RemoteRobot:
         self._found, self._network, self._description = found, network, None
 
     def _lacking(self) -> str:
-        has = {"lockout": self.has_lockout, "lease": self.has_lease, "stop": self.has_stop}
-        return ", ".join(f"no {name}" for name, there in has.items() if not there)
+        return ", ".join(f"no {name}" for name in self._described.lacking)
 
-    def _method(self, name: str, verb: VerbDescription) -> Callable[..., dict[str, Any]]:
-        signature = verb.signature()
-        positional = tuple(signature.parameters)
+    def _method(self, name: str, verb: AdvertisedVerb) -> Callable[..., dict[str, Any]]:
+        stated = signature(verb)
+        positional = tuple(stated.parameters)
 
         def method(*values: Any, **arguments: Any) -> dict[str, Any]:
             if values:
@@ -329,8 +329,8 @@ class RemoteRobot:
         lacking = self._lacking()
         method.__name__ = name
         method.__qualname__ = f"{type(self).__name__}.{name}"
-        method.__doc__ = verb.docstring(f"This robot has {lacking}." if lacking else "")
-        vars(method)["__signature__"] = signature
+        method.__doc__ = docstring(verb, f"This robot has {lacking}." if lacking else "")
+        vars(method)["__signature__"] = stated
         return method
 
     def _call(self, verb: str, arguments: Mapping[str, Any], timeout: float | None) -> dict[str, Any]:
@@ -338,8 +338,8 @@ class RemoteRobot:
         if (description is None or description.kind == "motion") and verb not in OF_THE_HOLDER:
             self._refuse_ambiguous(verb)
             held = self._lease
-            if held is not None and description is not None and description.leased and "lease_id" not in arguments:
-                arguments = {**arguments, "lease_id": held.lease_id}
+            if held is not None and description is not None and LEASE_ID in description.leases - arguments.keys():
+                arguments = {**arguments, LEASE_ID: held.lease_id}
         if timeout is None:
             timeout = _patience(description, arguments)
         try:
@@ -362,7 +362,7 @@ class RemoteRobot:
     def _unknown(self, verb: str) -> UnknownVerbError:
         named = [*self.verbs, *self._names]
         called = ", ".join(name for name in self.verbs if python_name(name) == verb)
-        remedy = f"Reach it by call(): {called}." if called else near(verb, named, "verbs")
+        remedy = f"Reach it by call(): {called}." if called else near(verb, named).strip()
         return UnknownVerbError(f"It has no verb {verb[:100]}", robot=self.id, verb=verb, remedy=remedy)
 
 
@@ -401,20 +401,19 @@ class RobotOfWorld(RemoteRobot):
         whole = super()._bounded(functions)
         return replace(whole, verbs={name: verb for name, each in whole.verbs.items() if (verb := _of_one(each))})
 
-    def _sent(self, verb: VerbDescription | None, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-        named = verb is not None and ROBOT_NAME in self._world.verbs[verb.name].parameters.get("properties", {})
+    def _sent(self, verb: AdvertisedVerb | None, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+        named = verb is not None and ROBOT_NAME in self._world.verbs[verb.name].by_name
         return {**arguments, ROBOT_NAME: self._name} if named else arguments
 
     def _stopped_on(self, network: NetworkAdapter) -> object:
         return _stopped(self.address, network, self._name)
 
 
-def _of_one(verb: VerbDescription) -> VerbDescription | None:
+def _of_one(verb: AdvertisedVerb) -> AdvertisedVerb | None:
     """Return a verb of a world as one robot has it; None for one of all robots."""
-    properties = dict(verb.parameters.get("properties", {}))
-    if properties.pop(ROBOT_NAME, None) is None and verb.kind == "motion":
+    if ROBOT_NAME not in verb.by_name and verb.kind == "motion":
         return None
-    return replace(verb, parameters={**verb.parameters, "properties": properties})
+    return replace(verb, parameters=tuple(each for each in verb.parameters if each.name != ROBOT_NAME))
 
 
 _RESERVED = frozenset(dir(RemoteRobot))
@@ -497,14 +496,14 @@ def _stopped(robot: str, network: NetworkAdapter, robot_name: str = "") -> objec
         return {"status": "error", "stopped": None, "reason": f"{type(exc).__name__}: {exc}"}
 
 
-def _patience(verb: VerbDescription | None, arguments: Mapping[str, Any]) -> float:
+def _patience(verb: AdvertisedVerb | None, arguments: Mapping[str, Any]) -> float:
     """Return the seconds in which a verb has to answer."""
     if verb is None:
         return CALL_S
-    lasts, duration = verb.lasts_s, arguments.get("duration")
-    if lasts and isinstance(duration, int | float) and 0 < duration <= 3600:
+    lasts, duration, waits = verb.lasts_s, arguments.get("duration"), verb.name == "wait" or "wait" in verb.by_name
+    if lasts and isinstance(duration, int | float) and 0 < duration <= DURATION_MAX_S:
         lasts = max(lasts, float(duration))
-    return CALL_S + (WAIT_S if verb.waits else 0.0) + lasts
+    return CALL_S + (WAIT_S if waits else 0.0) + lasts
 
 
 def _named(verb: str, positional: Sequence[str], values: Sequence[Any], arguments: Mapping[str, Any]) -> dict[str, Any]:

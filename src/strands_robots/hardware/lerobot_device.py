@@ -7,7 +7,6 @@ LeRobot keeps its devices in registries of configuration classes (``RobotConfig`
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import logging
 import pkgutil
 from collections.abc import Mapping
@@ -17,7 +16,7 @@ from typing import Any, Literal
 from strands_robots.hardware._compat import lerobot_module, light
 from strands_robots.hardware.calibration import calibrate_from
 from strands_robots.hardware.device_facts import check_port
-from strands_robots.utils import ValidationError, mapping, missing_extra, shown
+from strands_robots.utils import ValidationError, alike, mapping, missing_extra, shown
 
 logger = logging.getLogger(__name__)
 
@@ -58,8 +57,8 @@ def make_device(name: str, options: Mapping[str, Any], role: Role = "follower", 
     known: dict[str, Any] = getattr(devices, registry).get_known_choices()
     kind = name if name in known else f"{name}_{role}"
     if kind not in known:
-        near = difflib.get_close_matches(str(name), known, n=4, cutoff=0.4)
-        hint = f"near it: {', '.join(near)}" if near else f"known: {', '.join(sorted(known))}"
+        similar = alike(str(name), known)
+        hint = f"near it: {', '.join(similar)}" if similar else f"known: {', '.join(sorted(known))}"
         raise ValidationError(f"name must be a LeRobot {role} type, not {shown(name)}; {hint}.")
     fields = dict(options)
     calibration = fields.pop("calibration", None)

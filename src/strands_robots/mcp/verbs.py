@@ -9,21 +9,20 @@ from strands_robots.device_connect.discovery import Peer
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.mcp.results import row
 from strands_robots.serving.advertised import (
+    STOPS,
     AdvertisedVerb,
-    absent_safety,
+    RobotDescription,
     find_verb,
     fitting,
-    near,
     verb_names,
-    verbs_of,
 )
-from strands_robots.utils import shown
+from strands_robots.utils import near, shown
 
 VERBS_BYTES = 28_000
 """Size of a robot's verbs in its description, which is in an answer twice as well: 64 kB in all."""
 
 INSTEAD = {
-    **dict.fromkeys(("stop", "stopMotion"), "use stop"),
+    **dict.fromkeys(STOPS, "use stop"),
     "emergencyStop": "use emergency_stop",
     "acquireControl": "use acquire_control",
     "releaseControl": "use release_control",
@@ -37,14 +36,14 @@ INSTEAD = {
 
 def described(peer: Peer) -> Envelope:
     """Return a robot's description: its verbs in its own words, within a bound."""
-    known = [each for each in verbs_of(peer.functions) if each.name not in INSTEAD]
+    description = RobotDescription.of(peer.functions)
+    known = [each for each in description.verbs.values() if each.name not in INSTEAD]
     # Its own ones first: the others are known without it.
     rows = [_verb_row(each) for each in sorted(known, key=lambda each: not each.own)]
     verbs = fitting(rows, VERBS_BYTES)
     more = sum(name not in INSTEAD for name in verb_names(peer.functions)) - len(verbs)
     left_out = {"verbs_left_out": more} if more else {}
-    absent = absent_safety(peer.functions)
-    note = {"note": absent} if absent else {}
+    note = {"note": description.absent} if description.absent else {}
     return success("Described, in the robot's words.", **row(peer), **note, **left_out, verbs=verbs)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import inspect
 from collections.abc import Callable
 from importlib import import_module
@@ -12,7 +11,7 @@ from urllib.parse import urlsplit
 
 from strands_robots.policies.base import Action, Policy, Ranges
 from strands_robots.policies.profiles import Profile, profiles
-from strands_robots.utils import ValidationError, shown
+from strands_robots.utils import ValidationError, alike, shown
 
 __all__ = ["ALIASES", "Action", "Policy", "Ranges", "create_policy", "policy_names", "resolve_provider"]
 
@@ -51,7 +50,7 @@ def resolve_provider(provider: object) -> str:
     name = ALIASES.get(provider, provider) if isinstance(provider, str) else ""
     if name in names:
         return name
-    similar = difflib.get_close_matches(str(name), names, n=3)
+    similar = alike(str(name), names)
     hint = f" Did you mean {' or '.join(similar)}?" if similar else ""
     raise ValidationError(f"policy_provider must be one of {', '.join(names)}, not {shown(provider)}.{hint}")
 

@@ -1,41 +1,68 @@
 """Verbs as a robot advertises them, read from its description within bounds.
 
-A description is data of its robot. Whatever it holds, nothing raises here, texts are plain, and the work is bounded.
+A description is data of its robot. Whatever it holds, nothing raises here, the work is bounded, and texts lose control
+characters, terminal escapes and invisible characters. What is out of bounds is left out and named: more than
+:data:`VERBS_MAX` verbs or :data:`TOTAL_MAX` characters, names that are no identifiers, a schema that nests deeper than
+:data:`DEPTH_MAX`.
 """
 
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import islice
 from math import isfinite
-from typing import Any, TypeAlias, TypeVar
+from types import MappingProxyType
+from typing import Any, Literal, TypeAlias, TypeVar
 
+from strands_robots.errors import StrandsRobotsError
 from strands_robots.serving.verbs import LEASE_NAMES
-from strands_robots.utils import ValidationError, shown
+from strands_robots.utils import DURATION_MAX_S, ValidationError, plain_text, shown
+from strands_robots.verb_parameters import JSON_TYPES, UNIT_MAX
 
-VERBS_MAX, PARAMETERS_MAX, CHOICES_MAX = 1000, 64, 64
+TOTAL_MAX, VERB_MAX = 64_000, 16_000
+"""Characters that all verbs of a robot may take together, and those of one verb."""
+
+VERBS_MAX, PARAMETERS_MAX, CHOICES_MAX = 500, 64, 64
 """Verbs of a robot, parameters of a verb and values of a choice that are read."""
 
-NAME_MAX, UNIT_MAX, TEXT_MAX = 100, 20, 2000
+DEPTH_MAX = 8
+"""Levels of a verb's parameters, counted from their JSON Schema."""
 
-DEPTH_MAX, NODES_MAX = 8, 500
-"""Nesting of a verb's schema, and values of one parameter's, that are read."""
+NAME_MAX, TEXT_MAX = 100, 2_000
+
+LEFT_OUT_MAX = 20
+"""Things left out that are named one by one."""
+
+NODE = 8
+"""Characters that a value counts besides its text, so that many small ones are bounded too."""
 
 WHOLE_MAX = 2**63
 """Bound of a whole number; Python takes the square of the digits' number to write one."""
 
-LASTS_MAX_S = 3600.0
-
-NEAR_MAX, NAMED_MAX = 64, 40
-"""Letters of a name that are compared for likeness, and names that a sentence lists."""
+STOPS = ("stop", "stopMotion")
 
 T = TypeVar("T")
 Scalar: TypeAlias = str | int | float | bool
+VerbKind = Literal["read", "motion", "stop"]
 
-_LOCK = "resume"
-"""Verb of each robot that an emergency stop locks: a device without it has its functions alone."""
+PYTHON_TYPES: Mapping[str, type] = {name: kind for kind, name in JSON_TYPES.items()}
+"""Types in Python by those of JSON Schema."""
+
+_WORDS = {
+    "integer": "a whole number",
+    "number": "a number",
+    "boolean": "true or false",
+    "array": "a list as JSON",
+    "object": "an object as JSON",
+}
+_NAME = re.compile(rf"[A-Za-z_][A-Za-z0-9_]{{0,{NAME_MAX - 1}}}\Z")
+
+
+class _OutOfBoundsError(StrandsRobotsError, ValueError):
+    """A value that is left out; the text says why."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +93,7 @@ class AdvertisedParameter:
         """Values that it may have, as in ``integer, 1 to 8 cups`` or ``mild | strong``."""
         if self.choices:
             return " | ".join(each if isinstance(each, str) else json.dumps(each) for each in self.choices)
-        kind, bounds = self.type or "any", self._bounds
+        kind, bounds = self.type or "any", self.bounds
         measured = " ".join(filter(None, (bounds, self.unit)))
         return f"{kind}, {measured}" if measured else kind
 
@@ -79,11 +106,12 @@ class AdvertisedParameter:
         if isinstance(value, int | float) and not kind:
             outside = (self.low is not None and value < self.low) or (self.high is not None and value > self.high)
             if outside:
-                return f"{self.name} must be {self._bounds}{f' {self.unit}' if self.unit else ''}, not {shown(value)}."
+                return f"{self.name} must be {self.bounds}{f' {self.unit}' if self.unit else ''}, not {shown(value)}."
         return ""
 
     @property
-    def _bounds(self) -> str:
+    def bounds(self) -> str:
+        """Its bounds in words; empty without any."""
         if self.low is not None and self.high is not None:
             return f"{self.low:g} to {self.high:g}"
         if self.low is not None:
@@ -99,20 +127,25 @@ class AdvertisedVerb:
         description: in plain lines; ``summary`` is its first one.
         parameters: without those of the lease, which ``leases`` names.
         leases: the parameters of the lease that it takes.
-        reads: it is declared a read; anything else counts as a motion.
+        kind: ``read``, ``motion`` or ``stop``; what does not say that it reads is a motion.
         own: it is declared one of the robot's own, or the robot is none of ours.
-        lasts_s: seconds that it may take before it answers.
-        stated: its parameters are stated; else it may take any.
+        lasts_s: seconds that it may take before it answers; 0 for a verb that answers soon.
+        stated: all its parameters are known; else it may take any.
     """
 
     name: str
     description: str
     parameters: tuple[AdvertisedParameter, ...]
     leases: frozenset[str]
-    reads: bool
+    kind: VerbKind
     own: bool
     lasts_s: float
     stated: bool
+
+    @property
+    def reads(self) -> bool:
+        """True for a read."""
+        return self.kind == "read"
 
     @property
     def summary(self) -> str:
@@ -140,22 +173,63 @@ class AdvertisedVerb:
     def unknown(self, names: Iterable[str]) -> str:
         """Return the refusal of arguments that it does not have, or nothing."""
         known = [each.name for each in self.parameters]
-        absent = [shown(name) for name in names if name in LEASE_NAMES or (self.stated and name not in known)]
+        absent = [shown(each) for each in names if each not in known and (self.stated or each in LEASE_NAMES)]
         if not absent:
             return ""
         return f"{self.name} takes no argument {', '.join(absent[:3])}; its arguments: {', '.join(known) or 'none'}."
 
 
-def verbs_of(functions: object, most: int = VERBS_MAX) -> list[AdvertisedVerb]:
-    """Return a robot's verbs, each name once; what is no description is left out."""
-    own = _LOCK not in verb_names(functions)
-    return list({each["name"]: _verb(each, own) for each in islice(_rows(functions), most)}.values())
+@dataclass(frozen=True, slots=True)
+class RobotDescription:
+    """Verbs of a robot by their names on the wire.
+
+    Attributes:
+        left_out: parts of the description that are out of bounds.
+        lacking: what a device that is none of ours may not have: a lockout, a lease, a stop.
+    """
+
+    verbs: Mapping[str, AdvertisedVerb] = field(default_factory=dict)
+    left_out: tuple[str, ...] = ()
+    lacking: tuple[str, ...] = ("lockout", "lease", "stop")
+
+    @classmethod
+    def of(cls, functions: object) -> RobotDescription:
+        """Read the functions that a robot announces; never raises."""
+        if not isinstance(functions, list | tuple):
+            return cls(left_out=() if functions is None else (f"its verbs, which are no list: {shown(functions)}",))
+        verbs, left_out, lacking, left = dict[str, AdvertisedVerb](), _LeftOut(), _lacking(functions), TOTAL_MAX
+        # Its own ones first: the others are known without its description.
+        for function in sorted(functions, key=_declared_own, reverse=True)[:VERBS_MAX]:
+            share = min(left, VERB_MAX)
+            reader = _Reader(share, left_out)
+            try:
+                verb = reader.verb(function, foreign="lockout" in lacking)
+            except _OutOfBoundsError as exc:
+                left_out.add(str(exc))
+            else:
+                if verbs.setdefault(verb.name, verb) is not verb:
+                    left_out.add(f"a second verb {verb.name}")
+            # What was looked at in vain counts as well, which bounds the time.
+            left -= share - max(reader.left, 0)
+        if len(functions) > VERBS_MAX:
+            left_out.add(f"{len(functions) - VERBS_MAX} verbs after the first {VERBS_MAX}")
+        in_order = {name: verbs[name] for name in verb_names(functions) if name in verbs}
+        return cls(MappingProxyType(in_order), left_out.named(), lacking)
+
+    @property
+    def absent(self) -> str:
+        """A sentence on what a device lacks to be stopped and held, or nothing."""
+        lacks = [f"no {what}" for what in self.lacking]
+        return f"This device has {' and '.join(filter(None, (', '.join(lacks[:-1]), lacks[-1])))}." if lacks else ""
 
 
 def find_verb(functions: object, name: str) -> AdvertisedVerb | None:
     """Return the verb of a name, or None."""
     named = next((each for each in _rows(functions) if each["name"] == name), None)
-    return None if named is None else _verb(named, _LOCK not in verb_names(functions))
+    try:
+        return None if named is None else _Reader(VERB_MAX, _LeftOut()).verb(named, "lockout" in _lacking(functions))
+    except _OutOfBoundsError:
+        return None
 
 
 def verb_names(functions: object) -> list[str]:
@@ -168,32 +242,6 @@ def own_names(names: object) -> list[str]:
     return verb_names([{"name": each} for each in islice(names, VERBS_MAX)]) if isinstance(names, list) else []
 
 
-def absent_safety(functions: object) -> str:
-    """Return a sentence on what a device lacks to be stopped and held, or nothing.
-
-    A device that is none of ours has its functions alone.
-    """
-    names = set(verb_names(functions))
-    has = {"lock": {_LOCK}, "lease": {"acquireControl"}, "stop": {"stop", "stopMotion"}}
-    lacks = [f"no {what}" for what, verbs in has.items() if not verbs & names]
-    if not lacks:
-        return ""
-    said = lacks[0] if len(lacks) == 1 else f"{', '.join(lacks[:-1])} and {lacks[-1]}"
-    return f"This device has {said}."
-
-
-def near(wanted: str, names: Iterable[str]) -> str:
-    """Return a sentence with the names that resemble ``wanted``, else with all."""
-    import difflib  # noqa: PLC0415 - only a name that is not there needs it
-
-    known = sorted(name for name in islice(names, VERBS_MAX) if len(name) <= NEAR_MAX)
-    alike = difflib.get_close_matches(wanted[:NEAR_MAX], known, n=3, cutoff=0.5)
-    if alike:
-        return f" Near it: {', '.join(alike)}."
-    more = f" and {len(known) - NAMED_MAX} more" if len(known) > NAMED_MAX else ""
-    return f" There {'is' if len(known) == 1 else 'are'}: {', '.join(known[:NAMED_MAX])}{more}." if known else ""
-
-
 def fitting(rows: Iterable[T], most: int) -> list[T]:
     """Return the rows whose JSON is within so many bytes together, the first ones first."""
     kept, left = list[T](), most
@@ -203,38 +251,6 @@ def fitting(rows: Iterable[T], most: int) -> list[T]:
             left -= size
             kept.append(each)
     return kept
-
-
-def plain_text(value: object, longest: int = TEXT_MAX) -> str:
-    """Return a text's printable characters and line breaks, cut; else an empty text."""
-    if not isinstance(value, str):
-        return ""
-    cut = value[:longest]
-    return "".join(char for char in cut if char.isprintable() or char == "\n").strip()
-
-
-def plain_data(value: object, depth: int = DEPTH_MAX - 2, nodes: int = NODES_MAX) -> Any:
-    """Return a value as JSON can carry it, with plain texts and within the bounds."""
-    left = [nodes]
-
-    def copied(each: object, deep: int) -> Any:
-        left[0] -= 1
-        if isinstance(each, str):
-            return plain_text(each)
-        if isinstance(each, Mapping | list | tuple):
-            if deep == 0:
-                return None
-            if isinstance(each, Mapping):
-                rows = islice(each.items(), max(0, left[0]))
-                return {
-                    plain_text(name, NAME_MAX): copied(one, deep - 1)
-                    for name, one in rows
-                    if isinstance(name, str) and left[0] > 0
-                }
-            return [copied(one, deep - 1) for one in islice(each, max(0, left[0])) if left[0] > 0]
-        return _scalar(each)
-
-    return copied(value, depth)
 
 
 def typed(parameter: AdvertisedParameter, value: object, text: str) -> Any:
@@ -251,71 +267,148 @@ def typed(parameter: AdvertisedParameter, value: object, text: str) -> Any:
     wanted = parameter.type
     if wanted == "string" and not (isinstance(value, str) and text[:1] == '"'):
         value = text
-    elif value is not None and wanted in _TYPES:
-        kinds, word = _TYPES[wanted]
+    elif value is not None and wanted in _WORDS:
+        kinds = int | float if wanted == "number" else PYTHON_TYPES[wanted]
         if not isinstance(value, kinds) or (isinstance(value, bool) and wanted != "boolean"):
-            raise ValidationError(f"{parameter.name} must be {word}, not {shown(text)}.")
+            raise ValidationError(f"{parameter.name} must be {_WORDS[wanted]}, not {shown(text)}.")
     problem = parameter.problem(value) if value is not None else ""
     if problem:
         raise ValidationError(problem)
     return value
 
 
-_TYPES: dict[str, tuple[type | tuple[type, ...], str]] = {
-    "integer": (int, "a whole number"),
-    "number": ((int, float), "a number"),
-    "boolean": (bool, "true or false"),
-    "array": (list, "a list as JSON"),
-    "object": (dict, "an object as JSON"),
-}
+class _LeftOut:
+    """Names of what was left out; the first :data:`LEFT_OUT_MAX` of them."""
+
+    def __init__(self) -> None:
+        self._named: list[str] = []
+        self._more = 0
+
+    def add(self, what: str) -> None:
+        if len(self._named) < LEFT_OUT_MAX:
+            self._named.append(what)
+        else:
+            self._more += 1
+
+    def named(self) -> tuple[str, ...]:
+        return (*self._named, f"{self._more} more") if self._more else tuple(self._named)
+
+
+class _Reader:
+    """Copies one verb of a description within its share of characters."""
+
+    def __init__(self, left: int, left_out: _LeftOut) -> None:
+        self.left = left
+        self._left_out = left_out
+
+    def verb(self, function: object, foreign: bool) -> AdvertisedVerb:
+        name = function.get("name") if isinstance(function, Mapping) else None
+        if not isinstance(function, Mapping) or not isinstance(name, str) or not _NAME.match(name):
+            raise _OutOfBoundsError(f"a verb whose name is no identifier of at most {NAME_MAX} letters: {shown(name)}")
+        self._take(len(name), name)
+        description, labels = self._text(function.get("description"), name), _object(function, "labels")
+        schema = _object(function, "parameters")
+        stated, required = schema.get("properties"), schema.get("required")
+        properties = stated if isinstance(stated, Mapping) else {}
+        needed = set(_texts(required)) if isinstance(required, list | tuple) else set()
+        # A lease that has to be given is what the verb is about, as in renewControl.
+        leases = (LEASE_NAMES & properties.keys()) - needed
+        others = ((each, said) for each, said in properties.items() if each not in leases)
+        read = [self._parameter(name, each, said, needed) for each, said in islice(others, PARAMETERS_MAX)]
+        parameters = tuple(each for each in read if each is not None)
+        more = len(properties) - len(leases) - PARAMETERS_MAX
+        if more > 0:
+            self._left_out.add(f"{more} parameters of {name}")
+        kind: VerbKind = "read" if labels.get("direction") == "read" else "motion"
+        return AdvertisedVerb(
+            name=name,
+            description=description,
+            parameters=parameters,
+            leases=leases,
+            kind="stop" if name in STOPS else kind,
+            own=foreign or _declared_own(function),
+            lasts_s=_seconds(labels.get("lasts_s")),
+            stated=isinstance(stated, Mapping) and len(parameters) == len(properties) - len(leases),
+        )
+
+    def _parameter(self, verb: str, name: object, said: object, needed: set[str]) -> AdvertisedParameter | None:
+        if not isinstance(name, str) or not _NAME.match(name):
+            self._left_out.add(f"parameter {shown(name)} of {verb}, whose name is no identifier")
+            return None
+        try:
+            self._take(len(name), verb)
+            # Its schema stands on the third level: parameters, properties, parameter.
+            schema = self._copy(said if isinstance(said, Mapping) else {}, verb, name, 3)
+        except _OutOfBoundsError as exc:
+            self._left_out.add(str(exc))
+            return None
+        kind, choices, unit, meaning = (schema.get(each) for each in ("type", "enum", "unit", "description"))
+        kinds = [each for each in _texts(kind if isinstance(kind, list) else [kind]) if each != "null"]
+        scalars = [each for each in choices if _is_scalar(each)] if isinstance(choices, list) else []
+        return AdvertisedParameter(
+            name=name,
+            type=kinds[0] if len(kinds) == 1 and kinds[0].isalpha() else "",
+            meaning=meaning if isinstance(meaning, str) else "",
+            required=name in needed,
+            default=schema["default"] if _is_scalar(schema.get("default")) else None,
+            low=_number(schema.get("minimum")),
+            high=_number(schema.get("maximum")),
+            # Of a choice that is too long the robot checks the value itself.
+            choices=tuple(scalars) if len(scalars) <= CHOICES_MAX else (),
+            unit=plain_text(unit, UNIT_MAX),
+            schema=schema,
+        )
+
+    def _copy(self, value: object, verb: str, parameter: str, level: int) -> Any:
+        self._take(NODE, verb)
+        if isinstance(value, Mapping | list | tuple) and level > DEPTH_MAX:
+            raise _OutOfBoundsError(f"parameter {parameter} of {verb}, nested deeper than {DEPTH_MAX}")
+        if isinstance(value, Mapping):
+            copied = {}
+            for key, item in value.items():
+                name = self._text(key, verb, NAME_MAX)
+                copied[name] = self._copy(item, verb, parameter, level + 1)
+            return copied
+        if isinstance(value, list | tuple):
+            return [self._copy(item, verb, parameter, level + 1) for item in value]
+        if isinstance(value, str):
+            return self._text(value, verb)
+        if isinstance(value, float):
+            return value if isfinite(value) else None
+        return value if isinstance(value, int) and abs(value) < WHOLE_MAX else None
+
+    def _text(self, value: object, verb: str, longest: int = TEXT_MAX) -> str:
+        self._take(min(len(value), 2 * longest) if isinstance(value, str) else 0, verb)
+        return plain_text(value, longest, lines=True)
+
+    def _take(self, characters: int, verb: str) -> None:
+        self.left -= characters
+        if self.left < 0:
+            raise _OutOfBoundsError(f"{verb}, or a part of it, which is too long")
 
 
 def _rows(functions: object) -> Iterator[Mapping[str, Any]]:
-    """Yield the descriptions that have a name of printable characters, as a verb has."""
+    """Yield the descriptions that have the name of a verb."""
     for each in functions if isinstance(functions, list | tuple) else ():
         name = each.get("name") if isinstance(each, Mapping) else None
-        if isinstance(name, str) and 0 < len(name) <= NAME_MAX and name.isprintable():
+        if isinstance(name, str) and _NAME.match(name):
             yield each
 
 
-def _verb(function: Mapping[str, Any], own: bool) -> AdvertisedVerb:
-    schema, labels = _object(function, "parameters"), _object(function, "labels")
-    required = schema.get("required")
-    needed = set(_texts(required)) if isinstance(required, list) else set()
-    rows = [
-        (name, each)
-        for name, each in islice(_object(schema, "properties").items(), PARAMETERS_MAX + len(LEASE_NAMES))
-        if isinstance(name, str) and 0 < len(name) <= NAME_MAX and name.isprintable() and isinstance(each, Mapping)
-    ]
-    given = [_parameter(name, each, name in needed) for name, each in rows if name not in LEASE_NAMES]
-    return AdvertisedVerb(
-        name=function["name"],
-        description=plain_text(function.get("description")),
-        parameters=tuple(given[:PARAMETERS_MAX]),
-        leases=LEASE_NAMES & {name for name, _ in rows},
-        reads=labels.get("direction") == "read",
-        own=own or labels.get("own") == "true",
-        lasts_s=_seconds(labels.get("lasts_s")),
-        stated=isinstance(schema.get("properties"), Mapping),
-    )
+def _lacking(functions: object) -> tuple[str, ...]:
+    """Return what a device lacks, by all of its verbs."""
+    rows = {each["name"]: each for each in _rows(functions)}
+    resume = _object(rows.get("resume", {}), "parameters")
+    has = {
+        "lockout": "assertion" in _object(resume, "properties"),
+        "lease": rows.keys() >= {"acquireControl", "renewControl", "releaseControl"},
+        "stop": not rows.keys().isdisjoint(STOPS),
+    }
+    return tuple(name for name, there in has.items() if not there)
 
 
-def _parameter(name: str, schema: Mapping[str, Any], required: bool) -> AdvertisedParameter:
-    kind, choices, default = schema.get("type"), schema.get("enum"), schema.get("default")
-    kinds = [each for each in _texts(kind if isinstance(kind, list) else [kind]) if each != "null"]
-    values = islice(choices, CHOICES_MAX) if isinstance(choices, list | tuple) else ()
-    return AdvertisedParameter(
-        name=name,
-        type=kinds[0][:UNIT_MAX] if len(kinds) == 1 and kinds[0].isalpha() else "",
-        meaning=plain_text(schema.get("description")),
-        required=required,
-        default=_scalar(default),
-        low=_number(schema.get("minimum")),
-        high=_number(schema.get("maximum")),
-        choices=tuple(each for each in map(_scalar, values) if each is not None),
-        unit=plain_text(schema.get("unit"), UNIT_MAX).replace("\n", " "),
-        schema=plain_data(schema),
-    )
+def _declared_own(function: object) -> bool:
+    return isinstance(function, Mapping) and _object(function, "labels").get("own") in ("true", True)
 
 
 def _object(holder: Mapping[str, Any], name: str) -> Mapping[str, Any]:
@@ -327,26 +420,18 @@ def _texts(values: Iterable[object]) -> Iterator[str]:
     return (each for each in islice(values, PARAMETERS_MAX * 2) if isinstance(each, str))
 
 
-def _scalar(value: object) -> Scalar | None:
-    if isinstance(value, str):
-        return plain_text(value)
-    if isinstance(value, bool):
-        return value
-    if isinstance(value, int):
-        return value if abs(value) < WHOLE_MAX else None
-    return value if isinstance(value, float) and isfinite(value) else None
+def _is_scalar(value: object) -> bool:
+    return isinstance(value, Scalar)
 
 
 def _number(value: object) -> float | None:
-    found = _scalar(value)
-    return found if isinstance(found, int | float) and not isinstance(found, bool) else None
+    return value if isinstance(value, int | float) and not isinstance(value, bool) else None
 
 
 def _seconds(label: object) -> float:
-    if not isinstance(label, str) or len(label) > UNIT_MAX:
-        return 0.0
+    """Return the seconds of a label, 0 for what is none."""
     try:
-        seconds = float(label)
-    except ValueError:
+        seconds = float(label) if isinstance(label, str | int | float) and len(shown(label)) <= UNIT_MAX else 0.0
+    except (ValueError, OverflowError):
         return 0.0
-    return min(max(seconds, 0.0), LASTS_MAX_S) if isfinite(seconds) else 0.0
+    return seconds if 0.0 <= seconds <= DURATION_MAX_S else 0.0

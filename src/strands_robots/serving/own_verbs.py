@@ -9,17 +9,18 @@ from typing import Any
 
 from strands_robots.contract import WorldRobot, body_of, stops_motions
 from strands_robots.envelope import Envelope, jsonable, success
+from strands_robots.serving.advertised import RobotDescription
 from strands_robots.serving.robot_verbs import ARM_VERBS, WORLD_VERBS
 from strands_robots.serving.verb_schema import described
-from strands_robots.serving.verbs import REQUIRED, Arguments, Kind, Parameter, Verb
+from strands_robots.serving.verbs import LEASE_NAMES, REQUIRED, Arguments, Kind, Parameter, Verb
 from strands_robots.utils import ValidationError
 from strands_robots.verb_declaration import DeclaredVerb, declared_verbs
 
 VERBS_MAX = 100
 """Own verbs of one robot."""
 
-DESCRIPTION_MAX_BYTES = 64 * 1024
-"""Size of the description of a robot's own verbs, in JSON."""
+DESCRIPTION_MAX_BYTES = 32 * 1024
+"""Size of the description of a robot's own verbs, in JSON: with the others of any robot it is within what is read."""
 
 UNPROVEN = (
     "A stop waits until it has returned. That none of its own writes follows is its author's word: it is not proven."
@@ -37,6 +38,13 @@ MEMBERS = frozenset(
     }
 )
 """Names of what every robot has on the calling side or as a device."""
+
+
+TRAVELLING = LEASE_NAMES | {
+    *("robot_name", "action", "timeout"),
+    *("source_device", "function_name", "traceparent", "tracestate", "baggage"),
+}
+"""Names of what goes with a call besides its arguments, which no parameter of an own verb may have."""
 
 
 @functools.cache
@@ -59,7 +67,11 @@ def own_verbs(robot: object) -> dict[str, Verb]:
     if len(declared) > VERBS_MAX:
         raise ValidationError(f"{type(body).__name__} declares {len(declared)} verbs; a robot may have {VERBS_MAX}.")
     verbs = {name: _served(body, each) for name, each in declared.items()}
-    size = len(json.dumps([described(each) for each in verbs.values()]))
+    functions = [described(each) for each in verbs.values()]
+    left_out = RobotDescription.of(functions).left_out
+    if left_out:
+        raise ValidationError(f"Callers of {type(body).__name__} would not see {'; '.join(left_out)}.")
+    size = len(json.dumps(functions))
     if size > DESCRIPTION_MAX_BYTES:
         raise ValidationError(
             f"The descriptions of the verbs of {type(body).__name__} have {size} bytes of JSON; they may have "
@@ -77,6 +89,11 @@ def _served(body: object, declared: DeclaredVerb) -> Verb:
     if lower in _ours():
         raise ValidationError(
             f"{method} cannot be the verb {name}, which other robots have in another sense. Rename it."
+        )
+    taken = next((each.name for each in declared.parameters if each.name in TRAVELLING), "")
+    if taken:
+        raise ValidationError(
+            f"{method} cannot have the parameter {taken}, which goes with a call in another sense. Rename it."
         )
     if declared.motion and not declared.permit and not stops_motions(body):
         raise ValidationError(

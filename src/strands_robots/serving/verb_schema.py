@@ -5,16 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from strands_robots.serving.verbs import REQUIRED, Kind, Parameter, Verb
-
-JSON_TYPES: dict[type, str] = {
-    float: "number",
-    int: "integer",
-    bool: "boolean",
-    str: "string",
-    dict: "object",
-    list: "array",
-}
-"""Types of JSON Schema by the types of parameters."""
+from strands_robots.verb_parameters import JSON_TYPES
 
 Labels = dict[str, str | list[str]]
 

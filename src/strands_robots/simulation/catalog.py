@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import importlib.util
 from dataclasses import dataclass
@@ -10,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from strands_robots.kinematics.model_file import load_model
-from strands_robots.utils import ValidationError, shown
+from strands_robots.utils import ValidationError, alike, shown
 
 MODELS = Path(__file__).parents[1] / "models"
 BUILT_IN = ("so100", "so101", "rover")
@@ -79,7 +78,7 @@ def _find_description(model: str) -> ModelSource:
             path = getattr(module, "MJCF_PATH", None) or getattr(module, "URDF_PATH", None)
             if isinstance(path, str):
                 return ModelSource(model, Path(path))
-    similar = difflib.get_close_matches(model.lower(), [*BUILT_IN, *ALIASES, *names], n=5, cutoff=0.4)
+    similar = alike(model.lower(), [*BUILT_IN, *ALIASES, *names], most=5)
     hint = f"near it: {', '.join(similar)}" if similar else f"known: {', '.join(BUILT_IN)}"
     raise ValidationError(f"model {shown(model)} is not known; {hint}. A path to an MJCF or URDF file works too.")
 

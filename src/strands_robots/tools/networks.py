@@ -336,17 +336,18 @@ class DeviceConnect:
 
         Verbs of its own come with their parameters, in the robot's words.
         """
-        from strands_robots.serving.advertised import absent_safety, fitting, verbs_of  # noqa: PLC0415 - loaded when it is used
+        from strands_robots.serving.advertised import RobotDescription, fitting  # noqa: PLC0415 - loaded when it is used
 
         def described(functions: object) -> dict[str, Any]:
-            verbs, absent = verbs_of(functions), absent_safety(functions)
+            description = RobotDescription.of(functions)
+            verbs = description.verbs.values()
             own = dict(
                 fitting(((each.name, f"({each.takes}) {each.summary}") for each in verbs if each.own), OWN_BYTES)
             )
             return {
                 "functions": [each.name for each in verbs],
                 **({"own_verbs": own} if own else {}),
-                **({"note": absent} if absent else {}),
+                **({"note": description.absent} if description.absent else {}),
             }
 
         def listed(fleet: FleetClient) -> Envelope:

@@ -33,7 +33,7 @@ OWN_FORMS = forms_of(
             "labels": OWN,
         },
         {"name": "halt", "description": "Halt everything.", "labels": OWN},
-        {"name": "resume"},
+        {"name": "resume", "parameters": {"properties": {"assertion": {"type": "object"}}}},
     ]
 )
 

@@ -54,6 +54,8 @@ class Served:
             self._stack.callback(peer.close)
         if self._fleet is None:
             self._fleet = self._stack.enter_context(connect())
+        # A robot that joins a mesh later is known from its first presence on.
+        eventually(lambda: name in self._fleet, what=name)
         found: RemoteRobot = self._fleet[name]
         return found
 

@@ -78,7 +78,7 @@ async def called(client: Any, robot: str, verb: str, **arguments: Any) -> Any:
 async def test_device_of_another_maker_is_described_and_called(site: McpSite) -> None:
     async with site.client() as client:
         said = (await client.call_tool("describe_robot", {"robot": "kettle-1"})).structured_content["data"]
-        assert said["note"] == "This device has no lock, no lease and no stop."
+        assert said["note"] == "This device has no lockout, no lease and no stop."
         verbs = {each["name"]: each for each in said["verbs"]}
         assert {name: each["moves"] for name, each in verbs.items()} == {"temperature": False, "boil": True}
         assert verbs["boil"]["parameters"]["required"] == ["litres"]
