@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import threading
 from collections.abc import Callable
 from typing import Annotated, Any, Literal, Optional
@@ -12,7 +13,8 @@ from fixtures.waiting import eventually
 
 from strands_robots import Domain, Permit, verb
 from strands_robots.contract import adapt
-from strands_robots.safety.gate import MotionRefused, gate_of
+from strands_robots.safety.gate import MotionRefused
+from strands_robots.safety.kept_gates import gate_of
 from strands_robots.utils import ValidationError
 from strands_robots.verb_declaration import declared_verbs
 
@@ -270,3 +272,73 @@ def test_robots_that_are_equal_or_have_no_hash_have_gates_of_their_own() -> None
     one, other = Same(), Same()
     assert gate_of(one) is not gate_of(other)
     assert gate_of(one) is gate_of(one)
+
+
+def test_decorator_above_is_refused_because_a_network_would_leave_it_out() -> None:
+    def guarded(method: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.wraps(method)
+        def guard(*values: Any, **named: Any) -> Any:
+            raise RuntimeError("not today")
+
+        return guard
+
+    class Guarded:
+        @guarded
+        @verb
+        def brew(self, permit: Permit) -> None: ...
+
+    with pytest.raises(ValidationError, match="decorator above @verb"):
+        declared_verbs(Guarded())
+
+    class Inside:
+        @verb(motion=False)
+        @guarded
+        def look(self) -> None: ...
+
+    with pytest.raises(RuntimeError, match="not today"):
+        Inside().look()
+
+
+def test_attribute_of_the_class_that_answers_to_every_name_is_no_verb() -> None:
+    class Proxy:
+        def __getattr__(self, name: str) -> object:
+            raise AssertionError(f"{name} was asked of another machine")
+
+    class Robot(Barista):
+        server = Proxy()
+
+    assert set(declared_verbs(Robot())) == {"brewCoffee", "beansLeft"}
+
+
+def test_permit_is_void_once_its_verb_has_returned_or_its_time_is_over() -> None:
+    class Keeps:
+        permit: Permit | None = None
+
+        @verb
+        def keep(self, permit: Permit) -> bool:
+            self.permit = permit
+            return permit.valid
+
+    robot = Keeps()
+    assert robot.keep() is True
+    assert robot.permit is not None
+    assert not robot.permit.valid
+    with gate_of(robot).moving("keep", 0.05) as permit:
+        eventually(lambda: not permit.valid)
+
+
+def test_verb_that_halts_its_own_robot_does_not_wait_for_itself() -> None:
+    class Careful(Barista):
+        @verb
+        def feel(self, permit: Permit) -> dict[str, Any]:
+            verdict = adapt(self).halt("I felt something")
+            return {"stopped": verdict.stopped, "valid": permit.valid}
+
+    assert Careful().feel() == {"stopped": True, "valid": False}
+
+
+def test_default_that_no_message_can_carry_is_refused() -> None:
+    def with_sets(self: object, cups: list = [{1}]) -> None: ...  # type: ignore[type-arg]  # noqa: B006 - the point
+
+    with pytest.raises(ValidationError, match="with_sets"):
+        declared(with_sets).check()

@@ -18,8 +18,9 @@ from typing import Any, Literal, Protocol, runtime_checkable
 from strands_robots import settings
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.identity_map import IdentityMap
-from strands_robots.safety.gate import MotionGate, MotionRefused, gate_of
+from strands_robots.safety.gate import MotionGate, MotionRefused
 from strands_robots.safety.halted_verbs import halted_with_verbs
+from strands_robots.safety.kept_gates import gate_of
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import (
     PendingVerdict,
@@ -255,7 +256,8 @@ def observe(robot: Robot, observer: Observer) -> Unsubscribe:
             )
         )
 
-    leave, unsubscribe = robot.gate.under_way.observe(told), robot.subscribe(observer)
+    unsubscribe = robot.subscribe(observer)
+    leave = robot.gate.under_way.observe(told)
 
     def end() -> None:
         leave()

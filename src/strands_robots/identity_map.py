@@ -32,6 +32,11 @@ class IdentityMap(Generic[T]):
                     known = self._values[id(key)] = self._reference(key), make()
         return known[1]
 
+    def get(self, key: object) -> T | None:
+        """Return the value of ``key``, None before it was made."""
+        known = self._values.get(id(key))
+        return None if known is None else known[1]
+
     def _reference(self, key: object) -> object:
         try:
             # Called by the garbage collector, on any thread: it may take no lock.

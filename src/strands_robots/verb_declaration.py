@@ -34,13 +34,17 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, TypeVar, get_type_hints, overload
 
-from strands_robots.safety.gate import Permit, gate_of
+from strands_robots.safety.gate import Permit
+from strands_robots.safety.kept_gates import gate_of
 from strands_robots.utils import DURATION_MAX_S, ValidationError, flag, number, plain_text, shown, text
 from strands_robots.verb_parameters import Domain, VerbParameter, is_permit, parameter_of
 
 __all__ = ["DeclaredVerb", "Domain", "Permit", "declared_verbs", "verb"]
 
 F = TypeVar("F", bound=Callable[..., Any])
+
+START_S = 10.0
+"""Seconds that every motion has to return; a lasting one has its own besides."""
 
 NAME_MAX = 64
 SUMMARY_MAX = 600
@@ -62,12 +66,14 @@ class DeclaredVerb:
         name: on the wire.
         motion: False for a read.
         lasts: seconds that it may take to return.
+        made: the method that ``@verb`` made of the function.
     """
 
     function: Callable[..., Any]
     name: str
     motion: bool
     lasts: float
+    made: Callable[..., Any]
 
     @cached_property
     def parameters(self) -> tuple[VerbParameter, ...]:
@@ -131,7 +137,7 @@ class DeclaredVerb:
         if not self.motion:
             with gate.reading(self.name):
                 return self.function(robot, **arguments), ""
-        with gate.moving(self.name) as permit:
+        with gate.moving(self.name, START_S + self.lasts) as permit:
             given = {self.permit: permit} if self.permit else {}
             result = self.function(robot, **arguments, **given)
             return result, "completed" if permit.valid else "stopped"
@@ -215,19 +221,19 @@ def verb(function: F | None = None, *, motion: bool = True, name: str = "", last
 
     def declare(method: F) -> F:
         if not inspect.isfunction(method):
-            raise ValidationError(f"@verb declares a method, not {shown(method)}; put it below other decorators.")
+            raise ValidationError(f"@verb declares a method, not {shown(method)}.")
         if (
             inspect.iscoroutinefunction(method)
             or inspect.isgeneratorfunction(method)
             or inspect.isasyncgenfunction(method)
         ):
             raise ValidationError(f"{method.__qualname__} must be a plain method: it is called on a thread of its own.")
-        declared = DeclaredVerb(method, _wire_name(name, method.__name__), motion, seconds)
 
         @functools.wraps(method)
         def call(self: object, *values: object, **named: object) -> Any:
             return declared.called(self, *values, **named)
 
+        declared = DeclaredVerb(method, _wire_name(name, method.__name__), motion, seconds, call)
         vars(call)[MARK] = declared
         return call  # type: ignore[return-value]  # the same signature, its permit left out by callers
 
@@ -241,16 +247,27 @@ def declared_verbs(robot: object) -> dict[str, DeclaredVerb]:
         ValidationError: two verbs have one name, or a method overrides a verb without being declared.
     """
     found: dict[str, DeclaredVerb] = {}
+    kind = type(robot).__name__
     for attribute, method in _methods(type(robot)):
-        declared = getattr(method, MARK, None)
-        if not isinstance(declared, DeclaredVerb):
-            raise ValidationError(f"{type(robot).__name__}.{attribute} overrides a verb; declare it with @verb, too.")
+        declared = _declared(method)
+        if declared is None:
+            raise ValidationError(f"{kind}.{attribute} overrides a verb; declare it with @verb, too.")
+        if declared.made is not method:
+            # What stands above @verb would be left out when the verb is called over a network.
+            raise ValidationError(f"{kind}.{attribute} has a decorator above @verb; put @verb above it.")
         other = next((each for name, each in found.items() if name.lower() == declared.name.lower()), None)
         if other is not None:
             names = f"{other.function.__name__} and {declared.function.__name__}"
-            raise ValidationError(f"{type(robot).__name__} has two verbs {declared.name}: {names}; rename one.")
+            raise ValidationError(f"{kind} has two verbs {declared.name}: {names}; rename one.")
         found[declared.name] = declared
     return found
+
+
+def _declared(value: object) -> DeclaredVerb | None:
+    """Return what a function declares; no other attribute of a class is asked."""
+    function = getattr(value, "__func__", None) if isinstance(value, staticmethod | classmethod) else value
+    found = vars(function).get(MARK) if inspect.isfunction(function) else None
+    return found if isinstance(found, DeclaredVerb) else None
 
 
 def _methods(kind: type) -> Iterator[tuple[str, object]]:
@@ -258,7 +275,7 @@ def _methods(kind: type) -> Iterator[tuple[str, object]]:
     seen: set[str] = set()
     for each in kind.__mro__:
         for attribute, value in vars(each).items():
-            if attribute not in seen and hasattr(value, MARK):
+            if attribute not in seen and _declared(value) is not None:
                 seen.add(attribute)
                 # Read off the classes: an attribute of the robot's own may be looked up anywhere.
                 yield attribute, next(vars(base)[attribute] for base in kind.__mro__ if attribute in vars(base))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import json
 import math
 import types
 from collections.abc import Callable, Mapping
@@ -125,7 +126,8 @@ def parameter_of(where: str, parameter: inspect.Parameter, hint: Any, meaning: s
         if default is not None:
             try:
                 default = kind.check(parameter.name, default)
-            except ValidationError as exc:
+                json.dumps(default, allow_nan=False)
+            except (ValidationError, TypeError, ValueError, RecursionError) as exc:
                 raise ValidationError(f"The default of {where} is outside its domain: {exc}") from None
             schema["default"] = default
     words = plain_text(meaning or " ".join(told), MEANING_MAX)

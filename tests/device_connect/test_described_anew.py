@@ -16,6 +16,7 @@ from fixtures.toy_robots import ToyWorld
 from strands_robots.device_connect._compat import Runtime, describe_anew
 from strands_robots.device_connect.backends import LinkConfig
 from strands_robots.device_connect.simulation_driver import SimulationDeviceDriver
+from strands_robots.serving.offered_verbs import Offers
 
 LINK = LinkConfig("nats", connect=("nats://127.0.0.1:1",))
 
@@ -55,7 +56,15 @@ def world() -> Iterator[Growing]:
 
 @pytest.fixture
 def driver(world: Growing) -> SimulationDeviceDriver:
-    return SimulationDeviceDriver(world)
+    made = SimulationDeviceDriver(world)
+    made.offers = Offers(world, made.made, every_s=0.0)
+    return made
+
+
+def announce(runtime: Any, driver: SimulationDeviceDriver) -> None:
+    """Look at the world, as a worker does, and announce what it can do."""
+    driver.offers.look()
+    describe_anew(runtime, driver)
 
 
 @pytest.fixture(params=[Runtime, DeviceRuntime], ids=["ours", "the framework's own"])
@@ -80,17 +89,17 @@ async def ended() -> None:
 async def test_device_is_announced_once_for_each_change(
     runtime: Any, driver: SimulationDeviceDriver, world: Growing
 ) -> None:
-    describe_anew(runtime, driver)
+    announce(runtime, driver)
     await ended()
     assert runtime.messaging.published == []
     world.add("left")
     for _ in range(3):
-        describe_anew(runtime, driver)
+        announce(runtime, driver)
         await ended()
     assert len(runtime.messaging.published) == 1
     assert "execute" in runtime.messaging.functions()
     world.positions.clear()
-    describe_anew(runtime, driver)
+    announce(runtime, driver)
     await ended()
     assert "execute" not in runtime.messaging.functions()
 
@@ -100,7 +109,7 @@ async def test_next_message_of_a_link_that_was_lost_says_it(
 ) -> None:
     runtime.messaging.lost = True
     world.add("left")
-    describe_anew(runtime, driver)
+    announce(runtime, driver)
     await ended()
     said = json.loads(runtime._d2d_announcer._build_payload())
     assert "execute" in {each["name"] for each in said["capabilities"]["functions"]}
@@ -121,11 +130,11 @@ async def test_registry_is_told_of_a_change(
     runtime = kind(driver=driver, device_id="sim-1", allow_insecure=True, **more)
     runtime._d2d_mode = False
     await runtime._register(force=True)
-    describe_anew(runtime, driver)
+    announce(runtime, driver)
     await ended()
     assert len(registered) == 1
     world.add("left")
-    describe_anew(runtime, driver)
+    announce(runtime, driver)
     await ended()
     assert len(registered) == 2
     assert "execute" in registered[-1] - registered[0]
@@ -135,5 +144,7 @@ def test_devices_of_one_class_share_what_describes_them(world: Growing) -> None:
     first, second = SimulationDeviceDriver(world), SimulationDeviceDriver(Growing())
     assert first.described() is second.described()
     world.add("left")
+    assert first.described() is second.described()
+    first.offers = Offers(world, first.made)
     assert first.described() is not second.described()
     assert first.described() is first.described()

@@ -8,13 +8,15 @@ from typing import Any
 
 import pytest
 from fixtures.barista import Barista, Stubborn
-from fixtures.devices import RecordingDevice
+from fixtures.devices import RecordingDevice, TorqueDevice
 from fixtures.waiting import eventually
 
 from strands_robots import Permit, verb
 from strands_robots.contract import adapt
 from strands_robots.hardware import HardwareRobot
+from strands_robots.safety.gate import MotionGate, MotionRefused
 from strands_robots.safety.stop_executor import stop_executor
+from strands_robots.safety.stopping import StopVerdict
 
 
 class Waving(HardwareRobot):
@@ -120,3 +122,143 @@ def test_stop_behind_a_verb_that_hangs_begins_at_once() -> None:
         robot.released.set()
         working.join(20.0)
     assert stop_executor().halt(target, "stubborn", "last").stopped is True
+
+
+class Holds:
+    """A robot that fits the contract by itself; where its gate is kept is its author's choice."""
+
+    tool_name_str = "holds"
+
+    def __init__(self) -> None:
+        self.started, self.released = threading.Event(), threading.Event()
+
+    def start_task(self, instruction: str, **options: Any) -> dict[str, Any]:
+        return {"status": "success"}
+
+    def stop_task(self) -> dict[str, Any]:
+        return {"status": "success"}
+
+    get_task_status = get_features = get_state = stop_task
+
+    def subscribe(self, observer: object) -> Any:
+        return lambda: None
+
+    def halt(self, reason: str = "") -> StopVerdict:
+        self.gate.revoke()
+        return StopVerdict()
+
+    @verb(motion=True, lasts=60.0)
+    def hang(self, permit: Permit) -> None:
+        """Hang."""
+        self.started.set()
+        self.released.wait(60.0)
+
+
+class OfTheClass(Holds):
+    gate = MotionGate()
+
+
+class ByProperty(Holds):
+    _own = MotionGate()
+
+    @property
+    def gate(self) -> MotionGate:
+        return self._own
+
+
+class Misleading(ByProperty):
+    verbs_under_way: Any = ()
+    under_way: Any = None
+
+
+@pytest.mark.parametrize("kind", [OfTheClass, ByProperty, Misleading])
+def test_verb_is_waited_for_wherever_the_robot_keeps_its_gate(kind: type[Holds]) -> None:
+    robot = kind()
+    working = threading.Thread(target=robot.hang)
+    working.start()
+    eventually(robot.started.is_set)
+    try:
+        verdict = stop_executor().halt(robot, "holds", "stop", within=0.4)
+        assert verdict.stopped is False
+        assert "has not returned" in verdict.not_stopped["hang"]
+    finally:
+        robot.released.set()
+        working.join(20.0)
+
+
+class Hanging(HardwareRobot):
+    """A real arm with a verb that ignores its permit."""
+
+    def __init__(self, *values: Any, **options: Any) -> None:
+        super().__init__(*values, **options)
+        self.started, self.released = threading.Event(), threading.Event()
+
+    @verb(motion=True, lasts=60.0)
+    def hang(self, permit: Permit) -> None:
+        """Hang."""
+        self.started.set()
+        self.released.wait(60.0)
+
+
+class HaltsTwice(Hanging):
+    """An arm whose halt does something besides."""
+
+    def halt(self, reason: str = "") -> StopVerdict:
+        return super().halt(reason)
+
+
+@pytest.mark.parametrize("kind", [Hanging, HaltsTwice])
+def test_second_stop_of_an_arm_begins_beside_the_first_ones_verb(kind: type[Hanging]) -> None:
+    arm = kind(RecordingDevice(), "arm")
+    arm.connect()
+    working = threading.Thread(target=arm.hang)
+    working.start()
+    eventually(arm.started.is_set)
+    try:
+        stops = [stop_executor().submit(arm, "arm", f"{number}", within=1.0) for number in range(3)]
+        eventually(lambda: arm.gate.generation >= 2)
+        assert not any(each.done() for each in stops)
+        assert [each.result(20.0).stopped for each in stops] == [False] * 3
+        assert arm.stop_task()["status"] == "error"
+    finally:
+        arm.released.set()
+        working.join(20.0)
+    assert arm.stop_task()["status"] == "success"
+
+
+def test_arm_settles_once_its_verb_has_returned_and_not_before(patient_halts: None) -> None:
+    device = TorqueDevice()
+    rest = dict.fromkeys(device.action_features, 0.0)
+    arm = Hanging(device, "arm", stop_level="settle", rest_pose=rest)
+    arm.connect()
+    arm.send_action(dict.fromkeys(device.action_features, 1.0))
+    working = threading.Thread(target=arm.hang)
+    working.start()
+    eventually(arm.started.is_set)
+    stop = stop_executor().submit(arm, "arm", "stop", within=0.5)
+    refused = stop.result(20.0)
+    assert (refused.stopped, refused.settling) == (False, False)
+    arm.released.set()
+    working.join(20.0)
+    assert stop_executor().halt(arm, "arm", "again").stopped is True
+
+
+def test_one_verb_runs_at_a_time_and_none_is_lost() -> None:
+    robot = Barista()
+    done: list[int] = []
+    refused: list[str] = []
+
+    def brew() -> None:
+        for _ in range(200):
+            try:
+                done.append(robot.brew_coffee(1)["cups"])
+            except MotionRefused as exc:
+                refused.append(str(exc))
+
+    callers = [threading.Thread(target=brew) for _ in range(4)]
+    for each in callers:
+        each.start()
+    for each in callers:
+        each.join(60.0)
+    assert len(done) + len(refused) == 800
+    assert robot.cups == len(done)

@@ -143,3 +143,26 @@ def test_answer_is_an_envelope_whatever_the_verb_returns(given: object, fields: 
     answer = answer_of("brew", given)
     assert answer["content"][0]["text"]
     assert {name: answer[name] for name in fields} == fields
+
+
+def test_default_that_a_method_changes_is_none_for_the_next_call() -> None:
+    class Collects:
+        @verb(motion=False)
+        def collect(self, items: list[int] = []) -> int:  # noqa: B006 - what an author may write
+            items.append(1)
+            return len(items)
+
+    robot = Collects()
+    assert [served(robot, "collect").result["result"] for _ in range(3)] == [1, 1, 1]
+
+
+def test_stop_of_a_robot_of_a_world_voids_what_waits_on_another_network() -> None:
+    robot = Barista()
+    first, second = (
+        Pipeline.of(adapt(robot), lambda: "robot-1", hardware=False, authorize=lambda command, given: ("tester",))
+        for _ in range(2)
+    )
+    asked = first.pending.arrive("left")
+    second.pending.void("left")
+    assert asked is not None
+    assert asked.given_up

@@ -369,17 +369,22 @@ class Runtime(DeviceRuntime):  # type: ignore[misc]  # the framework has no type
 _ANNOUNCED: WeakKeyDictionary[Any, str] = WeakKeyDictionary()
 """Description by which each runtime has announced its device."""
 
+_ANNOUNCING: WeakKeyDictionary[Any, asyncio.Task[None]] = WeakKeyDictionary()
+"""The announcement of each runtime that is under way; a registry that is down keeps one waiting."""
+
 
 def describe_anew(runtime: Any, driver: DeviceDriver) -> None:
     """Announce a device again where its description has changed; on its loop."""
     if not isinstance(runtime, DeviceRuntime):
         return
     described, before = encoded_capabilities(driver), _ANNOUNCED.get(runtime)
-    if described == before:
+    announcing = _ANNOUNCING.get(runtime)
+    if described == before or (announcing is not None and not announcing.done()):
         return
     _ANNOUNCED[runtime] = described
     if before is not None:
-        runtime._track_task(asyncio.create_task(_announce(runtime, driver)))
+        _ANNOUNCING[runtime] = asyncio.create_task(_announce(runtime, driver))
+        runtime._track_task(_ANNOUNCING[runtime])
 
 
 async def _announce(runtime: Any, driver: DeviceDriver) -> None:

@@ -44,7 +44,7 @@ from strands_robots.safety.stop_executor import stop_executor
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.control_changes import ControlChange
-from strands_robots.serving.offered_verbs import offered
+from strands_robots.serving.offered_verbs import Offers
 from strands_robots.serving.own_verbs import own_verbs
 from strands_robots.serving.pipeline import Command, Pipeline, RefusalReason, Refused, Result, busy
 from strands_robots.serving.stop_arguments import noted
@@ -170,6 +170,7 @@ class RobotDriver(CollectedOnce):
         self.robot = robot
         self.own_verbs = own_verbs(robot)
         self._described: dict[tuple[str, frozenset[str]], str] = {}
+        self.offers = Offers(robot, self.made)
         self.hardware = hardware
         self.authorization = authorization or Authorization(hardware=hardware, robot=robot.tool_name_str)
         self.registration: SafetyRegistration | None = None
@@ -438,7 +439,7 @@ class RobotDriver(CollectedOnce):
         """Return what the robot can be called for now, read once for each class."""
         if type(self) not in _FUNCTIONS:
             _FUNCTIONS[type(self)] = tuple(super().functions)
-        missing = self.made.keys() - offered(self.robot, self.made)
+        missing = self.made.keys() - self.offers.names
         own = [FunctionDef(**described(verb)) for verb in self.own_verbs.values()]
         return [*(each for each in _FUNCTIONS[type(self)] if each.name not in missing), *own]
 
@@ -462,7 +463,7 @@ class RobotDriver(CollectedOnce):
         Raises:
             TypeError, ValueError: JSON cannot carry them.
         """
-        key = json.dumps(self.labels, allow_nan=False), frozenset(offered(self.robot, self.made))
+        key = json.dumps(self.labels, allow_nan=False), self.offers.names
         # A robot with verbs of its own is described like no other of its class.
         known = self._described if self.own_verbs else _DESCRIBED.setdefault(type(self), {})
         if key not in known:
@@ -590,7 +591,8 @@ class RobotDriver(CollectedOnce):
 
     def unchanged(self) -> bool:
         """Look at the robot, on a worker; False when its state is another one."""
-        return self.same(self.glance(), self.activity) and not self.robot.gate.under_way
+        same = self.same(self.glance(), self.activity) and not self.robot.gate.under_way
+        return same and not self.offers.look()
 
     def same(self, one: Activity, other: Activity) -> bool:
         """Return True for two states of which the second one need not be told."""
@@ -651,7 +653,7 @@ class RobotDriver(CollectedOnce):
     async def _looked(self) -> Activity:
         self._looking += 1
         try:
-            activity = await called(self.pipeline.shares.read, self.glance, READ_DEADLINE_S)
+            activity = await called(self.pipeline.shares.read, self._glance, READ_DEADLINE_S)
             return replace(activity, busy=True) if self.robot.gate.under_way else activity
         except Exception as exc:  # noqa: BLE001 - whatever a robot's read raises is its state to tell
             fault = f"{type(exc).__name__}: {exc}"
@@ -660,6 +662,10 @@ class RobotDriver(CollectedOnce):
             return Activity(self.activity.busy, self.activity.facts, fault)
         finally:
             self._looking -= 1
+
+    def _glance(self) -> Activity:
+        self.offers.look()
+        return self.glance()
 
     def _look_now(self) -> Activity:
         try:

@@ -376,6 +376,8 @@ class HardwareRobot(ArmMixin, TeleopMixin):
     def stop_task(self) -> Envelope:
         """Stop the task and freeze the robot, within the halt deadline."""
         self._waiting.void()
+        if self.gate.under_way:
+            return self.halt("stop_task").envelope()
         task = self._task
         if task is None or not task.running:
             return success("No task runs.", stopped=True, was_running=False, **self._task_fields())
@@ -456,7 +458,7 @@ class HardwareRobot(ArmMixin, TeleopMixin):
         except Exception as exc:  # noqa: BLE001 - a device may raise anything; the verdict says what
             verdicts.append(unfrozen(failure(self.tool_name_str, exc), moved))
         else:
-            verdicts.append(RolloutsEnd(moved, loops, deadline, then).at_once())
+            verdicts.append(RolloutsEnd(moved, loops, deadline, then, self.gate.under_way).at_once())
         finally:
             self._halting = {}
 

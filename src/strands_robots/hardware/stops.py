@@ -8,6 +8,7 @@ from typing import Protocol
 
 from strands_robots.hardware.body import DeviceBody
 from strands_robots.policies.rollout import Rollout, RolloutsEnd
+from strands_robots.safety.halted_verbs import StopOfRobot
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import PendingVerdict, StopVerdict
 
@@ -49,11 +50,15 @@ class ReleasableRobot(Protocol):
 
 
 @dataclass(frozen=True)
-class TorqueRelease:
+class TorqueRelease(StopOfRobot):
     """Stops a robot and takes the torque of some motors, or all, away."""
 
     robot: ReleasableRobot
     motors: str
+
+    def stopped_robot(self) -> object:
+        """Return the robot, whose own verbs it stops as well."""
+        return self.robot
 
     def halt_ordered(self) -> None:
         """Note what moves."""

@@ -35,6 +35,7 @@ from strands_robots.safety.gate import Permit, PermitVoidError
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import READ_EVERY_S, PendingVerdict, StopVerdict, halt_each
 from strands_robots.safety.turns import shorten_turns
+from strands_robots.safety.verbs_under_way import VerbsUnderWay
 from strands_robots.utils import ValidationError, number, text, whole
 from strands_robots.utils import duration as checked_duration
 
@@ -490,6 +491,7 @@ class RolloutsEnd(PendingVerdict):
         loops: the voided rollouts, by what a verdict calls them.
         until: the moment, in monotonic s, until which their ends are waited for.
         then: makes the final verdict.
+        verbs: own verbs of the robot; while one runs, the verdict is not final, and then without ``then``.
     """
 
     def __init__(
@@ -498,7 +500,9 @@ class RolloutsEnd(PendingVerdict):
         loops: Mapping[str, Rollout],
         until: float,
         then: Callable[[StopVerdict], StopVerdict] = lambda verdict: verdict,
+        verbs: VerbsUnderWay | None = None,
     ) -> None:
+        self._verbs = verbs
         # The reading itself waits for the end of a loop.
         super().__init__(until, pause_s=0.0)
         self._moved, self._loops, self._then = tuple(moved), loops, then
@@ -506,8 +510,8 @@ class RolloutsEnd(PendingVerdict):
         self._interrupted = self._answered_for = False
 
     def at_once(self) -> StopVerdict | PendingVerdict:
-        """Return the verdict where no loop has to end, else this."""
-        return self if self._loops else self._then(self._found())
+        """Return the verdict where nothing has to end, else this."""
+        return self if self._loops or self._verbs else self._then(self._found())
 
     def known(self) -> StopVerdict | None:
         return self.judged(None, last=False)
@@ -523,10 +527,10 @@ class RolloutsEnd(PendingVerdict):
                 return
 
     def judged(self, reading: object, *, last: bool) -> StopVerdict | None:
-        found = self._found()
-        if self._final is None and (found.stopped or last):
+        found, moves = self._found(), bool(self._verbs)
+        if self._final is None and ((found.stopped and not moves) or last):
             # Once, and in time: it may have the robot settle, of which the answer must say so.
-            self._final = found if self._answered_for else self._then(found)
+            self._final = found if self._answered_for or moves else self._then(found)
         return self._final
 
     def unread(self, why: str) -> StopVerdict:

@@ -21,7 +21,6 @@ from typing import ParamSpec, Protocol, TypeVar
 
 from strands_robots.envelope import Envelope, error
 from strands_robots.errors import StrandsRobotsError
-from strands_robots.identity_map import IdentityMap
 from strands_robots.safety.awake import AWAKE, AwakeClock
 from strands_robots.safety.verbs_under_way import VerbCall, VerbsUnderWay
 from strands_robots.utils import MissingExtraError, ValidationError
@@ -110,12 +109,13 @@ class Asked:
 class Permit:
     """Leave to move until the next halt or until the caller withdraws it."""
 
-    __slots__ = ("_asked", "_gate", "_withdrawn", "verb")
+    __slots__ = ("_asked", "_ends", "_gate", "_withdrawn", "verb")
 
     def __init__(self, gate: MotionGate, asked: Asked, verb: str) -> None:
         self._gate = gate
         self._asked = asked
         self._withdrawn = False
+        self._ends: float | None = None
         self.verb = verb
 
     @property
@@ -131,7 +131,8 @@ class Permit:
     @property
     def valid(self) -> bool:
         """False for ever after a halt, a lock, a withdrawal, or its call's end."""
-        return not (self._withdrawn or self._asked.given_up or self.revoked)
+        over = self._ends is not None and time.monotonic() >= self._ends
+        return not (over or self._withdrawn or self._asked.given_up or self.revoked)
 
     @property
     def revoked(self) -> bool:
@@ -188,6 +189,10 @@ class Permit:
     def begin(self) -> None:
         """Note that something moves by this permit from now on."""
         self._asked.begun = True
+
+    def end_at(self, moment: float) -> None:
+        """Void this permit alone from a moment on, in monotonic s."""
+        self._ends = moment
 
     def withdraw(self) -> None:
         """Void this permit alone: one motion stops, the robot stays free."""
@@ -315,8 +320,10 @@ class MotionGate:
             self._here.asked = before
 
     @contextmanager
-    def moving(self, verb: str) -> Iterator[Permit]:
+    def moving(self, verb: str, within_s: float) -> Iterator[Permit]:
         """Give the permit of a robot's own verb, and mark the time until it has returned.
+
+        The permit is void after ``within_s`` seconds, and once the verb has returned.
 
         Raises:
             MotionRefused: locked, halted since it was asked for, or another own verb has not returned.
@@ -330,6 +337,7 @@ class MotionGate:
                 permit.wait()
                 permit.check()
                 permit.begin()
+                permit.end_at(time.monotonic() + within_s)
                 with permit.inside():
                     yield permit
                 call.ended = "completed" if permit.valid else "stopped"
@@ -337,6 +345,9 @@ class MotionGate:
                 call.error = f"{type(exc).__name__}: {exc}"[:ERROR_MAX]
                 call.ended = "error" if permit.valid else "stopped"
                 raise
+            finally:
+                # What the verb has left behind, such as a thread, writes no more by it.
+                permit.withdraw()
 
     def lockout(self, verb: str) -> Envelope | None:
         """Return the answer to ``verb`` while locked, else None."""
@@ -416,12 +427,3 @@ class MotionGate:
 
 
 _LATE = "{} is refused: the robot was halted after it was asked for; nothing was started."
-
-
-_gates: IdentityMap[MotionGate] = IdentityMap()
-
-
-def gate_of(robot: object) -> MotionGate:
-    """Return the gate of a robot: its own ``gate``, or the one that is kept for it."""
-    own = getattr(robot, "gate", None)
-    return own if isinstance(own, MotionGate) else _gates.of(robot, MotionGate)

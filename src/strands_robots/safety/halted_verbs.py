@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import replace
 
+from strands_robots.safety.gate import MotionGate
+from strands_robots.safety.kept_gates import kept_gate
 from strands_robots.safety.stopping import ForeignAnswer, PendingVerdict, StopVerdict, read_verdict
 from strands_robots.safety.verbs_under_way import VerbCall, VerbsUnderWay
 
@@ -21,7 +24,7 @@ class VerbsAfterHalt(PendingVerdict):
 
     def __init__(self, answer: StopVerdict | PendingVerdict, calls: tuple[VerbCall, ...], until: float) -> None:
         rest = answer if isinstance(answer, PendingVerdict) else None
-        super().__init__(until, *(() if rest is None else (rest.pause_s,)))
+        super().__init__(until)
         self._rest, self._calls = rest, calls
         self._verdict = answer if isinstance(answer, StopVerdict) else None
 
@@ -31,7 +34,8 @@ class VerbsAfterHalt(PendingVerdict):
         return None if self._verdict is None or self._running() else self._with_verbs(self._verdict)
 
     def read(self) -> object:
-        return self._rest.read() if self._rest is not None and self._verdict is None else None
+        # One reading serves all stops of a robot, also one whose own verdict still waits for it.
+        return None if self._rest is None else self._rest.read()
 
     def judged(self, reading: object, *, last: bool) -> StopVerdict | None:
         if self._rest is not None and self._verdict is None:
@@ -58,21 +62,26 @@ class VerbsAfterHalt(PendingVerdict):
         return replace(verdict, halted=(*verdict.halted, *returned), not_stopped={**verdict.not_stopped, **unreturned})
 
 
+class StopOfRobot:
+    """A stop that is no robot itself: of a part of one, or with more than a halt."""
+
+    def stopped_robot(self) -> object:
+        """Return the robot whose own verbs it stops. Must not block."""
+        raise NotImplementedError
+
+
 def under_way_of(target: object) -> VerbsUnderWay | None:
     """Return the own verbs of what is stopped; None where it has no gate of ours.
 
     No code of the robot's own is run: it may hang, and a stop follows.
     """
-    # Of its class: a stop of a part of a robot.
-    part_of = getattr(type(target), "verbs_under_way", None)
-    if part_of is not None:
-        target = part_of(target)
+    robot = target.stopped_robot() if isinstance(target, StopOfRobot) else target
     try:
-        gate = object.__getattribute__(target, "__dict__").get("gate")
+        gate = object.__getattribute__(robot, "__dict__").get("gate")
     except AttributeError:
-        return None
-    own = getattr(gate, "under_way", None)
-    return own if isinstance(own, VerbsUnderWay) else None
+        gate = None
+    known = gate if isinstance(gate, MotionGate) else kept_gate(robot)
+    return None if known is None else known.under_way
 
 
 def void_calls(target: object) -> tuple[VerbCall, ...]:
@@ -84,17 +93,32 @@ def void_calls(target: object) -> tuple[VerbCall, ...]:
     return calls
 
 
+class _Here(threading.local):
+    """Halts under way on this thread whose verbs the executor waits for."""
+
+    halts = 0
+
+
+_here = _Here()
+
+
 class HaltedVerbs:
-    """The own verbs of a target that is about to be halted.
+    """The own verbs of a target that is about to be halted on this thread.
+
+    A halt inside that waits for verbs itself leaves that to this one.
 
     Args:
         target: of the halt; permits of its verbs are void from now on.
         before: calls that ran when the halt was asked for.
+        asked_by: threads that asked for the halt; a verb that halts its own robot is not waited for.
     """
 
-    def __init__(self, target: object, before: Iterable[VerbCall] = ()) -> None:
+    def __init__(self, target: object, before: Iterable[VerbCall] = (), asked_by: Collection[int] = ()) -> None:
         self._under_way = under_way_of(target)
         self._calls = dict.fromkeys((*before, *void_calls(target)))
+        # Several stops have one answer, and whoever does not run the verb has to be told of it.
+        self._itself = next(iter(asked_by)) if len(set(asked_by)) == 1 else None
+        _here.halts += 1
 
     def after(self, answer: object, name: str, until: float) -> object:
         """Return the answer to the halt, not settled while a verb has not returned.
@@ -104,13 +128,15 @@ class HaltedVerbs:
             name: what the verdict calls a target whose halt names nothing.
             until: monotonic s at which a verb that has not returned did not stop.
         """
+        _here.halts -= 1
         if self._under_way:
             # One that began while the halt came saw a valid permit, which is void now.
             self._calls.update(dict.fromkeys(each for each in self._under_way.calls if not each.valid()))
-        if not self._calls:
+        calls = tuple(each for each in self._calls if each.thread != self._itself)
+        if not calls or _here.halts:
             return answer
         given = answer if isinstance(answer, StopVerdict | PendingVerdict) else ForeignAnswer(answer, name)
-        return VerbsAfterHalt(given, tuple(self._calls), until)
+        return VerbsAfterHalt(given, calls, until)
 
 
 def halted_with_verbs(robot: object, halt: Callable[[], StopVerdict | PendingVerdict], deadline: float) -> StopVerdict:
@@ -121,6 +147,10 @@ def halted_with_verbs(robot: object, halt: Callable[[], StopVerdict | PendingVer
         halt: returns its answer.
         deadline: monotonic s at which a verb that has not returned did not stop.
     """
-    verbs, answer = HaltedVerbs(robot), halt()
-    given = verbs.after(answer, "", deadline)
+    verbs = HaltedVerbs(robot, asked_by=(threading.get_ident(),))
+    answer: StopVerdict | PendingVerdict | None = None
+    try:
+        answer = halt()
+    finally:
+        given = verbs.after(answer, "", deadline)
     return read_verdict(given if isinstance(given, PendingVerdict) else answer)

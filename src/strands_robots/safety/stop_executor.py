@@ -245,7 +245,7 @@ class StopExecutor:
             answer: object = None
             reason, target = stops[0].reason, stops[0].target
             deadline = max(each.moment(RETURN_SHARE) for each in stops)
-            verbs = HaltedVerbs(target, [call for each in stops for call in each.verbs])
+            verbs = HaltedVerbs(target, [call for each in stops for call in each.verbs], [each.asker for each in stops])
             try:
                 # Nested, an overridden halt has called the one of its class.
                 if has_parts(target) or (nested and isinstance(target, HaltsInParts)):

@@ -31,6 +31,7 @@ class SubmittedStop:
         within: seconds to halt, which count from ``since``.
         answered: called with a verdict that comes too late for the future.
         verbs: own verbs of the target that ran when it was submitted.
+        asker: the thread that submitted it.
         pending: what is still to be read for the verdict; None until the halt has returned.
         begun: the moment at which its halt, or later its reading, began.
     """
@@ -44,6 +45,7 @@ class SubmittedStop:
     answered: Answered | None
     direct: bool = False
     verbs: tuple[VerbCall, ...] = ()
+    asker: int = field(default_factory=threading.get_ident)
     extended: bool = False
     pending: PendingVerdict | None = None
     begun: float | None = None

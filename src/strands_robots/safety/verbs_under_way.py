@@ -23,6 +23,7 @@ class VerbCall:
         call: identity of the caller's request; verbs that a verb calls have its own.
         valid: returns False once its permit is void.
         void: ends its permit, and no other.
+        thread: that runs it.
         ended: how it ended; empty while it runs.
     """
 
@@ -31,6 +32,7 @@ class VerbCall:
     valid: Callable[[], bool]
     void: Callable[[], None]
     began: float = field(default_factory=time.monotonic)
+    thread: int = field(default_factory=threading.get_ident)
     ended: Literal["", "completed", "stopped", "error"] = ""
     error: str = ""
 
@@ -81,7 +83,7 @@ class VerbsUnderWay:
         One call of a robot's own verbs runs at a time, with those that it calls itself.
         """
         with self._beginning:
-            other = next((each.name for each in self._running if each.call is not call.call), "")
+            other = next((each.name for each in self.calls if each.call is not call.call), "")
             outer = not self._running
             if not other:
                 self._running[call] = None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Mapping
 from typing import Any
 
@@ -11,6 +12,9 @@ from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS
 from strands_robots.serving.verbs import Verb
 
 logger = logging.getLogger(__name__)
+
+LOOK_EVERY_S = 2.0
+"""Seconds between two looks at what a robot can be called for."""
 
 
 def offered(robot: Any, verbs: Mapping[str, Verb]) -> dict[str, Verb]:
@@ -25,6 +29,36 @@ def offered(robot: Any, verbs: Mapping[str, Verb]) -> dict[str, Verb]:
     """
     arm = _arm_verbs(robot)
     return {name: verb for name, verb in verbs.items() if _offers(robot, verb, arm)}
+
+
+class Offers:
+    """Verbs that a robot could carry out when it was looked at last.
+
+    Args:
+        robot: behind its contract.
+        verbs: all verbs of its device.
+        every_s: seconds between two looks.
+    """
+
+    def __init__(self, robot: Any, verbs: Mapping[str, Verb], every_s: float = LOOK_EVERY_S) -> None:
+        self._robot, self._verbs, self._every_s = robot, verbs, every_s
+        self._names: frozenset[str] | None = None
+        self._looked_at = 0.0
+
+    @property
+    def names(self) -> frozenset[str]:
+        """Their names, without a look at the robot but for the first time."""
+        if self._names is None:
+            self.look()
+        return self._names or frozenset()
+
+    def look(self) -> bool:
+        """Look at the robot, which may block; return True where its verbs changed."""
+        before, now = self._names, time.monotonic()
+        if before is None or now - self._looked_at >= self._every_s:
+            self._looked_at = now
+            self._names = frozenset(offered(self._robot, self._verbs))
+        return before != self._names
 
 
 def _arm_verbs(robot: Any) -> frozenset[str] | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 import json
 from collections.abc import Mapping
@@ -103,7 +104,9 @@ def _served(body: object, declared: DeclaredVerb) -> Verb:
         )
 
     def run(robot: Any, arguments: Arguments) -> Envelope:
-        return answer_of(name, *declared.carry_out(body_of(robot), arguments))
+        # A default that the method changes is none for the next call.
+        given = {each: copy.deepcopy(value) for each, value in arguments.items()}
+        return answer_of(name, *declared.carry_out(body_of(robot), given))
 
     return Verb(
         name,

@@ -16,9 +16,10 @@ from enum import Enum
 from typing import Any
 from weakref import WeakKeyDictionary
 
-from strands_robots.contract import Robot
+from strands_robots.contract import Robot, body_of
 from strands_robots.envelope import Envelope, error, is_error
 from strands_robots.errors import StrandsRobotsError
+from strands_robots.identity_map import IdentityMap
 from strands_robots.safety.approval import Approval, Claim, digest
 from strands_robots.safety.gate import REFUSALS, Asked, MotionGate, MotionRefused, refusal_envelope
 from strands_robots.safety.stop_log import stop_logger
@@ -181,6 +182,9 @@ class PendingCommands:
                     asked.give_up()
 
 
+_PENDING: IdentityMap[PendingCommands] = IdentityMap()
+
+
 @dataclass
 class Pipeline:
     """Serves the commands of one robot on one network.
@@ -213,7 +217,9 @@ class Pipeline:
     def of(cls, robot: Robot | None, peer_id: Callable[[], str], **parts: Any) -> Pipeline:
         """Make the pipeline of a robot, with shares and pending commands of its own."""
         gate = None if robot is None else robot.gate
-        parts.setdefault("pending", PendingCommands(gate))
+        # The same on every network: a stop of one robot of a world voids what waits on the others.
+        pending = PendingCommands(None) if robot is None else _PENDING.of(body_of(robot), lambda: PendingCommands(gate))
+        parts.setdefault("pending", pending)
         parts.setdefault("shares", Shares() if robot is None else shares_of(robot))
         parts.setdefault("leases", None if robot is None else leases_of(robot, hardware=parts["hardware"]))
         return cls(robot, peer_id, **parts)

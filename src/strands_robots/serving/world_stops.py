@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from strands_robots import settings
 from strands_robots.contract import WorldRobot
 from strands_robots.envelope import Envelope
+from strands_robots.safety.halted_verbs import StopOfRobot
 from strands_robots.safety.stop_executor import stop_executor
 from strands_robots.safety.stopping import (
     PendingVerdict,
@@ -94,13 +95,13 @@ class _WorldEnds(PendingVerdict):
 
 
 @dataclass(frozen=True)
-class RobotStop:
+class RobotStop(StopOfRobot):
     """The stop of one robot of a world."""
 
     world: WorldRobot
     name: str
 
-    def verbs_under_way(self) -> WorldRobot:
+    def stopped_robot(self) -> WorldRobot:
         """Return the world, of whose own verbs each may move this robot."""
         return self.world
 

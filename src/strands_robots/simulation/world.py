@@ -627,7 +627,7 @@ class Simulation(PicturesMixin, ArmMixin, TeleopMixin):
         moved, self._moved = self._moved, {}
         for rollout in (running := self._running()).values():
             rollout.void()
-        return RolloutsEnd(moved, running | self.void_teleoperation(), deadline, then).at_once()
+        return RolloutsEnd(moved, running | self.void_teleoperation(), deadline, then, self.gate.under_way).at_once()
 
 
 def _row(rollout: Rollout) -> dict[str, Any]:

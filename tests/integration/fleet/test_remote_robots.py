@@ -87,7 +87,7 @@ class TestOnEachNetwork:
         (arm,) = site.fleet.robots()
         assert (arm.id, arm.network, arm.left_out) == ("arm-1", site.network, ())
         assert (arm.has_stop, arm.has_lockout, arm.has_lease) == (True, True, True)
-        assert {"move_to", "acquire_control", "halt"} <= set(dir(arm))
+        assert {"get_control", "acquire_control", "halt"} <= set(dir(arm))
 
     def test_reads_answer(self, site: Site) -> None:
         assert site.arm.status()["task_status"] == "idle"
