@@ -16,7 +16,7 @@ from strands_robots.contract import adapt
 from strands_robots.hardware import HardwareRobot
 from strands_robots.safety.gate import MotionGate, MotionRefused
 from strands_robots.safety.stop_executor import stop_executor
-from strands_robots.safety.stopping import StopVerdict
+from strands_robots.safety.stopping import PendingVerdict, StopVerdict
 
 
 class Waving(HardwareRobot):
@@ -192,6 +192,11 @@ class Hanging(HardwareRobot):
     def __init__(self, *values: Any, **options: Any) -> None:
         super().__init__(*values, **options)
         self.started, self.released = threading.Event(), threading.Event()
+        self.halts = 0
+
+    def halt_here(self, reason: str, deadline: float) -> StopVerdict | PendingVerdict:
+        self.halts += 1
+        return super().halt_here(reason, deadline)
 
     @verb(motion=True, lasts=60.0)
     def hang(self, permit: Permit) -> None:
@@ -215,8 +220,12 @@ def test_second_stop_of_an_arm_begins_beside_the_first_ones_verb(kind: type[Hang
     working.start()
     eventually(arm.started.is_set)
     try:
-        stops = [stop_executor().submit(arm, "arm", f"{number}", within=1.0) for number in range(3)]
-        eventually(lambda: arm.gate.generation >= 2)
+        first = arm.halts
+        stops = []
+        for number in range(1, 4):
+            stops.append(stop_executor().submit(arm, "arm", f"{number}", within=1.5))
+            # The halt of each begins while the one before still waits for its verb.
+            eventually(lambda wanted=first + number: arm.halts >= wanted)
         assert not any(each.done() for each in stops)
         assert [each.result(20.0).stopped for each in stops] == [False] * 3
         assert arm.stop_task()["status"] == "error"
@@ -262,3 +271,20 @@ def test_one_verb_runs_at_a_time_and_none_is_lost() -> None:
         each.join(60.0)
     assert len(done) + len(refused) == 800
     assert robot.cups == len(done)
+
+
+def test_verb_of_an_arm_that_halts_it_does_not_wait_for_itself() -> None:
+    class Careful(HardwareRobot):
+        @verb
+        def feel(self, permit: Permit) -> dict[str, Any]:
+            """Feel."""
+            began = time.monotonic()
+            return {"stopped": self.halt("I felt something").stopped, "took_s": time.monotonic() - began}
+
+    arm = Careful(RecordingDevice(), "arm")
+    arm.connect()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("STRANDS_HALT_DEADLINE_S", "30")
+        felt = arm.feel()
+    assert felt["stopped"] is True
+    assert felt["took_s"] < 20.0

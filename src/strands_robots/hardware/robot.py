@@ -50,6 +50,7 @@ from strands_robots.safety.gate import (
     answered,
     refusal_envelope,
 )
+from strands_robots.safety.halted_verbs import verbs_to_end
 from strands_robots.safety.persistence import hardware_key
 from strands_robots.safety.stop_executor import stop_executor
 from strands_robots.safety.stop_log import stop_logger
@@ -458,7 +459,7 @@ class HardwareRobot(ArmMixin, TeleopMixin):
         except Exception as exc:  # noqa: BLE001 - a device may raise anything; the verdict says what
             verdicts.append(unfrozen(failure(self.tool_name_str, exc), moved))
         else:
-            verdicts.append(RolloutsEnd(moved, loops, deadline, then, self.gate.under_way).at_once())
+            verdicts.append(RolloutsEnd(moved, loops, deadline, then, verbs_to_end(self.gate.under_way)).at_once())
         finally:
             self._halting = {}
 
@@ -495,7 +496,7 @@ class HardwareRobot(ArmMixin, TeleopMixin):
     def _settled_after(self, generation: int, given: int, verdict: StopVerdict) -> StopVerdict:
         """Let a frozen robot settle, unless another stop or a motion came since."""
         settling = self._settling
-        if settling is None:
+        if settling is None or self.gate.under_way:
             return verdict
         if generation != self.gate.generation:
             # The two stops are one, and the later one lets the arm settle.

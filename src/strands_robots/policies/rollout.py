@@ -35,7 +35,6 @@ from strands_robots.safety.gate import Permit, PermitVoidError
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import READ_EVERY_S, PendingVerdict, StopVerdict, halt_each
 from strands_robots.safety.turns import shorten_turns
-from strands_robots.safety.verbs_under_way import VerbsUnderWay
 from strands_robots.utils import ValidationError, number, text, whole
 from strands_robots.utils import duration as checked_duration
 
@@ -491,7 +490,7 @@ class RolloutsEnd(PendingVerdict):
         loops: the voided rollouts, by what a verdict calls them.
         until: the moment, in monotonic s, until which their ends are waited for.
         then: makes the final verdict.
-        verbs: own verbs of the robot; while one runs, the verdict is not final, and then without ``then``.
+        moves: returns True while something else of the robot has to end; at last the verdict is without ``then``.
     """
 
     def __init__(
@@ -500,9 +499,9 @@ class RolloutsEnd(PendingVerdict):
         loops: Mapping[str, Rollout],
         until: float,
         then: Callable[[StopVerdict], StopVerdict] = lambda verdict: verdict,
-        verbs: VerbsUnderWay | None = None,
+        moves: Callable[[], bool] = lambda: False,
     ) -> None:
-        self._verbs = verbs
+        self._moves = moves
         # The reading itself waits for the end of a loop.
         super().__init__(until, pause_s=0.0)
         self._moved, self._loops, self._then = tuple(moved), loops, then
@@ -511,7 +510,7 @@ class RolloutsEnd(PendingVerdict):
 
     def at_once(self) -> StopVerdict | PendingVerdict:
         """Return the verdict where nothing has to end, else this."""
-        return self if self._loops or self._verbs else self._then(self._found())
+        return self if self._loops or self._moves() else self._then(self._found())
 
     def known(self) -> StopVerdict | None:
         return self.judged(None, last=False)
@@ -527,7 +526,7 @@ class RolloutsEnd(PendingVerdict):
                 return
 
     def judged(self, reading: object, *, last: bool) -> StopVerdict | None:
-        found, moves = self._found(), bool(self._verbs)
+        found, moves = self._found(), self._moves()
         if self._final is None and ((found.stopped and not moves) or last):
             # Once, and in time: it may have the robot settle, of which the answer must say so.
             self._final = found if self._answered_for or moves else self._then(found)

@@ -94,9 +94,10 @@ def void_calls(target: object) -> tuple[VerbCall, ...]:
 
 
 class _Here(threading.local):
-    """Halts under way on this thread whose verbs the executor waits for."""
+    """Halts under way on this thread, the outermost first."""
 
-    halts = 0
+    def __init__(self) -> None:
+        self.halts: list[HaltedVerbs] = []
 
 
 _here = _Here()
@@ -118,7 +119,11 @@ class HaltedVerbs:
         self._calls = dict.fromkeys((*before, *void_calls(target)))
         # Several stops have one answer, and whoever does not run the verb has to be told of it.
         self._itself = next(iter(asked_by)) if len(set(asked_by)) == 1 else None
-        _here.halts += 1
+        _here.halts.append(self)
+
+    def asked(self, call: VerbCall) -> bool:
+        """Return True for a verb that asks for the halt itself."""
+        return call.thread == self._itself
 
     def after(self, answer: object, name: str, until: float) -> object:
         """Return the answer to the halt, not settled while a verb has not returned.
@@ -128,15 +133,26 @@ class HaltedVerbs:
             name: what the verdict calls a target whose halt names nothing.
             until: monotonic s at which a verb that has not returned did not stop.
         """
-        _here.halts -= 1
+        _here.halts.remove(self)
         if self._under_way:
             # One that began while the halt came saw a valid permit, which is void now.
             self._calls.update(dict.fromkeys(each for each in self._under_way.calls if not each.valid()))
-        calls = tuple(each for each in self._calls if each.thread != self._itself)
+        calls = tuple(each for each in self._calls if not self.asked(each))
         if not calls or _here.halts:
             return answer
         given = answer if isinstance(answer, StopVerdict | PendingVerdict) else ForeignAnswer(answer, name)
         return VerbsAfterHalt(given, calls, until)
+
+
+def verbs_to_end(under_way: VerbsUnderWay) -> Callable[[], bool]:
+    """Return whether verbs run that a halt under way on this thread has to wait for.
+
+    An inner halt waits for none: the outermost does.
+    """
+    if len(_here.halts) != 1:
+        return lambda: False
+    halted = _here.halts[0]
+    return lambda: any(not each.valid() and not halted.asked(each) for each in under_way.calls)
 
 
 def halted_with_verbs(robot: object, halt: Callable[[], StopVerdict | PendingVerdict], deadline: float) -> StopVerdict:

@@ -78,6 +78,9 @@ class StopTorque:
             generation: of that halt.
             given: the gate's count of permits at that halt.
         """
+        if self._gate.under_way:
+            # A verb of the world's own goes on, or halts its own world.
+            return verdict
         if generation != self._gate.generation:
             # Another stop came meanwhile: the two are one, and the later one lets the arms settle.
             return replace(verdict, settling=bool(self.settling))

@@ -32,7 +32,7 @@ from strands_robots.policies.rollout import (
     unfollowed,
 )
 from strands_robots.safety.gate import MotionGate, Permit, Waiting, answered
-from strands_robots.safety.halted_verbs import halted_with_verbs
+from strands_robots.safety.halted_verbs import halted_with_verbs, verbs_to_end
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stop_targets import note_motion
 from strands_robots.safety.stopping import PendingVerdict, StopLevel, StopVerdict, halts_in_parts, read_verdict
@@ -627,7 +627,9 @@ class Simulation(PicturesMixin, ArmMixin, TeleopMixin):
         moved, self._moved = self._moved, {}
         for rollout in (running := self._running()).values():
             rollout.void()
-        return RolloutsEnd(moved, running | self.void_teleoperation(), deadline, then, self.gate.under_way).at_once()
+        return RolloutsEnd(
+            moved, running | self.void_teleoperation(), deadline, then, verbs_to_end(self.gate.under_way)
+        ).at_once()
 
 
 def _row(rollout: Rollout) -> dict[str, Any]:
