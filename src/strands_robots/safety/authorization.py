@@ -60,8 +60,9 @@ def motion_refusal(source: object, allow: Sequence[str], *, hardware: bool) -> s
         if not hardware:
             return None
         return (
-            "No caller may move this robot: DEVICE_CONNECT_RPC_ALLOW is not set. Set it to the callers that may "
-            "(names or globs, '*' for every named caller, 'anonymous' for callers without a name)."
+            "No caller may move this robot: DEVICE_CONNECT_RPC_ALLOW is not set. Set it to the callers that may, such "
+            f"as this one, {name or ANONYMOUS} (names or globs, '*' for every named caller, 'anonymous' for callers "
+            "without a name)."
         )
     if name is None:
         if ANONYMOUS in listed:
