@@ -103,7 +103,7 @@ def test_a_robots_own_verb_is_called_by_the_allowed_and_stopped_in_its_middle(en
         assert made.returncode == 0, made.stderr
         assert "brewCoffee completed." in made.stdout
         refused = command(environment, "call", "barista", "brewCoffee", "cups=9")
-        assert refused.returncode == 1
+        assert refused.returncode == 2
         assert "cups must be an integer from 1 to 8, not 9." in refused.stderr
         assert "result: 242.0" in command(environment, "call", "barista", "beansLeft").stdout
         brewing = subprocess.Popen([*COMMAND, "call", "barista", "brewCoffee", "cups=8"], env=environment)
