@@ -9,6 +9,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from fixtures.barista import Barista
 from fixtures.mesh_robots import Arm, World
 from fixtures.waiting import eventually
 
@@ -23,7 +24,7 @@ from strands_robots.safety.roster import Roster
 from strands_robots.serving.advertised import AdvertisedVerb, find_verb
 from strands_robots.tools import networks, robot_mesh
 from strands_robots.tools.mesh_roster import mesh_network
-from strands_robots.tools.networks import DeviceConnect, NativeMesh
+from strands_robots.tools.networks import DeviceConnect, NativeMesh, joined_mesh
 from strands_robots.tools.roster_verdict import combined_verdict
 
 
@@ -234,6 +235,31 @@ def test_robots_on_the_mesh_are_listed_commanded_and_stopped(on_the_mesh: None) 
         for mesh in meshes:
             if mesh is not None:
                 mesh.close()
+
+
+@pytest.fixture
+def barista(on_the_mesh: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Barista]:
+    monkeypatch.setenv("BYPASS_TOOL_CONSENT", "true")
+    robot = Barista()
+    with joined_mesh(robot, "bar-1", "robot"), joined_mesh(None, "looker", "tool") as looker:
+        # All peers of one process share their list of peers.
+        eventually(lambda: looker.get_peer("bar-1") is not None)
+        yield robot
+
+
+def test_own_verb_of_a_mesh_peer_is_waited_for_as_long_as_it_lasts(barista: Barista) -> None:
+    answer = NativeMesh().call("bar-1", "brewCoffee", {"cups": 2}, seconds=1e-6)
+    assert answer["cups"] == 2
+    assert "did not answer" in NativeMesh().call("bar-1", "status", {}, seconds=1e-6)["reason"]
+
+
+@pytest.mark.parametrize("verb", ["brewCoffee", "status", "stop"])
+def test_unknown_peer_is_answered_at_once_with_the_near_ones(
+    barista: Barista, verb: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(networks, "STOP_S", 0.1)
+    answer = robot_mesh(action="call", target="bar-2", verb=verb)
+    assert answer["reason"] == "No peer 'bar-2' is on the mesh. Near it: bar-1."
 
 
 def test_discovery_of_a_stated_endpoint_outlasts_its_retry_pause() -> None:

@@ -93,12 +93,14 @@ def call(
     stated = None if timeout is None else number("--timeout", timeout, above=0, high=3600)
     whose = ""
     if on_mesh:
-        from strands_robots.tools.networks import NativeMesh  # noqa: PLC0415 - loaded when a network is used
+        from strands_robots.cli.peers_mesh import call_peer  # noqa: PLC0415 - loaded when a network is used
 
         if function is None:
             raise CliError("call --mesh takes a function, such as status.", Exit.USAGE)
         network.use_mesh()
-        answer = NativeMesh().call(device, function, params, stated or _usual_wait(function))
+        command = {**params, "action": function}
+        wait = lambda verb: stated or _wait(function, verb)  # noqa: E731 - one line
+        answer = call_peer(device, command, wait, lambda verb: _typed(verb, given, params))
     else:
         with network.fleet(source) as fleet:
             whose = other_user(fleet.link)
@@ -110,7 +112,7 @@ def call(
                     verb = fleet.verb(device, function) if given or not _quick(function) else None
                 if verb is not None:
                     params = _typed(verb, given, params)
-                seconds = stated or _usual_wait(function) + (verb.lasts_s if verb is not None else 0.0)
+                seconds = stated or _wait(function, verb)
                 answer = call_device(fleet, device, function, params, seconds)
             except CliError as failure:
                 raise CliError(f"{failure.reason} {whose}".rstrip(), failure.code, **failure.fields) from failure
@@ -127,6 +129,11 @@ def call(
 def _quick(function: str) -> bool:
     """Return True for a read or a stop, which is known to be answered at once."""
     return function.startswith(("get", "list", "stop"))
+
+
+def _wait(function: str, verb: AdvertisedVerb | None) -> float:
+    """Return the seconds to wait for an answer, those that a verb lasts included."""
+    return _usual_wait(function) + (verb.lasts_s if verb is not None else 0.0)
 
 
 def _usual_wait(function: str) -> float:
