@@ -14,6 +14,7 @@ from strands_robots.cli.network import SOURCE, Network, answering, call_device, 
 from strands_robots.cli.output import LATE_S, CliError, Exit, Screen, label, plain, readable, table
 from strands_robots.cli.readiness import other_user
 from strands_robots.envelope import is_error, text_of
+from strands_robots.serving.known_verbs import TEXTS, VERBS, WAITING
 from strands_robots.utils import WAIT_S, ValidationError, device_id, number
 
 if TYPE_CHECKING:
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from strands_robots.device_connect.discovery import Peer
     from strands_robots.serving.advertised import AdvertisedVerb
 
+LEASE_ID = "lease_id"
 
 CALL_S = 10.0
 MOTION_S = CALL_S + WAIT_S
@@ -98,7 +100,7 @@ def call(
         if function is None:
             raise CliError("call --mesh takes a function, such as status.", Exit.USAGE)
         network.use_mesh()
-        command = {**params, "action": function}
+        command = {**_typed(None, given, params), "action": function}
         wait = lambda verb: stated or _wait(function, verb)  # noqa: E731 - one line
         answer = call_peer(device, command, wait, lambda verb: _typed(verb, given, params))
     else:
@@ -109,9 +111,8 @@ def call(
                     _list_functions(screen, fleet, device)
                     return
                 with answering(fleet, device):
-                    verb = fleet.verb(device, function) if given or not _quick(function) else None
-                if verb is not None:
-                    params = _typed(verb, given, params)
+                    verb = fleet.verb(device, function) if _needs_description(function, given, params) else None
+                params = _typed(verb, given, params)
                 seconds = stated or _wait(function, verb)
                 answer = call_device(fleet, device, function, params, seconds)
             except CliError as failure:
@@ -126,41 +127,43 @@ def call(
             screen.say(f"  {key}: {value if isinstance(value, str) else json.dumps(value, default=str)}")
 
 
-def _quick(function: str) -> bool:
-    """Return True for a read or a stop, which is known to be answered at once."""
-    return function.startswith(("get", "list", "stop"))
-
-
 def _wait(function: str, verb: AdvertisedVerb | None) -> float:
     """Return the seconds to wait for an answer, those that a verb lasts included."""
-    return _usual_wait(function) + (verb.lasts_s if verb is not None else 0.0)
+    return (MOTION_S if function in WAITING else CALL_S) + (verb.lasts_s if verb is not None else 0.0)
 
 
-def _usual_wait(function: str) -> float:
-    """Return the seconds to wait for a function's answer."""
-    if _quick(function):
-        return CALL_S
-    from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS  # noqa: PLC0415 - saves its import elsewhere
+def _needs_description(function: str, given: Sequence[str], params: Mapping[str, Any]) -> bool:
+    """Return False where name and arguments already say all that is needed.
 
-    verb = ARM_MOTION_VERBS.get(function)
-    return MOTION_S if verb is not None and verb.lasts else CALL_S
+    Of a verb of ours the robot itself checks the arguments, and only what may be of another type is asked about.
+    """
+    if function not in VERBS:
+        return True
+    texts = dict(each.split("=", 1) for each in given)
+    # A text that is no JSON stays a text, and JSON that is no text stays what it is.
+    return any(
+        texts[name][:1] != '"' and name != LEASE_ID and (isinstance(value, str) is not (name in TEXTS))
+        for name, value in params.items()
+    )
 
 
-def _typed(verb: AdvertisedVerb, given: Sequence[str], params: Mapping[str, Any]) -> dict[str, Any]:
+def _typed(verb: AdvertisedVerb | None, given: Sequence[str], params: Mapping[str, Any]) -> dict[str, Any]:
     """Return the arguments with the types that a function's description states.
 
     Raises:
         ValidationError: naming an argument that it does not have, or a value that does not fit.
     """
+    texts = dict(each.split("=", 1) for each in given)
+    # A lease may consist of digits alone, and is a text all the same.
+    leased = {LEASE_ID: texts[LEASE_ID]} if not isinstance(params.get(LEASE_ID, ""), str) else {}
+    if verb is None:
+        return {**params, **leased}
     from strands_robots.serving.advertised import typed  # noqa: PLC0415 - loaded when a network is used
-    from strands_robots.serving.verbs import LEASE_ID  # noqa: PLC0415 - as above
 
+    known = verb.by_name
     unknown = verb.unknown(name for name in params if name not in verb.leases)
     if unknown:
         raise ValidationError(unknown)
-    texts, known = dict(each.split("=", 1) for each in given), verb.by_name
-    # A lease may consist of digits alone, and is a text all the same.
-    leased = {LEASE_ID: texts[LEASE_ID]} if LEASE_ID in texts else {}
     given_types = {name: typed(known[name], value, texts[name]) for name, value in params.items() if name in known}
     return {**params, **given_types, **leased}
 

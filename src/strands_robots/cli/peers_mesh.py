@@ -40,7 +40,7 @@ def call_peer(
     seconds: Callable[[AdvertisedVerb | None], float],
     fit: Callable[[AdvertisedVerb], Mapping[str, Any]],
 ) -> Envelope:
-    """Have a peer carry an action out, as :func:`~strands_robots.tools.networks.ask` does.
+    """Have a peer carry an action out, as :func:`networks.ask` does.
 
     Raises:
         CliError: no such peer, no answer or no network (exit code 3).
