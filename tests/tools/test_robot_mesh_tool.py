@@ -253,6 +253,33 @@ def test_own_verb_of_a_mesh_peer_is_waited_for_as_long_as_it_lasts(barista: Bari
     assert "did not answer" in NativeMesh().call("bar-1", "status", {}, seconds=1e-6)["reason"]
 
 
+def test_peers_of_the_mesh_are_listed_with_the_verbs_that_they_have(barista: Barista) -> None:
+    (bar,) = (row for row in robot_mesh(action="peers")["peers"] if row["id"] == "bar-1")
+    assert {"brewCoffee", "beansLeft", "status", "stop"} <= set(bar["functions"])
+    assert not {"moveTo", "execute", "releaseTorque"} & set(bar["functions"])
+    assert bar["own_verbs"]["brewCoffee"].startswith("(cups: integer, 1 to 8; [strength: mild | strong]) Brew coffee")
+    assert "note" not in bar
+
+
+def test_silent_peers_hold_up_a_list_for_a_bounded_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked, given = list[str](), list[float]()
+
+    def send(peer: str, command: dict[str, Any], seconds: float) -> dict[str, Any]:
+        asked.append(peer)
+        given.append(seconds)
+        threading.Event().wait(seconds)
+        return {"status": "timeout"}
+
+    monkeypatch.setattr(networks, "LIST_S", 0.1)
+    names = [f"bar-{n}" for n in range(100)]
+    rows = [{"peer_id": name, "type": "robot", "reachable": True, "robot_kind": "mobile_base"} for name in names]
+    mesh = SimpleNamespace(peers=rows, send=send)
+    monkeypatch.setattr(networks, "_on_mesh", lambda work: work(mesh))
+    monkeypatch.setattr(networks, "discover", lambda mesh: None)
+    assert all("drive" in row["functions"] for row in NativeMesh().peers()["peers"])
+    assert len(asked) < len(names) and max(given) <= 0.1
+
+
 @pytest.mark.parametrize("verb", ["brewCoffee", "status", "stop"])
 def test_unknown_peer_is_answered_at_once_with_the_near_ones(
     barista: Barista, verb: str, monkeypatch: pytest.MonkeyPatch
@@ -472,7 +499,7 @@ def test_peers_name_own_verbs_with_their_parameters_and_devices_that_cannot_be_s
     assert echo["note"] == "This device has no lockout, no lease and no stop."
 
 
-def test_own_verbs_of_a_mesh_peer_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_verbs_of_an_older_mesh_peer_are_those_of_its_kind(monkeypatch: pytest.MonkeyPatch) -> None:
     row = {
         "peer_id": "bar-1",
         "type": "robot",
@@ -480,7 +507,9 @@ def test_own_verbs_of_a_mesh_peer_are_named(monkeypatch: pytest.MonkeyPatch) -> 
         "robot_kind": "robot",
         "own_verbs": ["brewCoffee", 5],
     }
-    monkeypatch.setattr(networks, "_on_mesh", lambda work: work(SimpleNamespace(peers=[row])))
+    older = {"type": "error", "error": "validation: action must be one of status, stop."}
+    mesh = SimpleNamespace(peers=[row], send=lambda *_: older)
+    monkeypatch.setattr(networks, "_on_mesh", lambda work: work(mesh))
     monkeypatch.setattr(networks, "discover", lambda mesh: None)
     (bar,) = NativeMesh().peers()["peers"]
     assert "moveTo" in bar["functions"] and bar["functions"][-1] == "brewCoffee"

@@ -56,6 +56,9 @@ AGAIN_S, LOOK_S = 1.0, 0.05
 DESCRIBE_S = 2.0
 """Seconds in which a peer of the mesh has to describe a verb of its own before that is called."""
 
+LIST_S, LISTED_AT_ONCE = 1.0, 32
+"""Seconds in which the peers of a list have to describe their verbs, and how many are asked at once."""
+
 ALWAYS_SENT = ("stop", "releaseTorque")
 """Actions that take energy away: they are sent to a peer that was not seen, too."""
 
@@ -112,22 +115,24 @@ class NativeMesh:
     """Robots on the native mesh, called by a peer without a robot."""
 
     def peers(self) -> Envelope:
-        """List every peer in reach, with its type, state and actions."""
-        from strands_robots.serving.advertised import own_names  # noqa: PLC0415 - loaded when it is used
-        from strands_robots.serving.peer_verbs import KINDS  # noqa: PLC0415 - as above
+        """List every peer in reach, with its type, state and actions.
+
+        Actions are those that it describes, of an earlier release or a silent one those of its kind.
+        """
 
         def listed(mesh: Mesh) -> Envelope:
             discover(mesh)
+            rows = [row for row in mesh.peers if row["reachable"]]
+            functions = _functions_of(mesh, [row["peer_id"] for row in rows if "robot_kind" in row])
             return _peer_list(
                 [
                     {
                         "id": row["peer_id"],
                         "type": row["type"],
                         "status": row.get("task_status", ""),
-                        "functions": [*KINDS.get(str(row.get("robot_kind")), ()), *own_names(row.get("own_verbs"))],
+                        **(_verbs(functions[row["peer_id"]]) if row["peer_id"] in functions else _verbs_of_kind(row)),
                     }
-                    for row in mesh.peers
-                    if row["reachable"]
+                    for row in rows
                 ]
             )
 
@@ -294,6 +299,44 @@ def _functions(mesh: Mesh, target: str, seconds: float) -> list[Any] | None:
     return functions if isinstance(functions, list) else None
 
 
+def _functions_of(mesh: Mesh, peers: Collection[str]) -> dict[str, list[Any]]:
+    """Return the functions of the peers that describe them in time."""
+    ends, found = time.monotonic() + LIST_S, dict[str, list[Any]]()
+
+    def described(peer: str) -> None:
+        left = ends - time.monotonic()
+        functions = _functions(mesh, peer, left) if left > 0 else None
+        if functions is not None:
+            found[peer] = functions
+
+    if peers:
+        with ThreadPoolExecutor(min(len(peers), LISTED_AT_ONCE), "describe") as pool:
+            list(pool.map(described, peers))
+    return found
+
+
+def _verbs(functions: object) -> dict[str, Any]:
+    """Return what a list of robots says on the verbs of one."""
+    from strands_robots.serving.advertised import RobotDescription, fitting  # noqa: PLC0415 - loaded when it is used
+
+    description = RobotDescription.of(functions)
+    verbs = description.verbs.values()
+    own = dict(fitting(((each.name, f"({each.takes}) {each.summary}") for each in verbs if each.own), OWN_BYTES))
+    return {
+        "functions": [each.name for each in verbs],
+        **({"own_verbs": own} if own else {}),
+        **({"note": description.absent} if description.absent else {}),
+    }
+
+
+def _verbs_of_kind(row: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the same of a mesh peer by its presence alone."""
+    from strands_robots.serving.advertised import own_names  # noqa: PLC0415 - loaded when it is used
+    from strands_robots.serving.peer_verbs import KINDS  # noqa: PLC0415 - as above
+
+    return {"functions": [*KINDS.get(str(row.get("robot_kind")), ()), *own_names(row.get("own_verbs"))]}
+
+
 def _stop_all(mesh: Mesh, stop: Callable[[], list[dict[str, Any]]], roster: StopRoster) -> dict[str, Envelope]:
     """Send a stop, and again while a peer in reach has not confirmed it.
 
@@ -416,19 +459,6 @@ class DeviceConnect:
 
         Verbs of its own come with their parameters, in the robot's words.
         """
-        from strands_robots.serving.advertised import RobotDescription, fitting  # noqa: PLC0415 - loaded when it is used
-
-        def described(functions: object) -> dict[str, Any]:
-            description = RobotDescription.of(functions)
-            verbs = description.verbs.values()
-            own = dict(
-                fitting(((each.name, f"({each.takes}) {each.summary}") for each in verbs if each.own), OWN_BYTES)
-            )
-            return {
-                "functions": [each.name for each in verbs],
-                **({"own_verbs": own} if own else {}),
-                **({"note": description.absent} if description.absent else {}),
-            }
 
         def listed(fleet: FleetClient) -> Envelope:
             rows = [
@@ -436,7 +466,7 @@ class DeviceConnect:
                     "id": peer.id,
                     "type": peer.type,
                     "status": peer.status.get("availability", ""),
-                    **described(peer.functions),
+                    **_verbs(peer.functions),
                 }
                 for peer in fleet.peers()
             ]
