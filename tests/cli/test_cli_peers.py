@@ -185,8 +185,8 @@ def test_call_sends_what_the_description_says_and_waits_as_long_as_the_verb_last
 @pytest.mark.parametrize(
     ("argument", "said"),
     [
-        ("cups=nine", "cups must be a whole number"),
-        ("cups=9", "cups must be 1 to 8 cups"),
+        ("cups=nine", "cups must be an integer from 1 to 8, not 'nine'."),
+        ("cups=9", "cups must be an integer from 1 to 8, not 9."),
         ("strength=weak", "mild, strong"),
         ("recipe=[1]", "recipe must be an object as JSON"),
         ("sugar=1", "its arguments: cups, label, strength, recipe"),
