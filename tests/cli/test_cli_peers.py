@@ -241,6 +241,24 @@ def test_own_verb_is_waited_for_whatever_its_name_begins_with(run: Run, fleet: F
     assert fleet.called == [("bar-1", name, {}, 100.0)]
 
 
+@pytest.mark.parametrize("function", ["brewCoffee", "moveTo", "wait"])
+def test_ctrl_c_of_a_motion_says_that_it_goes_on_and_how_to_stop_it(run: Run, fleet: FakeFleet, function: str) -> None:
+    fleet.found, fleet.answer = [barista()], KeyboardInterrupt()
+    result = run("call", "bar-1", function, "--tenant", "lab")
+    assert result.exit_code == 130
+    assert "The robot may still move. Stop it: strands-robots stop bar-1 --tenant lab" in result.stderr
+    said = json.loads(run("call", "bar-1", function, "--json").stdout)
+    assert (said["exit"], said["stop"]) == (130, "strands-robots stop bar-1")
+
+
+def test_ctrl_c_of_a_read_says_nothing(run: Run, fleet: FakeFleet) -> None:
+    read = {"name": "beansLeft", "labels": {"direction": "read", "own": "true"}}
+    fleet.found, fleet.answer = [Peer("bar-1", functions=(read,))], KeyboardInterrupt()
+    for function in ("getStatus", "beansLeft"):
+        result = run("call", "bar-1", function)
+        assert (result.exit_code, result.output) == (130, "")
+
+
 def test_call_without_a_function_lists_them_with_their_domains(run: Run, fleet: FakeFleet) -> None:
     fleet.found = [barista(), Peer("echo-1", functions=({"name": "echo"}, {"name": "\x1b[2J", "parameters": 5}))]
     said = run("call", "bar-1").stdout

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 from fixtures.barista import Barista
@@ -11,6 +12,7 @@ from fixtures.waiting import eventually
 from tests.cli.conftest import Run
 
 from strands_robots.cli import peers
+from strands_robots.mesh import Mesh
 from strands_robots.mesh.session import clear_peers
 from strands_robots.mesh.transport import zenoh_config
 from strands_robots.tools.networks import joined_mesh
@@ -52,3 +54,20 @@ def test_no_answer_is_exit_3(run: Run, barista: Barista, device: str, said: str)
     result = run("call", "--mesh", device, "status", "--timeout", "0.000001")
     assert result.exit_code == 3
     assert said in result.stderr
+
+
+@pytest.mark.parametrize(("function", "told"), [("brewCoffee", True), ("beansLeft", False), ("status", False)])
+def test_ctrl_c_of_a_motion_names_the_stop_on_the_mesh(
+    run: Run, barista: Barista, monkeypatch: pytest.MonkeyPatch, function: str, told: bool
+) -> None:
+    send = Mesh.send
+
+    def interrupted(mesh: Mesh, target: str, command: dict[str, Any], timeout: float = 1.0) -> dict[str, Any]:
+        if command["action"] == function:
+            raise KeyboardInterrupt
+        return send(mesh, target, command, timeout)
+
+    monkeypatch.setattr(Mesh, "send", interrupted)
+    result = run("call", "--mesh", "bar-1", function, *(["cups=1"] if told else []))
+    assert result.exit_code == 130
+    assert ("The robot may still move. Stop it: strands-robots stop bar-1 --mesh" in result.stderr) is told

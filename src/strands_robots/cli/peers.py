@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import contextmanager
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,14 +15,15 @@ from strands_robots.cli.network import SOURCE, Network, answering, call_device, 
 from strands_robots.cli.output import LATE_S, CliError, Exit, Screen, label, plain, readable, table
 from strands_robots.cli.readiness import other_user
 from strands_robots.envelope import is_error, text_of
-from strands_robots.serving.known_verbs import TEXTS, VERBS, WAITING
+from strands_robots.serving.known_verbs import QUICK, TEXTS, VERBS, WAITING
 from strands_robots.utils import WAIT_S, ValidationError, device_id, number
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from strands_robots.device_connect import FleetClient
     from strands_robots.device_connect.discovery import Peer
+    from strands_robots.envelope import Envelope
     from strands_robots.serving.advertised import AdvertisedVerb
 
 LEASE_ID = "lease_id"
@@ -95,14 +97,9 @@ def call(
     stated = None if timeout is None else number("--timeout", timeout, above=0, high=3600)
     whose = ""
     if on_mesh:
-        from strands_robots.cli.peers_mesh import call_peer  # noqa: PLC0415 - loaded when a network is used
-
         if function is None:
             raise CliError("call --mesh takes a function, such as status.", Exit.USAGE)
-        network.use_mesh()
-        command = {**_typed(None, given, params), "action": function}
-        wait = lambda verb: stated or _wait(function, verb)  # noqa: E731 - one line
-        answer = call_peer(device, command, wait, lambda verb: _typed(verb, given, params))
+        answer = _call_on_mesh(network, device, function, given, stated)
     else:
         with network.fleet(source) as fleet:
             whose = other_user(fleet.link)
@@ -114,8 +111,11 @@ def call(
                     verb = fleet.verb(device, function) if _needs_description(function, given, params) else None
                 params = _typed(verb, given, params)
                 seconds = stated or _wait(function, verb)
-                answer = call_device(fleet, device, function, params, seconds)
+                with _interruptible(f"strands-robots stop {device}{network.flags}", lambda: _moves(function, verb)):
+                    answer = call_device(fleet, device, function, params, seconds)
             except CliError as failure:
+                if failure.code is Exit.INTERRUPTED:
+                    raise
                 raise CliError(f"{failure.reason} {whose}".rstrip(), failure.code, **failure.fields) from failure
     if is_error(answer):
         said = f"{text_of(answer) or f'{device} refused {function}.'} {whose}".rstrip()
@@ -125,6 +125,37 @@ def call(
     for key, value in readable(answer).items():
         if key not in ("status", "content", "reason"):
             screen.say(f"  {key}: {value if isinstance(value, str) else json.dumps(value, default=str)}")
+
+
+def _call_on_mesh(network: Network, device: str, function: str, given: Sequence[str], stated: float | None) -> Envelope:
+    from strands_robots.cli.peers_mesh import call_peer  # noqa: PLC0415 - loaded when a network is used
+
+    network.use_mesh()
+    params, moving = assignments(given), False
+
+    def wait(verb: AdvertisedVerb | None) -> float:
+        nonlocal moving
+        moving = _moves(function, verb)
+        return stated or _wait(function, verb)
+
+    with _interruptible(f"strands-robots stop {device} --mesh{network.flags}", lambda: moving):
+        command = {**_typed(None, given, params), "action": function}
+        return call_peer(device, command, wait, lambda verb: _typed(verb, given, params))
+
+
+@contextmanager
+def _interruptible(stop: str, moving: Callable[[], bool]) -> Iterator[None]:
+    """Have Ctrl-C say that a motion goes on, and the command that stops it."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        if not moving():
+            raise
+        raise CliError(f"The robot may still move. Stop it: {stop}", Exit.INTERRUPTED, stop=stop) from None
+
+
+def _moves(function: str, verb: AdvertisedVerb | None) -> bool:
+    return function not in QUICK and (verb is None or not verb.reads)
 
 
 def _wait(function: str, verb: AdvertisedVerb | None) -> float:
