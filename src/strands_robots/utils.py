@@ -209,7 +209,7 @@ def finite(name: str, value: object) -> None:
         left += [(where, one, depth + 1) for where, one in reversed(inside)]
 
 
-def whole(name: str, value: object, *, low: int | None = None, high: int | None = None) -> int:
+def whole(name: str, value: object, *, low: float | None = None, high: float | None = None) -> int:
     """Return an integer, bounds included; ``True`` is not 1 and 2.0 is not 2."""
     if isinstance(value, int) and not isinstance(value, bool):
         inside = (low is None or value >= low) and (high is None or value <= high)

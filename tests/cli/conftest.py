@@ -36,7 +36,7 @@ class FakeFleet:
     def __init__(self) -> None:
         self.link, self.source = loopback_config(), "cli"
         self.found: list[Peer] = []
-        self.answer: Envelope | Exception = success("done")
+        self.answer: Envelope | BaseException = success("done")
         self.stops: dict[str, Envelope] = {}
         self.called: list[tuple[Any, ...]] = []
         self.stale = ""
@@ -52,7 +52,7 @@ class FakeFleet:
 
     def call(self, *called: Any) -> Envelope:
         self.called.append(called)
-        if isinstance(self.answer, Exception):
+        if isinstance(self.answer, BaseException):
             raise self.answer
         return self.answer
 

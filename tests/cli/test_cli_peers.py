@@ -185,8 +185,8 @@ def test_call_sends_what_the_description_says_and_waits_as_long_as_the_verb_last
 @pytest.mark.parametrize(
     ("argument", "said"),
     [
-        ("cups=nine", "cups must be a whole number"),
-        ("cups=9", "cups must be 1 to 8 cups"),
+        ("cups=nine", "cups must be an integer from 1 to 8, not 'nine'."),
+        ("cups=9", "cups must be an integer from 1 to 8, not 9."),
         ("strength=weak", "mild, strong"),
         ("recipe=[1]", "recipe must be an object as JSON"),
         ("sugar=1", "its arguments: cups, label, strength, recipe"),
@@ -202,13 +202,61 @@ def test_argument_that_does_not_fit_the_description_is_exit_2(
     assert fleet.called == []
 
 
-@pytest.mark.parametrize("function", ["getStatus", "listCameras", "stop", "stopMotion"])
-def test_quick_call_asks_for_no_description(
-    run: Run, fleet: FakeFleet, function: str, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("function", "given", "sent", "seconds"),
+    [
+        ("getStatus", (), {}, 10.0),
+        ("listCameras", (), {}, 10.0),
+        ("stop", (), {}, 10.0),
+        ("stopMotion", (), {}, 10.0),
+        ("moveTo", ("x=0.2", "wait=true", "lease_id=12"), {"x": 0.2, "wait": True, "lease_id": "12"}, 35.0),
+        ("moveJoints", ('joints={"pan": 1}', "wait=false"), {"joints": {"pan": 1}, "wait": False}, 35.0),
+        ("execute", ("instruction=wave", 'robot_name="5"'), {"instruction": "wave", "robot_name": "5"}, 10.0),
+    ],
+)
+def test_plain_call_of_a_known_verb_asks_for_no_description(
+    run: Run,
+    fleet: FakeFleet,
+    function: str,
+    given: tuple[str, ...],
+    sent: dict[str, object],
+    seconds: float,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.delattr(FakeFleet, "describe")
-    assert run("call", "arm-1", function).exit_code == 0
-    assert fleet.called == [("arm-1", function, {}, 10.0)]
+    assert run("call", "arm-1", function, *given).exit_code == 0
+    assert fleet.called == [("arm-1", function, sent, seconds)]
+
+
+def test_number_for_a_text_of_a_known_verb_is_sent_as_it_was_typed(run: Run, fleet: FakeFleet) -> None:
+    fleet.found = [arm()]
+    assert run("call", "arm-1", "execute", "instruction=1.50").exit_code == 0
+    assert fleet.called[0][2] == {"instruction": "1.50"}
+
+
+@pytest.mark.parametrize("name", ["getCoffee", "listAll", "stopwatch"])
+def test_own_verb_is_waited_for_whatever_its_name_begins_with(run: Run, fleet: FakeFleet, name: str) -> None:
+    fleet.found = [Peer("bar-1", functions=({**BREW, "name": name, "parameters": {}},))]
+    assert run("call", "bar-1", name).exit_code == 0
+    assert fleet.called == [("bar-1", name, {}, 100.0)]
+
+
+@pytest.mark.parametrize("function", ["brewCoffee", "moveTo", "wait"])
+def test_ctrl_c_of_a_motion_says_that_it_goes_on_and_how_to_stop_it(run: Run, fleet: FakeFleet, function: str) -> None:
+    fleet.found, fleet.answer = [barista()], KeyboardInterrupt()
+    result = run("call", "bar-1", function, "--tenant", "lab")
+    assert result.exit_code == 130
+    assert "The robot may still move. Stop it: strands-robots stop bar-1 --tenant lab" in result.stderr
+    said = json.loads(run("call", "bar-1", function, "--json").stdout)
+    assert (said["exit"], said["stop"]) == (130, "strands-robots stop bar-1")
+
+
+def test_ctrl_c_of_a_read_says_nothing(run: Run, fleet: FakeFleet) -> None:
+    read = {"name": "beansLeft", "labels": {"direction": "read", "own": "true"}}
+    fleet.found, fleet.answer = [Peer("bar-1", functions=(read,))], KeyboardInterrupt()
+    for function in ("getStatus", "beansLeft"):
+        result = run("call", "bar-1", function)
+        assert (result.exit_code, result.output) == (130, "")
 
 
 def test_call_without_a_function_lists_them_with_their_domains(run: Run, fleet: FakeFleet) -> None:

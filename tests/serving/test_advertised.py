@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import time
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import pytest
 
+from strands_robots import Domain
+from strands_robots import verb as declared
 from strands_robots.serving.advertised import (
     TEXT_MAX,
     TOTAL_MAX,
@@ -18,6 +20,8 @@ from strands_robots.serving.advertised import (
     own_names,
     typed,
 )
+from strands_robots.serving.own_verbs import own_verbs
+from strands_robots.serving.verb_schema import described
 from strands_robots.utils import ValidationError, near
 
 BREW: dict[str, Any] = {
@@ -81,10 +85,10 @@ def test_typed_value_is_what_the_description_says(parameter: str, text: str, sen
 @pytest.mark.parametrize(
     ("parameter", "text", "said"),
     [
-        ("cups", "five", "cups must be a whole number, not 'five'."),
-        ("cups", "1.5", "cups must be a whole number"),
-        ("cups", "true", "cups must be a whole number"),
-        ("cups", "9", "cups must be 1 to 8 cups, not 9."),
+        ("cups", "five", "cups must be an integer from 1 to 8, not 'five'."),
+        ("cups", "1.5", "cups must be an integer from 1 to 8, not 1.5."),
+        ("cups", "true", "cups must be an integer from 1 to 8, not True."),
+        ("cups", "9", "cups must be an integer from 1 to 8, not 9."),
         ("strength", "weak", "strength must be one of mild, strong, not 'weak'."),
     ],
 )
@@ -92,6 +96,33 @@ def test_value_that_does_not_fit_is_refused_by_name(parameter: str, text: str, s
     with pytest.raises(ValidationError) as refused:
         typed(brew().by_name[parameter], parsed(text), text)
     assert said in str(refused.value)
+
+
+class Painter:
+    @declared(motion=False)
+    def paint(
+        self,
+        coats: Annotated[int, Domain(1)],
+        width: Annotated[float, Domain(0.1, 2.5, "m")],
+        depth: Annotated[float, Domain(high=3)],
+        shade: float,
+        layer: Literal[1, 2],
+        colour: Literal["red", "blue"],
+    ) -> None:
+        """Paint."""
+
+
+@pytest.mark.parametrize("value", ["x", 0, 9.5, -1e9, True, 1e400])
+@pytest.mark.parametrize("name", ["coats", "width", "depth", "shade", "layer", "colour"])
+def test_value_is_refused_in_the_words_of_the_robot(name: str, value: object) -> None:
+    served = own_verbs(Painter())["paint"]
+    parameter = RobotDescription.of([described(served)]).verbs["paint"].by_name[name]
+    said = ""
+    try:
+        served.by_name[name].check(name, value)
+    except ValidationError as exc:
+        said = str(exc)
+    assert parameter.problem(value) == said
 
 
 def parsed(text: str) -> object:

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from fixtures.barista import Barista
 from fixtures.mesh_robots import Arm, World
 from fixtures.waiting import eventually
 
@@ -23,7 +24,7 @@ from strands_robots.safety.roster import Roster
 from strands_robots.serving.advertised import AdvertisedVerb, find_verb
 from strands_robots.tools import networks, robot_mesh
 from strands_robots.tools.mesh_roster import mesh_network
-from strands_robots.tools.networks import DeviceConnect, NativeMesh
+from strands_robots.tools.networks import DeviceConnect, NativeMesh, joined_mesh
 from strands_robots.tools.roster_verdict import combined_verdict
 
 
@@ -236,6 +237,58 @@ def test_robots_on_the_mesh_are_listed_commanded_and_stopped(on_the_mesh: None) 
                 mesh.close()
 
 
+@pytest.fixture
+def barista(on_the_mesh: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Barista]:
+    monkeypatch.setenv("BYPASS_TOOL_CONSENT", "true")
+    robot = Barista()
+    with joined_mesh(robot, "bar-1", "robot"), joined_mesh(None, "looker", "tool") as looker:
+        # All peers of one process share their list of peers.
+        eventually(lambda: looker.get_peer("bar-1") is not None)
+        yield robot
+
+
+def test_own_verb_of_a_mesh_peer_is_waited_for_as_long_as_it_lasts(barista: Barista) -> None:
+    answer = NativeMesh().call("bar-1", "brewCoffee", {"cups": 2}, seconds=1e-6)
+    assert answer["cups"] == 2
+    assert "did not answer" in NativeMesh().call("bar-1", "status", {}, seconds=1e-6)["reason"]
+
+
+def test_peers_of_the_mesh_are_listed_with_the_verbs_that_they_have(barista: Barista) -> None:
+    (bar,) = (row for row in robot_mesh(action="peers")["peers"] if row["id"] == "bar-1")
+    assert {"brewCoffee", "beansLeft", "status", "stop"} <= set(bar["functions"])
+    assert not {"moveTo", "execute", "releaseTorque"} & set(bar["functions"])
+    assert bar["own_verbs"]["brewCoffee"].startswith("(cups: integer, 1 to 8; [strength: mild | strong]) Brew coffee")
+    assert "note" not in bar
+
+
+def test_silent_peers_hold_up_a_list_for_a_bounded_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked, given = list[str](), list[float]()
+
+    def send(peer: str, command: dict[str, Any], seconds: float) -> dict[str, Any]:
+        asked.append(peer)
+        given.append(seconds)
+        threading.Event().wait(seconds)
+        return {"status": "timeout"}
+
+    monkeypatch.setattr(networks, "LIST_S", 0.1)
+    names = [f"bar-{n}" for n in range(100)]
+    rows = [{"peer_id": name, "type": "robot", "reachable": True, "robot_kind": "mobile_base"} for name in names]
+    mesh = SimpleNamespace(peers=rows, send=send)
+    monkeypatch.setattr(networks, "_on_mesh", lambda work: work(mesh))
+    monkeypatch.setattr(networks, "discover", lambda mesh: None)
+    assert all("drive" in row["functions"] for row in NativeMesh().peers()["peers"])
+    assert len(asked) < len(names) and max(given) <= 0.1
+
+
+@pytest.mark.parametrize("verb", ["brewCoffee", "status", "stop"])
+def test_unknown_peer_is_answered_at_once_with_the_near_ones(
+    barista: Barista, verb: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(networks, "STOP_S", 0.1)
+    answer = robot_mesh(action="call", target="bar-2", verb=verb)
+    assert answer["reason"] == "No peer 'bar-2' is on the mesh. Near it: bar-1."
+
+
 def test_discovery_of_a_stated_endpoint_outlasts_its_retry_pause() -> None:
     pause = zenoh_config.explicit(Posture.from_settings())["connect"]["retry"]["period_max_ms"] / 1000
     assert pause + zenoh_config.DISCOVERY_S < zenoh_config.LINK_DISCOVERY_S
@@ -446,7 +499,7 @@ def test_peers_name_own_verbs_with_their_parameters_and_devices_that_cannot_be_s
     assert echo["note"] == "This device has no lockout, no lease and no stop."
 
 
-def test_own_verbs_of_a_mesh_peer_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_verbs_of_an_older_mesh_peer_are_those_of_its_kind(monkeypatch: pytest.MonkeyPatch) -> None:
     row = {
         "peer_id": "bar-1",
         "type": "robot",
@@ -454,7 +507,9 @@ def test_own_verbs_of_a_mesh_peer_are_named(monkeypatch: pytest.MonkeyPatch) -> 
         "robot_kind": "robot",
         "own_verbs": ["brewCoffee", 5],
     }
-    monkeypatch.setattr(networks, "_on_mesh", lambda work: work(SimpleNamespace(peers=[row])))
+    older = {"type": "error", "error": "validation: action must be one of status, stop."}
+    mesh = SimpleNamespace(peers=[row], send=lambda *_: older)
+    monkeypatch.setattr(networks, "_on_mesh", lambda work: work(mesh))
     monkeypatch.setattr(networks, "discover", lambda mesh: None)
     (bar,) = NativeMesh().peers()["peers"]
     assert "moveTo" in bar["functions"] and bar["functions"][-1] == "brewCoffee"

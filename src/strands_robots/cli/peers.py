@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import contextmanager
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,15 +15,18 @@ from strands_robots.cli.network import SOURCE, Network, answering, call_device, 
 from strands_robots.cli.output import LATE_S, CliError, Exit, Screen, label, plain, readable, table
 from strands_robots.cli.readiness import other_user
 from strands_robots.envelope import is_error, text_of
+from strands_robots.serving.known_verbs import QUICK, TEXTS, VERBS, WAITING
 from strands_robots.utils import WAIT_S, ValidationError, device_id, number
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from strands_robots.device_connect import FleetClient
     from strands_robots.device_connect.discovery import Peer
+    from strands_robots.envelope import Envelope
     from strands_robots.serving.advertised import AdvertisedVerb
 
+LEASE_ID = "lease_id"
 
 CALL_S = 10.0
 MOTION_S = CALL_S + WAIT_S
@@ -93,12 +97,9 @@ def call(
     stated = None if timeout is None else number("--timeout", timeout, above=0, high=3600)
     whose = ""
     if on_mesh:
-        from strands_robots.tools.networks import NativeMesh  # noqa: PLC0415 - loaded when a network is used
-
         if function is None:
             raise CliError("call --mesh takes a function, such as status.", Exit.USAGE)
-        network.use_mesh()
-        answer = NativeMesh().call(device, function, params, stated or _usual_wait(function))
+        answer = _call_on_mesh(network, device, function, given, stated)
     else:
         with network.fleet(source) as fleet:
             whose = other_user(fleet.link)
@@ -107,12 +108,14 @@ def call(
                     _list_functions(screen, fleet, device)
                     return
                 with answering(fleet, device):
-                    verb = fleet.verb(device, function) if given or not _quick(function) else None
-                if verb is not None:
-                    params = _typed(verb, given, params)
-                seconds = stated or _usual_wait(function) + (verb.lasts_s if verb is not None else 0.0)
-                answer = call_device(fleet, device, function, params, seconds)
+                    verb = fleet.verb(device, function) if _needs_description(function, given, params) else None
+                params = _typed(verb, given, params)
+                seconds = stated or _wait(function, verb)
+                with _interruptible(f"strands-robots stop {device}{network.flags}", lambda: _moves(function, verb)):
+                    answer = call_device(fleet, device, function, params, seconds)
             except CliError as failure:
+                if failure.code is Exit.INTERRUPTED:
+                    raise
                 raise CliError(f"{failure.reason} {whose}".rstrip(), failure.code, **failure.fields) from failure
     if is_error(answer):
         said = f"{text_of(answer) or f'{device} refused {function}.'} {whose}".rstrip()
@@ -124,36 +127,74 @@ def call(
             screen.say(f"  {key}: {value if isinstance(value, str) else json.dumps(value, default=str)}")
 
 
-def _quick(function: str) -> bool:
-    """Return True for a read or a stop, which is known to be answered at once."""
-    return function.startswith(("get", "list", "stop"))
+def _call_on_mesh(network: Network, device: str, function: str, given: Sequence[str], stated: float | None) -> Envelope:
+    from strands_robots.cli.peers_mesh import call_peer  # noqa: PLC0415 - loaded when a network is used
+
+    network.use_mesh()
+    params, moving = assignments(given), False
+
+    def wait(verb: AdvertisedVerb | None) -> float:
+        nonlocal moving
+        moving = _moves(function, verb)
+        return stated or _wait(function, verb)
+
+    with _interruptible(f"strands-robots stop {device} --mesh{network.flags}", lambda: moving):
+        command = {**_typed(None, given, params), "action": function}
+        return call_peer(device, command, wait, lambda verb: _typed(verb, given, params))
 
 
-def _usual_wait(function: str) -> float:
-    """Return the seconds to wait for a function's answer."""
-    if _quick(function):
-        return CALL_S
-    from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS  # noqa: PLC0415 - saves its import elsewhere
+@contextmanager
+def _interruptible(stop: str, moving: Callable[[], bool]) -> Iterator[None]:
+    """Have Ctrl-C say that a motion goes on, and the command that stops it."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        if not moving():
+            raise
+        raise CliError(f"The robot may still move. Stop it: {stop}", Exit.INTERRUPTED, stop=stop) from None
 
-    verb = ARM_MOTION_VERBS.get(function)
-    return MOTION_S if verb is not None and verb.lasts else CALL_S
+
+def _moves(function: str, verb: AdvertisedVerb | None) -> bool:
+    return function not in QUICK and (verb is None or not verb.reads)
 
 
-def _typed(verb: AdvertisedVerb, given: Sequence[str], params: Mapping[str, Any]) -> dict[str, Any]:
+def _wait(function: str, verb: AdvertisedVerb | None) -> float:
+    """Return the seconds to wait for an answer, those that a verb lasts included."""
+    return (MOTION_S if function in WAITING else CALL_S) + (verb.lasts_s if verb is not None else 0.0)
+
+
+def _needs_description(function: str, given: Sequence[str], params: Mapping[str, Any]) -> bool:
+    """Return False where name and arguments already say all that is needed.
+
+    Of a verb of ours the robot itself checks the arguments, and only what may be of another type is asked about.
+    """
+    if function not in VERBS:
+        return True
+    texts = dict(each.split("=", 1) for each in given)
+    # A text that is no JSON stays a text, and JSON that is no text stays what it is.
+    return any(
+        texts[name][:1] != '"' and name != LEASE_ID and (isinstance(value, str) is not (name in TEXTS))
+        for name, value in params.items()
+    )
+
+
+def _typed(verb: AdvertisedVerb | None, given: Sequence[str], params: Mapping[str, Any]) -> dict[str, Any]:
     """Return the arguments with the types that a function's description states.
 
     Raises:
         ValidationError: naming an argument that it does not have, or a value that does not fit.
     """
+    texts = dict(each.split("=", 1) for each in given)
+    # A lease may consist of digits alone, and is a text all the same.
+    leased = {LEASE_ID: texts[LEASE_ID]} if not isinstance(params.get(LEASE_ID, ""), str) else {}
+    if verb is None:
+        return {**params, **leased}
     from strands_robots.serving.advertised import typed  # noqa: PLC0415 - loaded when a network is used
-    from strands_robots.serving.verbs import LEASE_ID  # noqa: PLC0415 - as above
 
+    known = verb.by_name
     unknown = verb.unknown(name for name in params if name not in verb.leases)
     if unknown:
         raise ValidationError(unknown)
-    texts, known = dict(each.split("=", 1) for each in given), verb.by_name
-    # A lease may consist of digits alone, and is a text all the same.
-    leased = {LEASE_ID: texts[LEASE_ID]} if LEASE_ID in texts else {}
     given_types = {name: typed(known[name], value, texts[name]) for name, value in params.items() if name in known}
     return {**params, **given_types, **leased}
 

@@ -19,7 +19,7 @@ from typing import Any, Literal, TypeAlias, TypeVar
 
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.serving.verbs import LEASE_NAMES
-from strands_robots.utils import DURATION_MAX_S, ValidationError, plain_text, shown
+from strands_robots.utils import DURATION_MAX_S, ValidationError, number, plain_text, shown, whole
 from strands_robots.verb_parameters import JSON_TYPES, UNIT_MAX
 
 TOTAL_MAX, VERB_MAX = 64_000, 16_000
@@ -51,9 +51,9 @@ VerbKind = Literal["read", "motion", "stop"]
 PYTHON_TYPES: Mapping[str, type] = {name: kind for kind, name in JSON_TYPES.items()}
 """Types in Python by those of JSON Schema."""
 
+NUMERIC = ("integer", "number")
+
 _WORDS = {
-    "integer": "a whole number",
-    "number": "a number",
     "boolean": "true or false",
     "array": "a list as JSON",
     "object": "an object as JSON",
@@ -98,15 +98,17 @@ class AdvertisedParameter:
         return f"{kind}, {measured}" if measured else kind
 
     def problem(self, value: object) -> str:
-        """Return why a value of the right type does not fit, or nothing."""
+        """Return why a value does not fit, in the robot's own words, or nothing."""
         # True is 1 to Python, and is not to a robot.
         kind = isinstance(value, bool)
         if self.choices and not any(each == value and isinstance(each, bool) is kind for each in self.choices):
             return f"{self.name} must be one of {', '.join(map(str, self.choices))}, not {shown(value)}."
-        if isinstance(value, int | float) and not kind:
-            outside = (self.low is not None and value < self.low) or (self.high is not None and value > self.high)
-            if outside:
-                return f"{self.name} must be {self.bounds}{f' {self.unit}' if self.unit else ''}, not {shown(value)}."
+        if self.type not in NUMERIC and (kind or not isinstance(value, int | float)):
+            return ""
+        try:
+            (whole if self.type == "integer" else number)(self.name, value, low=self.low, high=self.high)
+        except ValidationError as exc:
+            return str(exc)
         return ""
 
     @property
@@ -267,10 +269,8 @@ def typed(parameter: AdvertisedParameter, value: object, text: str) -> Any:
     wanted = parameter.type
     if wanted == "string" and not (isinstance(value, str) and text[:1] == '"'):
         value = text
-    elif value is not None and wanted in _WORDS:
-        kinds = int | float if wanted == "number" else PYTHON_TYPES[wanted]
-        if not isinstance(value, kinds) or (isinstance(value, bool) and wanted != "boolean"):
-            raise ValidationError(f"{parameter.name} must be {_WORDS[wanted]}, not {shown(text)}.")
+    elif value is not None and wanted in _WORDS and not isinstance(value, PYTHON_TYPES[wanted]):
+        raise ValidationError(f"{parameter.name} must be {_WORDS[wanted]}, not {shown(text)}.")
     problem = parameter.problem(value) if value is not None else ""
     if problem:
         raise ValidationError(problem)

@@ -36,11 +36,12 @@ from strands_robots.tools.roster_verdict import (
     with_plain_stops,
     with_reasons,
 )
-from strands_robots.utils import MissingExtraError, ValidationError, finite
+from strands_robots.utils import MissingExtraError, ValidationError, finite, near
 
 if TYPE_CHECKING:
     from strands_robots.device_connect import FleetClient
     from strands_robots.mesh import Mesh
+    from strands_robots.serving.advertised import AdvertisedVerb
 
 SOURCE = "robot-mesh-tool"
 """Caller's name in the tool's calls; an allowlist of a robot must include it."""
@@ -52,6 +53,15 @@ ESTOP_S = 1.5
 
 AGAIN_S, LOOK_S = 1.0, 0.05
 
+DESCRIBE_S = 2.0
+"""Seconds in which a peer of the mesh has to describe a verb of its own before that is called."""
+
+LIST_S, LISTED_AT_ONCE = 1.0, 32
+"""Seconds in which the peers of a list have to describe their verbs, and how many are asked at once."""
+
+ALWAYS_SENT = ("stop", "releaseTorque")
+"""Actions that take energy away: they are sent to a peer that was not seen, too."""
+
 OWN_BYTES = 16_000
 """Size of what the list of robots says on one robot's own verbs."""
 
@@ -62,6 +72,14 @@ def ignore_outcome(outcome: StopOutcome) -> None:
 
 class MeshUnavailableError(StrandsRobotsError, RuntimeError):
     """The native mesh is switched off, or has no session."""
+
+
+class NoPeerError(StrandsRobotsError, LookupError):
+    """No peer of the mesh has that id."""
+
+
+class SilentPeerError(StrandsRobotsError, TimeoutError):
+    """The peer did not answer in time."""
 
 
 def network() -> DeviceConnect | NativeMesh:
@@ -97,22 +115,24 @@ class NativeMesh:
     """Robots on the native mesh, called by a peer without a robot."""
 
     def peers(self) -> Envelope:
-        """List every peer in reach, with its type, state and actions."""
-        from strands_robots.serving.advertised import own_names  # noqa: PLC0415 - loaded when it is used
-        from strands_robots.serving.peer_verbs import KINDS  # noqa: PLC0415 - as above
+        """List every peer in reach, with its type, state and actions.
+
+        Actions are those that it describes, of an earlier release or a silent one those of its kind.
+        """
 
         def listed(mesh: Mesh) -> Envelope:
             discover(mesh)
+            rows = [row for row in mesh.peers if row["reachable"]]
+            functions = _functions_of(mesh, [row["peer_id"] for row in rows if "robot_kind" in row])
             return _peer_list(
                 [
                     {
                         "id": row["peer_id"],
                         "type": row["type"],
                         "status": row.get("task_status", ""),
-                        "functions": [*KINDS.get(str(row.get("robot_kind")), ()), *own_names(row.get("own_verbs"))],
+                        **(_verbs(functions[row["peer_id"]]) if row["peer_id"] in functions else _verbs_of_kind(row)),
                     }
-                    for row in mesh.peers
-                    if row["reachable"]
+                    for row in rows
                 ]
             )
 
@@ -125,7 +145,7 @@ class NativeMesh:
         )
 
     def call(self, target: str, action: str, arguments: Mapping[str, Any], seconds: float = ANSWER_S) -> Envelope:
-        """Send the peer any action with its arguments."""
+        """Send the peer any action; wait as long as a verb of its own lasts."""
         return self._request(target, seconds, **{**arguments, "action": action})
 
     def status(self, target: str) -> Envelope:
@@ -201,17 +221,120 @@ class NativeMesh:
 
     def _request(self, target: str, seconds: float = ANSWER_S, **command: Any) -> Envelope:
         def requested(mesh: Mesh) -> Envelope:
-            for name, value in command.items():
-                finite(name, value)
-            reply = _reply(mesh, target, command, seconds)
-            if reply.get("status") == "timeout":
-                return error(f"{target} did not answer.")
-            if reply.get("type") != "response":
-                return error(f"{target}: {reply.get('error', 'refused')}")
-            result = reply.get("result")
-            return result if isinstance(result, dict) else error(f"{target} answered with an unknown result shape.")
+            try:
+                return ask(mesh, target, command, lambda verb: seconds + (verb.lasts_s if verb is not None else 0.0))
+            except (NoPeerError, SilentPeerError) as exc:
+                return error(str(exc))
 
         return _on_mesh(requested)
+
+
+def ask(
+    mesh: Mesh,
+    target: str,
+    command: Mapping[str, Any],
+    seconds: Callable[[AdvertisedVerb | None], float],
+    fit: Callable[[AdvertisedVerb], Mapping[str, Any]] | None = None,
+) -> Envelope:
+    """Have a peer carry an action out; return its answer.
+
+    Args:
+        mesh: the peer that asks.
+        target: id of the peer that is asked.
+        command: the action with its arguments.
+        seconds: gives the time to wait for the answer, from the peer's description of a verb of its own.
+        fit: gives the arguments of a verb of its own as its description has them.
+
+    Raises:
+        NoPeerError: no peer has this id.
+        SilentPeerError: it did not answer in time.
+        ValidationError: an argument is not finite, or does not fit.
+    """
+    action = str(command["action"])
+    for name, value in command.items():
+        finite(name, value)
+    there = _seen(mesh, target)
+    if not there and action not in ALWAYS_SENT:
+        raise NoPeerError(_absent(mesh, target))
+    verb = _own_verb(mesh, target, action) if there else None
+    fitted = fit(verb) if fit is not None and verb is not None else {}
+    sent = {**command, **fitted, "action": action}
+    reply = mesh.send(target, sent, seconds(verb) if there else STOP_S)
+    if reply.get("type") == "response":
+        result = reply.get("result")
+        return result if isinstance(result, dict) else error(f"{target} answered with an unknown result shape.")
+    if reply.get("status") == "timeout":
+        if not there:
+            raise NoPeerError(_absent(mesh, target))
+        raise SilentPeerError(f"{target} did not answer.")
+    return error(f"{target}: {reply.get('error') or reply.get('reason') or 'refused'}")
+
+
+def _seen(mesh: Mesh, target: str) -> bool:
+    """Return whether a peer is in reach, once that can be known."""
+    from strands_robots.mesh.core import wait_for_peer  # noqa: PLC0415 - loaded when it is used
+    from strands_robots.mesh.transport.zenoh_config import DISCOVERY_S, discovery_timeout  # noqa: PLC0415 - as above
+
+    time.sleep(DISCOVERY_S)
+    # A loaded machine gets twice the time.
+    return wait_for_peer(mesh, target, max(discovery_timeout(DISCOVERY_S) - DISCOVERY_S, DISCOVERY_S))
+
+
+def _absent(mesh: Mesh, target: str) -> str:
+    return f"No peer {target!r} is on the mesh.{near(target, _in_reach(mesh))}"
+
+
+def _own_verb(mesh: Mesh, target: str, action: str) -> AdvertisedVerb | None:
+    """Return a peer's own verb as it describes it, or None."""
+    from strands_robots.serving.advertised import find_verb  # noqa: PLC0415 - loaded when it is used
+    from strands_robots.serving.peer_verbs import PEER_VERBS  # noqa: PLC0415 - as above
+
+    return None if action in PEER_VERBS else find_verb(_functions(mesh, target, DESCRIBE_S), action)
+
+
+def _functions(mesh: Mesh, target: str, seconds: float) -> list[Any] | None:
+    """Return the functions that a peer describes; None if it does not."""
+    result = mesh.send(target, {"action": "describe"}, seconds).get("result")
+    functions = result.get("functions") if isinstance(result, Mapping) else None
+    return functions if isinstance(functions, list) else None
+
+
+def _functions_of(mesh: Mesh, peers: Collection[str]) -> dict[str, list[Any]]:
+    """Return the functions of the peers that describe them in time."""
+    ends, found = time.monotonic() + LIST_S, dict[str, list[Any]]()
+
+    def described(peer: str) -> None:
+        left = ends - time.monotonic()
+        functions = _functions(mesh, peer, left) if left > 0 else None
+        if functions is not None:
+            found[peer] = functions
+
+    if peers:
+        with ThreadPoolExecutor(min(len(peers), LISTED_AT_ONCE), "describe") as pool:
+            list(pool.map(described, peers))
+    return found
+
+
+def _verbs(functions: object) -> dict[str, Any]:
+    """Return what a list of robots says on the verbs of one."""
+    from strands_robots.serving.advertised import RobotDescription, fitting  # noqa: PLC0415 - loaded when it is used
+
+    description = RobotDescription.of(functions)
+    verbs = description.verbs.values()
+    own = dict(fitting(((each.name, f"({each.takes}) {each.summary}") for each in verbs if each.own), OWN_BYTES))
+    return {
+        "functions": [each.name for each in verbs],
+        **({"own_verbs": own} if own else {}),
+        **({"note": description.absent} if description.absent else {}),
+    }
+
+
+def _verbs_of_kind(row: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the same of a mesh peer by its presence alone."""
+    from strands_robots.serving.advertised import own_names  # noqa: PLC0415 - loaded when it is used
+    from strands_robots.serving.peer_verbs import KINDS  # noqa: PLC0415 - as above
+
+    return {"functions": [*KINDS.get(str(row.get("robot_kind")), ()), *own_names(row.get("own_verbs"))]}
 
 
 def _stop_all(mesh: Mesh, stop: Callable[[], list[dict[str, Any]]], roster: StopRoster) -> dict[str, Envelope]:
@@ -336,19 +459,6 @@ class DeviceConnect:
 
         Verbs of its own come with their parameters, in the robot's words.
         """
-        from strands_robots.serving.advertised import RobotDescription, fitting  # noqa: PLC0415 - loaded when it is used
-
-        def described(functions: object) -> dict[str, Any]:
-            description = RobotDescription.of(functions)
-            verbs = description.verbs.values()
-            own = dict(
-                fitting(((each.name, f"({each.takes}) {each.summary}") for each in verbs if each.own), OWN_BYTES)
-            )
-            return {
-                "functions": [each.name for each in verbs],
-                **({"own_verbs": own} if own else {}),
-                **({"note": description.absent} if description.absent else {}),
-            }
 
         def listed(fleet: FleetClient) -> Envelope:
             rows = [
@@ -356,7 +466,7 @@ class DeviceConnect:
                     "id": peer.id,
                     "type": peer.type,
                     "status": peer.status.get("availability", ""),
-                    **described(peer.functions),
+                    **_verbs(peer.functions),
                 }
                 for peer in fleet.peers()
             ]
