@@ -26,11 +26,9 @@ def labels_of(verb: Verb) -> Labels:
 
 def text_of(verb: Verb) -> str:
     """Return the text that describes a verb and its parameters."""
-    lines = [verb.summary]
+    lines = [verb.summary, *(["", verb.note] if verb.note else [])]
     if verb.parameters:
         lines += ["", "Args:", *(f"    {each.name}: {each.meaning}" for each in verb.parameters)]
-    if verb.note:
-        lines += ["", verb.note]
     return "\n".join(lines)
 
 

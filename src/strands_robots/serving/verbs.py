@@ -133,7 +133,7 @@ class Verb:
         instead: the verb that a locked robot offers in the place of this one.
         of_world: a motion of all robots of a world; any other is of one, the first where none is named.
         on_lease: a verb of the control lease; its ``run`` gets ``caller``, ``robot`` and ``leases`` besides.
-        note: what callers have to know besides, the last paragraph of its description.
+        note: what callers have to know besides, the second paragraph of its description.
         own: a verb that its robot declares (:func:`~strands_robots.verb_declaration.verb`).
         lasts_s: seconds that it may take to return, besides those that each verb of its kind has.
     """

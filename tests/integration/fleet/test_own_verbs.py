@@ -75,6 +75,7 @@ def test_own_verb_is_a_method_with_signature_units_and_docstring(served: Served)
     assert signature.parameters["strength"].default == "mild"
     said = barista.brew_coffee.__doc__ or ""
     assert "Brew coffee." in said
+    assert "it is not proven" in said
     assert "how many cups; 1 to 8" in said
     assert "(as the robot describes it)" in said
     assert barista.verbs["brewCoffee"].own
