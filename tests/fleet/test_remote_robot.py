@@ -215,6 +215,24 @@ class TestControl:
         with arm.control(ttl_s=0.06):
             eventually(lambda: renewed() >= 3, what="three renewals")
 
+    def test_nested_and_overlapping_blocks_share_the_lease(self, arm: RemoteRobot, network: ScriptedNetwork) -> None:
+        first, second = arm.control(), arm.control()
+        with first, arm.control():
+            second.__enter__()
+        arm.move_to(x=1)
+        second.__exit__(None, None, None)
+        arm.move_to(x=2)
+        said = [(verb, arguments.get("lease_id")) for _, verb, arguments, _ in network.calls]
+        assert said == [
+            ("acquireControl", None),
+            ("moveTo", "secret"),
+            ("releaseControl", "secret"),
+            ("moveTo", None),
+        ]
+        with arm.control():
+            arm.move_to(x=3)
+        assert network.calls[-2][2] == {"x": 3, "lease_id": "secret"}
+
     def test_robot_without_leases_refuses(self) -> None:
         robot, _ = robot_with(function("go"))
         with pytest.raises(errors.UnknownVerbError, match="no control lease"), robot.control():

@@ -21,7 +21,7 @@ from strands_robots.envelope import Envelope, is_error
 from strands_robots.errors import AmbiguousRobotError, NoSuchRobotError, RefusalError, RobotError, UnknownVerbError
 from strands_robots.fleet.adapter import STOP_S, FoundRobot, NetworkAdapter, RobotEvent
 from strands_robots.fleet.description import docstring, python_name, signature
-from strands_robots.fleet.lease import HeldLease
+from strands_robots.fleet.lease import HeldLease, SharedLease
 from strands_robots.fleet.refusals import refusal_of
 from strands_robots.safety.stopping import StopVerdict, graded
 from strands_robots.serving.advertised import AdvertisedVerb, RobotDescription
@@ -82,7 +82,7 @@ class RemoteRobot:
         self._description: RobotDescription | None = None
         self._names: dict[str, str] = {}
         self._methods: dict[str, Callable[..., dict[str, Any]]] = {}
-        self._lease: HeldLease | None = None
+        self._lease = SharedLease()
 
     @property
     def id(self) -> str:
@@ -218,25 +218,16 @@ class RemoteRobot:
         """Hold the robot for the block: motions of other callers are refused.
 
         The lease is renewed in the background and released at the end, also after an exception. If this process dies,
-        the robot halts when ``ttl_s`` seconds are over.
+        the robot halts when ``ttl_s`` seconds are over. Blocks of this object that overlap or nest, on any thread,
+        share one lease with the ``ttl_s`` of the first; it is released at the end of the last one.
 
         Raises:
             ControlError: another caller holds it.
             UnknownVerbError: it has no control lease.
         """
         seconds = number("ttl_s", ttl_s, above=0)
-        if not self.has_lease:
-            raise UnknownVerbError("It has no control lease", robot=self.id, verb="acquireControl")
-        answer = self._call("acquireControl", {"ttl_s": seconds}, None)
-        lease_id = answer.get("lease_id")
-        if not isinstance(lease_id, str) or not lease_id:
-            raise RobotError("It gave no lease_id", robot=self.id, verb="acquireControl", envelope=answer)
-        before, self._lease = self._lease, HeldLease(self.id, self._call, lease_id, seconds)
-        try:
+        with self._lease.block(lambda: self._acquired(seconds)):
             yield self
-        finally:
-            held, self._lease = self._lease, before
-            held.release()
 
     @property
     def robots(self) -> Mapping[str, RobotOfWorld]:
@@ -314,6 +305,15 @@ class RemoteRobot:
         """Take what a new discovery found; its verbs are read again when they are used."""
         self._found, self._network, self._description = found, network, None
 
+    def _acquired(self, ttl_s: float) -> HeldLease:
+        if not self.has_lease:
+            raise UnknownVerbError("It has no control lease", robot=self.id, verb="acquireControl")
+        answer = self._call("acquireControl", {"ttl_s": ttl_s}, None)
+        lease_id = answer.get("lease_id")
+        if not isinstance(lease_id, str) or not lease_id:
+            raise RobotError("It gave no lease_id", robot=self.id, verb="acquireControl", envelope=answer)
+        return HeldLease(self.id, self._call, lease_id, ttl_s)
+
     def _lacking(self) -> str:
         return ", ".join(f"no {name}" for name in self._described.lacking)
 
@@ -337,9 +337,9 @@ class RemoteRobot:
         description = self._described.verbs.get(verb)
         if (description is None or description.kind == "motion") and verb not in OF_THE_HOLDER:
             self._refuse_ambiguous(verb)
-            held = self._lease
-            if held is not None and description is not None and LEASE_ID in description.leases - arguments.keys():
-                arguments = {**arguments, LEASE_ID: held.lease_id}
+            lease_id = self._lease.lease_id
+            if lease_id and description is not None and LEASE_ID in description.leases - arguments.keys():
+                arguments = {**arguments, LEASE_ID: lease_id}
         if timeout is None:
             timeout = _patience(description, arguments)
         try:
