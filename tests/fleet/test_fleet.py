@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
 from tests.fleet.scripted import OURS, ScriptedNetwork
 
 from strands_robots import errors
-from strands_robots.envelope import error
+from strands_robots.envelope import error, success
 from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
 from strands_robots.fleet.fleet import Fleet, connect
+from strands_robots.safety.identity import ROBOTS, KeyFile, SigningIdentity
+from strands_robots.safety.statements import Purpose, signed
 from strands_robots.utils import ValidationError
 
 
@@ -54,8 +57,54 @@ def test_motion_of_an_id_on_both_is_refused_naming_both(
     with pytest.raises(errors.AmbiguousRobotError), both.control():
         pytest.fail("controlled")
     assert both.status()["status"] == "success"
+    moved = [call for call in (*device_connect.calls, *mesh.calls) if call[1] != "getStatus"]
+    assert not moved
+
+
+@pytest.fixture
+def keys(tmp_path: Path) -> list[SigningIdentity]:
+    return [KeyFile(ROBOTS, name, tmp_path).load_or_make() for name in ("one", "two")]
+
+
+def test_id_on_both_is_one_robot_where_one_key_signs_both(
+    fleet: Fleet, device_connect: ScriptedNetwork, mesh: ScriptedNetwork, keys: list[SigningIdentity]
+) -> None:
+    device_connect.sign_with(keys[0])
+    mesh.sign_with(keys[0])
+    both = fleet["both"]
+    both.move_to(x=1)
+    both.move_to(x=2)
+    assert [call[1] for call in device_connect.calls] == ["getStatus", "moveTo", "moveTo"]
+    assert [call[1] for call in mesh.calls] == ["getStatus"]
+    mesh.sign_with(keys[1])
+    mesh.sessions += 1
+    with pytest.raises(errors.AmbiguousRobotError, match=r"another id.*connect\(mesh=False\)"):
+        both.move_to(x=3)
+
+
+def test_enrolled_robot_wins_an_id_on_both(
+    fleet: Fleet, device_connect: ScriptedNetwork, mesh: ScriptedNetwork, keys: list[SigningIdentity]
+) -> None:
+    device_connect.sign_with(keys[0])
+    mesh.sign_with(keys[1])
+    device_connect.enrolled = mesh.enrolled = {"both": keys[1].public}
+    both = fleet["both"]
+    both.move_to(x=1)
+    assert both.network == MESH
     assert [call[1] for call in device_connect.calls] == ["getStatus"]
-    assert not mesh.calls
+    assert [call[1] for call in mesh.calls] == ["getStatus", "moveTo"]
+    fleet.robots()
+    assert both.network == MESH
+
+
+def test_recorded_signature_proves_nothing(
+    fleet: Fleet, device_connect: ScriptedNetwork, mesh: ScriptedNetwork, keys: list[SigningIdentity]
+) -> None:
+    device_connect.sign_with(keys[0])
+    old = signed(keys[0], Purpose.LOCKOUT_STATE, "both", {"nonce": "0" * 32})
+    mesh.answers["getStatus"] = lambda arguments: success("idle", statement=old)
+    with pytest.raises(errors.AmbiguousRobotError):
+        fleet["both"].move_to(x=1)
 
 
 def test_halt_of_an_id_on_both_reaches_both(

@@ -65,6 +65,12 @@ class NetworkAdapter(Protocol):
     def bears(self, robot: str) -> bool:
         """Return whether a robot of this id is known here; asks no one."""
 
+    def session(self, robot: str) -> object:
+        """Return what differs once another robot may answer to this id; asks no one."""
+
+    def enrolled_key(self, robot: str) -> bytes | None:
+        """Return the public key that is enrolled for this id; None for none."""
+
     def describe(self, robot: str) -> object:
         """Return the robot's functions as they came over the wire; never raises."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -16,12 +17,15 @@ from strands_robots.errors import (
     UnreachableError,
 )
 from strands_robots.fleet.adapter import DEVICE_CONNECT, FIND_S, STOP_S, FoundRobot, OnEvent, RobotEvent
+from strands_robots.safety.identity import KeyFileError
 from strands_robots.utils import ValidationError, plain_text
 
 if TYPE_CHECKING:
     from strands_robots.device_connect.backends import LinkConfig
     from strands_robots.device_connect.client import DeviceEvent, FleetClient
     from strands_robots.device_connect.discovery import Peer
+
+logger = logging.getLogger(__name__)
 
 UNKNOWN_METHOD, BAD_PARAMS = -32601, -32602
 """JSON-RPC's codes of an unknown function and of arguments that do not fit."""
@@ -47,6 +51,7 @@ class DeviceConnectNetwork:
 
         self._client = FleetClient(link, source)
         self._peers: dict[str, Peer] = {}
+        self._discoveries = 0
         self._open = False
 
     def open(self) -> None:
@@ -61,6 +66,7 @@ class DeviceConnectNetwork:
 
     def find(self, timeout: float = FIND_S) -> list[FoundRobot]:
         """Return the devices of the tenant."""
+        self._discoveries += 1
         self._peers = {peer.id: peer for peer in self._connected.peers(timeout)}
         return [
             FoundRobot(peer.id, plain_text(peer.type, 100), plain_text(peer.model, 100))
@@ -70,6 +76,20 @@ class DeviceConnectNetwork:
     def bears(self, robot: str) -> bool:
         """Return whether a device of this id was found or has announced itself."""
         return robot in self._peers or (self._open and robot in self._client.known())
+
+    def session(self, robot: str) -> object:
+        """Return the number of discoveries: a device has no session."""
+        return self._discoveries
+
+    def enrolled_key(self, robot: str) -> bytes | None:
+        """Return the device's enrolled key."""
+        from strands_robots.device_connect.enrollment import enrolled_robots  # noqa: PLC0415 - loaded when it is used
+
+        try:
+            return enrolled_robots(self._client.link).get(robot)
+        except (KeyFileError, OSError) as exc:
+            logger.warning("The enrolled keys cannot be used, so none counts: %s", exc)
+            return None
 
     def describe(self, robot: str) -> object:
         """Return the functions that the device announced."""

@@ -93,8 +93,8 @@ class Fleet:
                 print(robot.id, robot.type, robot.network)
             arm = fleet["arm-1"]
 
-    An id that both networks have is one robot: Device Connect answers its reads, its motions are refused, and
-    :meth:`RemoteRobot.halt` stops both.
+    An id that both networks have is one robot where both answers are signed by one key: Device Connect is used. Of two
+    robots the enrolled one is moved. Where no key decides, motions are refused; :meth:`RemoteRobot.halt` stops both.
 
     Args:
         networks: those to join, the one whose robots win an id first.

@@ -12,7 +12,6 @@ import logging
 import queue
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Self
@@ -23,6 +22,8 @@ from strands_robots.fleet.adapter import STOP_S, FoundRobot, NetworkAdapter, Rob
 from strands_robots.fleet.description import docstring, python_name, signature
 from strands_robots.fleet.lease import HeldLease, SharedLease
 from strands_robots.fleet.refusals import refusal_of
+from strands_robots.fleet.shared_id import SharedId
+from strands_robots.fleet.side_by_side import side_by_side
 from strands_robots.safety.stopping import StopVerdict, graded
 from strands_robots.serving.advertised import AdvertisedVerb, RobotDescription
 from strands_robots.serving.verbs import LEASE_ID
@@ -83,6 +84,7 @@ class RemoteRobot:
         self._names: dict[str, str] = {}
         self._methods: dict[str, Callable[..., dict[str, Any]]] = {}
         self._lease = SharedLease()
+        self._shared_id = SharedId()
 
     @property
     def id(self) -> str:
@@ -201,11 +203,7 @@ class RemoteRobot:
         """
         began, networks = time.monotonic(), tuple(self._networks()) or (self._network,)
         logger.debug("%s is halted: %s", self.id, reason)
-        if len(networks) == 1:
-            answers = [self._stopped_on(networks[0])]
-        else:
-            with ThreadPoolExecutor(len(networks), "fleet-halt") as pool:
-                answers = list(pool.map(self._stopped_on, networks))
+        answers = side_by_side(self._stopped_on, networks)
         bearers = [(each, said) for each, said in zip(networks, answers, strict=True) if said is not None]
         verdicts = [
             verdict_of_answer(said, self.id if len(bearers) == 1 else f"{self.id} on {each.name}")
@@ -303,6 +301,9 @@ class RemoteRobot:
 
     def rediscovered(self, found: FoundRobot, network: NetworkAdapter) -> None:
         """Take what a new discovery found; its verbs are read again when they are used."""
+        decided = self._shared_id.decided
+        if decided is not None and decided is not network and decided.bears(self.address):
+            network = decided
         self._found, self._network, self._description = found, network, None
 
     def _acquired(self, ttl_s: float) -> HeldLease:
@@ -336,7 +337,8 @@ class RemoteRobot:
     def _call(self, verb: str, arguments: Mapping[str, Any], timeout: float | None) -> dict[str, Any]:
         description = self._described.verbs.get(verb)
         if (description is None or description.kind == "motion") and verb not in OF_THE_HOLDER:
-            self._refuse_ambiguous(verb)
+            if self._decide(verb):
+                description = self._described.verbs.get(verb)
             lease_id = self._lease.lease_id
             if lease_id and description is not None and LEASE_ID in description.leases - arguments.keys():
                 arguments = {**arguments, LEASE_ID: lease_id}
@@ -350,14 +352,24 @@ class RemoteRobot:
             raise refusal_of(self.id, verb, answer)
         return answer
 
-    def _refuse_ambiguous(self, verb: str) -> None:
+    def _decide(self, verb: str) -> bool:
+        """Use the network that motions go to; True where it is another one."""
         networks = self._networks()
         bearers = [each for each in networks if each.bears(self.address)] if len(networks) > 1 else ()
-        if len(bearers) > 1:
+        if len(bearers) < 2:
+            return False
+        decided = self._shared_id.decide(self.address, bearers)
+        if decided is None:
             named = " and ".join(each.name for each in bearers)
             raise AmbiguousRobotError(
-                f"{verb} is sent to neither: {named} both have a robot of this id", robot=self.id, verb=verb
+                f"{verb} is sent to neither: {named} both have a robot of this id, and no key decides",
+                robot=self.id,
+                verb=verb,
             )
+        if decided is self._network:
+            return False
+        self._network, self._description = decided, None
+        return True
 
     def _unknown(self, verb: str) -> UnknownVerbError:
         named = [*self.verbs, *self._names]
@@ -377,6 +389,7 @@ class RobotOfWorld(RemoteRobot):
     def __init__(self, world: RemoteRobot, name: str) -> None:
         super().__init__(FoundRobot(f"{world.id}/{name}", world.type, name), world._network, world._networks)
         self._world, self._name = world, name
+        self._shared_id = world._shared_id
 
     @property
     def address(self) -> str:

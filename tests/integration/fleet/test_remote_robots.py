@@ -87,7 +87,7 @@ class TestOnEachNetwork:
         (arm,) = site.fleet.robots()
         assert (arm.id, arm.network, arm.left_out) == ("arm-1", site.network, ())
         assert (arm.has_stop, arm.has_lockout, arm.has_lease) == (True, True, True)
-        assert {"move_to", "acquire_control", "halt"} <= set(dir(arm))
+        assert {"acquire_control", "halt"} <= set(dir(arm))
 
     def test_reads_answer(self, site: Site) -> None:
         assert site.arm.status()["task_status"] == "idle"
@@ -255,6 +255,23 @@ class TestBothNetworks:
         finally:
             stop_device_connect(runtime)
             toy.close()
+
+    def test_robot_that_is_served_on_both_is_driven(self, ports: int, allowed: None, patient_halts: None) -> None:
+        with ExitStack() as stack:
+            toy = ToyRobot("toy")
+            stack.callback(toy.close)
+            mesh = init_mesh(toy, "arm-1", "sim")
+            assert mesh is not None
+            stack.callback(mesh.close)
+            runtime = init_device_connect_sync(toy, peer_id="arm-1", link=loopback_config(ports))
+            stack.callback(stop_device_connect, runtime)
+            fleet = stack.enter_context(connect())
+            arm = fleet["arm-1"]
+            assert (arm.network, fleet.absent) == (DEVICE_CONNECT, {})
+            with arm.control():
+                arm.execute(instruction="wave", duration=300.0, policy_provider="mock")
+            eventually(lambda: toy.writes, what="a first write")
+            assert arm.halt().stopped is True
 
     def test_robot_in_another_process_on_the_mesh_is_reached(self, far_world: MeshPeer) -> None:
         with connect() as fleet:
