@@ -71,6 +71,8 @@ class TestVerbsAsMethods:
             arm.move_too()
         with pytest.raises(errors.UnknownVerbError, match="moveTo"):
             arm.call("moveTwo")
+        with pytest.raises(errors.UnknownVerbError, match=r"Near it: stop\.$"):
+            arm.call("stopp")
 
     def test_names_of_members_are_reachable_by_call_alone(self) -> None:
         names = ("halt", "call", "id", "__class__", "_private", "control", "brew")

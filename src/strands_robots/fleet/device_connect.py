@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from strands_robots.envelope import Envelope
@@ -67,7 +68,8 @@ class DeviceConnectNetwork:
     def find(self, timeout: float = FIND_S) -> list[FoundRobot]:
         """Return the devices of the tenant."""
         self._discoveries += 1
-        self._peers = {peer.id: peer for peer in self._connected.peers(timeout)}
+        with _carried():
+            self._peers = {peer.id: peer for peer in self._connected.peers(timeout)}
         return [
             FoundRobot(peer.id, plain_text(peer.type, 100), plain_text(peer.model, 100))
             for peer in self._peers.values()
@@ -117,7 +119,8 @@ class DeviceConnectNetwork:
 
     def stop_all(self, timeout: float = STOP_S) -> dict[str, Envelope]:
         """Stop each device when it is found."""
-        return self._connected.stop_all(timeout)
+        with _carried():
+            return self._connected.stop_all(timeout)
 
     def subscribe(self, robot: str, on_event: OnEvent) -> Callable[[], None]:
         """Receive the device's events."""
@@ -125,7 +128,8 @@ class DeviceConnectNetwork:
         def arrived(event: DeviceEvent) -> None:
             on_event(RobotEvent(event.device, plain_text(event.name, 100), event.payload))
 
-        return self._connected.subscription(robot, arrived).close
+        with _carried():
+            return self._connected.subscription(robot, arrived).close
 
     def close(self) -> None:
         """Disconnect."""
@@ -137,6 +141,19 @@ class DeviceConnectNetwork:
         if not self._open:
             raise UnreachableError("Device Connect is not joined: use the fleet as a context manager")
         return self._client
+
+
+@contextmanager
+def _carried() -> Iterator[None]:
+    """Raise :class:`UnreachableError` for what the network cannot carry."""
+    from device_connect_edge.messaging import MessagingError  # noqa: PLC0415 - loaded when it is used
+
+    try:
+        yield
+    except (MessagingError, TimeoutError, OSError) as exc:
+        if isinstance(exc, RefusalError):
+            raise
+        raise UnreachableError(plain_text(str(exc)) or "Device Connect did not answer in time") from exc
 
 
 def _refusal(exc: Exception, robot: str, verb: str) -> RefusalError | None:

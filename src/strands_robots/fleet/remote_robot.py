@@ -372,7 +372,7 @@ class RemoteRobot:
         return True
 
     def _unknown(self, verb: str) -> UnknownVerbError:
-        named = [*self.verbs, *self._names]
+        named = tuple(dict.fromkeys((*self.verbs, *self._names)))
         called = ", ".join(name for name in self.verbs if python_name(name) == verb)
         remedy = f"Reach it by call(): {called}." if called else near(verb, named).strip()
         return UnknownVerbError(f"It has no verb {verb[:100]}", robot=self.id, verb=verb, remedy=remedy)
