@@ -13,6 +13,9 @@ DEVICE_CONNECT, MESH = "device_connect", "mesh"
 FIND_S = 2.0
 """Seconds at most in which robots are looked for."""
 
+CLOSED = "the fleet was closed before it answered"
+"""Reason of a call that :meth:`NetworkAdapter.close` ends."""
+
 STOP_S = 5.0
 """Seconds in which a robot has to answer a stop."""
 

@@ -17,7 +17,7 @@ from strands_robots.errors import (
     UnknownVerbError,
     UnreachableError,
 )
-from strands_robots.fleet.adapter import DEVICE_CONNECT, FIND_S, STOP_S, FoundRobot, OnEvent, RobotEvent
+from strands_robots.fleet.adapter import CLOSED, DEVICE_CONNECT, FIND_S, STOP_S, FoundRobot, OnEvent, RobotEvent
 from strands_robots.safety.identity import KeyFileError
 from strands_robots.utils import ValidationError, plain_text
 
@@ -159,8 +159,14 @@ def _carried() -> Iterator[None]:
 def _refusal(exc: Exception, robot: str, verb: str) -> RefusalError | None:
     from device_connect_edge.messaging import MessagingError  # noqa: PLC0415 - loaded when it is used
 
-    from strands_robots.device_connect.client import CallRefusedError, NoSuchDeviceError  # noqa: PLC0415 - as above
+    from strands_robots.device_connect.client import (  # noqa: PLC0415 - as above
+        CallRefusedError,
+        ClientClosedError,
+        NoSuchDeviceError,
+    )
 
+    if isinstance(exc, ClientClosedError):
+        return NoAnswerError(CLOSED, robot=robot, verb=verb)
     why, cause = plain_text(str(exc)), None
     if isinstance(exc, CallRefusedError):
         cause = {UNKNOWN_METHOD: UnknownVerbError, BAD_PARAMS: ArgumentsError}.get(exc.code, RobotError)

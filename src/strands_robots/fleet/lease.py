@@ -65,7 +65,7 @@ class HeldLease:
 
 
 class SharedLease:
-    """Lease that all blocks of one robot share: the first acquires it, the last releases it."""
+    """Lease that all blocks of one robot share; the last block releases it."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from strands_robots import settings
 from strands_robots.envelope import Envelope, error, is_error
 from strands_robots.errors import ArgumentsError, NoAnswerError, NoSuchRobotError, UnreachableError
-from strands_robots.fleet.adapter import FIND_S, MESH, STOP_S, FoundRobot, OnEvent, RobotEvent
+from strands_robots.fleet.adapter import CLOSED, FIND_S, MESH, STOP_S, FoundRobot, OnEvent, RobotEvent
 from strands_robots.fleet.refusals import refusal_of_text
 from strands_robots.fleet.side_by_side import side_by_side
 from strands_robots.safety.peer_answers import enrolled_peers, stop_distrust
@@ -130,6 +130,8 @@ class MeshNetwork:
             return dict(result) if isinstance(result, Mapping) else {"result": result}
         if reply.get("type") == "error":
             raise refusal_of_text(robot, verb, reply.get("error"))
+        if self._mesh is None:
+            raise NoAnswerError(CLOSED, robot=robot, verb=verb)
         if reply.get("status") == "timeout":
             raise NoAnswerError(f"It did not answer within {timeout:g} s", robot=robot, verb=verb)
         why = plain_text(reply.get("reason") or reply.get("error"))
