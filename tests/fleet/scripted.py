@@ -85,7 +85,7 @@ class ScriptedNetwork:
     def enrolled_key(self, robot: str) -> bytes | None:
         return self.enrolled.get(robot)
 
-    def describe(self, robot: str) -> object:
+    def describe(self, robot: str, *, anew: bool = False) -> object:
         return self.robots[robot]
 
     def call(self, robot: str, verb: str, arguments: Mapping[str, Any], timeout: float) -> Envelope:

@@ -91,6 +91,17 @@ class TestVerbsAsMethods:
             robot.brew_coffee()
         assert robot.call("brewCoffee")["verb"] == "brewCoffee"
 
+    def test_robot_that_comes_back_with_other_verbs_is_described_anew(self) -> None:
+        robot, network = robot_with(function("brew"))
+        assert robot.brew()
+        network.robots["r"] = (function("jump"), function("fly"))
+        assert robot.jump()["verb"] == "jump"
+        assert not hasattr(robot, "brew")
+        network.robots["r"] = (function("swim"),)
+        with pytest.raises(errors.UnknownVerbError, match="swim"):
+            robot.fly()
+        assert list(robot.verbs) == ["swim"]
+
     def test_copy_asks_the_robot_for_nothing(self, arm: RemoteRobot, network: ScriptedNetwork) -> None:
         assert copy.copy(arm).id == "arm-1"
         assert not network.calls
@@ -176,7 +187,7 @@ class TestHalt:
 
     def test_halt_asks_for_no_description(self) -> None:
         robot, network = robot_with()
-        network.describe = lambda robot: pytest.fail("described")  # type: ignore[method-assign]
+        network.describe = lambda *_, **__: pytest.fail("described")  # type: ignore[method-assign]
         assert robot.halt().stopped
 
 
@@ -234,6 +245,14 @@ class TestControl:
         with arm.control():
             arm.move_to(x=3)
         assert network.calls[-2][2] == {"x": 3, "lease_id": "secret"}
+
+    def test_verb_without_a_description_carries_the_lease(self, arm: RemoteRobot, network: ScriptedNetwork) -> None:
+        network.answers["newVerb"] = network.answers["status"] = lambda arguments: success("done")
+        with arm.control():
+            arm.call("newVerb", x=1)
+            arm.call("status")
+        said = {verb: arguments for _, verb, arguments, _ in network.calls}
+        assert (said["newVerb"], said["status"]) == ({"x": 1, "lease_id": "secret"}, {})
 
     def test_robot_without_leases_refuses(self) -> None:
         robot, _ = robot_with(function("go"))

@@ -74,8 +74,11 @@ class NetworkAdapter(Protocol):
     def enrolled_key(self, robot: str) -> bytes | None:
         """Return the public key that is enrolled for this id; None for none."""
 
-    def describe(self, robot: str) -> object:
-        """Return the robot's functions as they came over the wire; never raises."""
+    def describe(self, robot: str, *, anew: bool = False) -> object:
+        """Return the robot's functions as they came over the wire.
+
+        ``anew`` asks the robot itself.
+        """
 
     def call(self, robot: str, verb: str, arguments: Mapping[str, Any], timeout: float) -> Envelope:
         """Call a verb and return the answer, also one of status error.

@@ -31,6 +31,9 @@ logger = logging.getLogger(__name__)
 UNKNOWN_METHOD, BAD_PARAMS = -32601, -32602
 """JSON-RPC's codes of an unknown function and of arguments that do not fit."""
 
+DESCRIBE_S = 2.0
+"""Seconds in which a device has to describe itself."""
+
 UNKNOWN_STOP_S = 1.0
 """Seconds in which a device that was not found has to answer a stop."""
 
@@ -93,8 +96,16 @@ class DeviceConnectNetwork:
             logger.warning("The enrolled keys cannot be used, so none counts: %s", exc)
             return None
 
-    def describe(self, robot: str) -> object:
+    def describe(self, robot: str, *, anew: bool = False) -> object:
         """Return the functions that the device announced."""
+        if anew:
+            try:
+                self._peers[robot] = self._connected.describe(robot, DESCRIBE_S)
+            except Exception as exc:
+                refusal = _refusal(exc, robot, "requestRegistration")
+                if refusal is None:
+                    raise
+                logger.debug("%s: it does not describe itself anew: %s", robot, refusal)
         peer = self._peers.get(robot)
         return None if peer is None else peer.functions
 

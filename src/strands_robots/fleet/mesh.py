@@ -93,10 +93,11 @@ class MeshNetwork:
         """Return the peer's enrolled key."""
         return (enrolled_peers() or {}).get(robot)
 
-    def describe(self, robot: str) -> object:
+    def describe(self, robot: str, *, anew: bool = False) -> object:
         """Return the robot's functions, of an older one those of its kind."""
         from strands_robots.serving.peer_verbs import KINDS, PEER_VERBS  # noqa: PLC0415 - loaded when it is used
 
+        del anew  # the robot is always asked
         row = self._joined_mesh.get_peer(robot) or {}
         reply = self._joined_mesh.send(robot, {"action": "describe"}, DESCRIBE_S)
         result = reply.get("result")

@@ -13,7 +13,7 @@ import queue
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Self
 
 from strands_robots.envelope import Envelope, is_error
@@ -51,8 +51,20 @@ ROBOT_NAME = "robot_name"
 OF_THE_HOLDER = ("renewControl", "releaseControl", "resume")
 """Verbs that write and move nothing; they go to the robot that reads go to."""
 
+READS = frozenset({"getStatus", "getState", "getFeatures", "status", "state", "features"})
+"""Names of reads that a mesh peer answers to without describing each of them."""
+
 Networks = Callable[[], Sequence[NetworkAdapter]]
 """Returns the networks that are joined now."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Known:
+    """Verbs of a robot as it described them once, with their names in Python."""
+
+    description: RobotDescription
+    names: Mapping[str, str]
+    methods: dict[str, Callable[..., dict[str, Any]]] = field(default_factory=dict)
 
 
 class RemoteRobot:
@@ -80,9 +92,7 @@ class RemoteRobot:
     def __init__(self, found: FoundRobot, network: NetworkAdapter, networks: Networks | None = None) -> None:
         self._found, self._network = found, network
         self._networks: Networks = networks or (lambda: (network,))
-        self._description: RobotDescription | None = None
-        self._names: dict[str, str] = {}
-        self._methods: dict[str, Callable[..., dict[str, Any]]] = {}
+        self._described_as: _Known | None = None
         self._lease = SharedLease()
         self._shared_id = SharedId()
 
@@ -244,48 +254,62 @@ class RemoteRobot:
         # Copying and pickling ask for underscore names before there is a description.
         if name.startswith("_"):
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-        described = self._described
-        method = self._methods.get(name)
-        if method is None:
-            wire = self._names.get(name)
-            if wire is None:
-                raise self._unknown(name)
-            method = self._methods[name] = self._method(name, described.verbs[wire])
-        return method
+        known = self._known
+        if name not in known.names:
+            # It may have come back with other verbs.
+            known = self._describe(anew=True)
+        wire = known.names.get(name)
+        if wire is None:
+            raise self._unknown(name)
+        if name not in known.methods:
+            known.methods[name] = self._method(name, known.description.verbs[wire])
+        return known.methods[name]
 
     def __dir__(self) -> list[str]:
-        described = self._described
-        return sorted({*object.__dir__(self), *(self._names if described.verbs else ())})
+        return sorted({*object.__dir__(self), *self._names})
 
     def __repr__(self) -> str:
         kind = self.model or self.type
-        known = self._description is not None or self._network.announces_verbs
+        known = self._described_as is not None or self._network.announces_verbs
         lacking = self._lacking() if known else ""
         return f"<RemoteRobot {self.id} ({', '.join(filter(None, (kind, self.network, lacking)))})>"
 
     @property
     def _described(self) -> RobotDescription:
-        if self._description is None:
-            self._describe()
-        return self._description or RobotDescription()
+        return self._known.description
 
-    def _describe(self) -> None:
-        """Ask the network for the robot's verbs, and name the methods."""
+    @property
+    def _names(self) -> Mapping[str, str]:
+        return self._known.names
+
+    @property
+    def _known(self) -> _Known:
+        return self._described_as or self._describe()
+
+    def _describe(self, *, anew: bool = False) -> _Known:
+        """Ask the network for the robot's verbs, and name the methods.
+
+        Args:
+            anew: ask the robot itself; what is known stays where it does not answer.
+        """
         try:
-            description = self._bounded(self._network.describe(self.address))
+            description = self._bounded(self._network.describe(self.address, anew=anew))
         except RefusalError as exc:
             logger.warning("%s: its verbs cannot be read: %s", self.id, exc)
-            return
+            return self._described_as or _Known(RobotDescription(), {})
         names: dict[str, list[str]] = {}
         for wire in description.verbs:
             names.setdefault(python_name(wire), []).append(wire)
-        self._names = {
-            name: wires[0]
-            for name, wires in names.items()
-            if len(wires) == 1 and name not in _RESERVED and name[0] != "_"
-        }
-        self._methods = {}
-        self._description = description
+        known = _Known(
+            description,
+            {
+                name: wires[0]
+                for name, wires in names.items()
+                if len(wires) == 1 and name not in _RESERVED and name[0] != "_"
+            },
+        )
+        self._described_as = known
+        return known
 
     def _bounded(self, functions: object) -> RobotDescription:
         """Read what the network has of its verbs."""
@@ -304,7 +328,7 @@ class RemoteRobot:
         decided = self._shared_id.decided
         if decided is not None and decided is not network and decided.bears(self.address):
             network = decided
-        self._found, self._network, self._description = found, network, None
+        self._found, self._network, self._described_as = found, network, None
 
     def _acquired(self, ttl_s: float) -> HeldLease:
         if not self.has_lease:
@@ -336,17 +360,21 @@ class RemoteRobot:
 
     def _call(self, verb: str, arguments: Mapping[str, Any], timeout: float | None) -> dict[str, Any]:
         description = self._described.verbs.get(verb)
-        if (description is None or description.kind == "motion") and verb not in OF_THE_HOLDER:
+        kind = ("read" if verb in READS else "motion") if description is None else description.kind
+        if kind == "motion" and verb not in OF_THE_HOLDER:
             if self._decide(verb):
                 description = self._described.verbs.get(verb)
             lease_id = self._lease.lease_id
-            if lease_id and description is not None and LEASE_ID in description.leases - arguments.keys():
+            # A verb that is not described may be a motion, which the robot refuses without the lease.
+            takes_it = description is None or LEASE_ID in description.leases
+            if lease_id and takes_it and LEASE_ID not in arguments:
                 arguments = {**arguments, LEASE_ID: lease_id}
         if timeout is None:
             timeout = _patience(description, arguments)
         try:
             answer: Envelope = self._network.call(self.address, verb, self._sent(description, arguments), timeout)
         except UnknownVerbError:
+            self._describe(anew=True)
             raise self._unknown(verb) from None
         if is_error(answer):
             raise refusal_of(self.id, verb, answer)
@@ -368,7 +396,7 @@ class RemoteRobot:
             )
         if decided is self._network:
             return False
-        self._network, self._description = decided, None
+        self._network, self._described_as = decided, None
         return True
 
     def _unknown(self, verb: str) -> UnknownVerbError:
