@@ -19,9 +19,10 @@ from tests.fleet.scripted import LEASE, OURS, ScriptedNetwork, function
 from strands_robots import errors
 from strands_robots.envelope import error, success
 from strands_robots.errors import RefusalError
+from strands_robots.fleet import event_feed
 from strands_robots.fleet.adapter import FoundRobot, RobotEvent
 from strands_robots.fleet.remote_robot import RemoteRobot
-from strands_robots.utils import WAIT_S
+from strands_robots.utils import WAIT_S, ValidationError
 
 
 @pytest.fixture
@@ -260,6 +261,44 @@ class TestControl:
             pytest.fail("controlled")
 
 
+class TestRobotsOfAWorld:
+    @pytest.fixture
+    def world(self) -> tuple[RemoteRobot, ScriptedNetwork]:
+        name = {"robot_name": {"type": "string"}}
+        functions = (
+            function("getStatus", "read"),
+            function("start", **name, **LEASE),
+            function("acquireControl", ttl_s={}, **name, **LEASE),
+            function("renewControl", lease_id={"type": "string"}),
+            function("releaseControl", lease_id={"type": "string"}),
+        )
+        robot, network = robot_with(*functions)
+        network.answers["getStatus"] = lambda arguments: success("idle", robots=["left", "right"])
+        network.answers["acquireControl"] = lambda arguments: success("held", lease_id="secret")
+        return robot, network
+
+    def test_robot_is_the_same_object_so_that_its_lease_counts(
+        self, world: tuple[RemoteRobot, ScriptedNetwork]
+    ) -> None:
+        robot, network = world
+        with robot.robots["left"].control():
+            robot.robots["left"].start()
+            robot.robots["right"].start()
+        said = [arguments for _, verb, arguments, _ in network.calls if verb == "start"]
+        assert said == [{"lease_id": "secret", "robot_name": "left"}, {"robot_name": "right"}]
+
+    def test_robot_outlives_a_new_description_of_its_world(self, world: tuple[RemoteRobot, ScriptedNetwork]) -> None:
+        robot, network = world
+        left = robot.robots["left"]
+        assert left.start()
+        network.robots["r"] = (function("jump", robot_name={"type": "string"}),)
+        robot.rediscovered(FoundRobot("r"), network)
+        assert left.jump()
+        with pytest.raises(errors.UnknownVerbError):
+            left.call("start")
+        assert network.calls[-1][2] == {"robot_name": "left"}
+
+
 class TestWhatItIs:
     def test_robot_of_ours_has_stop_lockout_and_lease(self, arm: RemoteRobot) -> None:
         assert (arm.has_stop, arm.has_lockout, arm.has_lease) == (True, True, True)
@@ -288,6 +327,35 @@ class TestEventsAndPictures:
                 network.subscribers[0](RobotEvent("arm-1", "streamStep", {"step": step}))
             assert [event.payload["step"] for event in events] == [0, 1, 2]
         assert not network.subscribers
+
+    def test_waiting_events_are_bounded_in_number_and_bytes(
+        self, arm: RemoteRobot, network: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(event_feed, "EVENTS_MAX", 3)
+        monkeypatch.setattr(event_feed, "BYTES_MAX", 10_000)
+        with arm.events(timeout=0.05) as events:
+            for step in range(5):
+                network.subscribers[0](RobotEvent("arm-1", "streamStep", {"step": step}))
+            assert [event.payload["step"] for event in events] == [2, 3, 4]
+        with arm.events(timeout=0.05) as events:
+            for step in range(3):
+                network.subscribers[0](RobotEvent("arm-1", "streamStep", {"step": step, "rows": [{}] * 50}))
+            assert [event.payload["step"] for event in events] == [1, 2]
+
+    @pytest.mark.parametrize("timeout", [0, -1, float("nan"), 1e9, "x", True])
+    def test_timeout_outside_its_domain_is_refused(self, arm: RemoteRobot, timeout: Any) -> None:
+        with pytest.raises(ValidationError, match="timeout"):
+            arm.call("getStatus", timeout=timeout)
+
+    def test_picture_that_asks_for_gigabytes_is_refused(self, arm: RemoteRobot, network: ScriptedNetwork) -> None:
+        jpeg = io.BytesIO()
+        Image.new("RGB", (8, 8)).save(jpeg, "JPEG")
+        # The frame header has the height and the width behind the precision.
+        head, marker, rest = jpeg.getvalue().partition(b"\xff\xc0\x00\x11\x08")
+        huge = base64.b64encode(head + marker + b"\xff\xff\xff\xff" + rest[4:]).decode()
+        network.answers["getPicture"] = lambda arguments: success("", jpeg=huge)
+        with pytest.raises(errors.RobotError, match="no picture"):
+            arm.picture()
 
     def test_picture_is_an_array(self, arm: RemoteRobot, network: ScriptedNetwork) -> None:
         jpeg = io.BytesIO()

@@ -9,7 +9,6 @@ from __future__ import annotations
 import base64
 import io
 import logging
-import queue
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -18,8 +17,9 @@ from typing import TYPE_CHECKING, Any, Self
 
 from strands_robots.envelope import Envelope, is_error
 from strands_robots.errors import AmbiguousRobotError, NoSuchRobotError, RefusalError, RobotError, UnknownVerbError
-from strands_robots.fleet.adapter import STOP_S, FoundRobot, NetworkAdapter, RobotEvent
+from strands_robots.fleet.adapter import STOP_S, FoundRobot, NetworkAdapter
 from strands_robots.fleet.description import docstring, python_name, signature
+from strands_robots.fleet.event_feed import EventFeed
 from strands_robots.fleet.lease import HeldLease, SharedLease
 from strands_robots.fleet.refusals import refusal_of
 from strands_robots.fleet.shared_id import SharedId
@@ -27,7 +27,7 @@ from strands_robots.fleet.side_by_side import side_by_side
 from strands_robots.safety.stopping import StopVerdict, graded
 from strands_robots.serving.advertised import AdvertisedVerb, RobotDescription
 from strands_robots.serving.verbs import LEASE_ID
-from strands_robots.utils import DURATION_MAX_S, WAIT_S, near, number, optional_module, plain_text
+from strands_robots.utils import DURATION_MAX_S, WAIT_S, near, number, optional_module, plain_text, text
 
 if TYPE_CHECKING:
     import numpy as np
@@ -37,9 +37,6 @@ logger = logging.getLogger(__name__)
 
 CALL_S = 10.0
 """Seconds in which a robot has to have started a motion or answered a read; it gives up itself by then."""
-
-EVENTS_MAX = 10_000
-"""Events that wait for a slow reader; a further one displaces the oldest."""
 
 PIXELS_MAX = 4096 * 4096
 HALTED_MAX = 64
@@ -65,6 +62,21 @@ class _Known:
     description: RobotDescription
     names: Mapping[str, str]
     methods: dict[str, Callable[..., dict[str, Any]]] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, description: RobotDescription) -> Self:
+        """Name the verbs that a method can have."""
+        names: dict[str, list[str]] = {}
+        for wire in description.verbs:
+            names.setdefault(python_name(wire), []).append(wire)
+        return cls(
+            description,
+            {
+                name: wires[0]
+                for name, wires in names.items()
+                if len(wires) == 1 and name not in _RESERVED and name[0] != "_"
+            },
+        )
 
 
 class RemoteRobot:
@@ -95,6 +107,7 @@ class RemoteRobot:
         self._described_as: _Known | None = None
         self._lease = SharedLease()
         self._shared_id = SharedId()
+        self._of_world: dict[str, RobotOfWorld] = {}
 
     @property
     def id(self) -> str:
@@ -151,13 +164,15 @@ class RemoteRobot:
 
         Args:
             verb: such as ``moveTo``.
-            timeout: seconds to wait for the answer; by default as long as the verb may take.
+            timeout: seconds to wait for the answer, above 0; by default as long as the verb may take.
             arguments: checked by the robot.
 
         Raises:
             RefusalError: the robot refused it, failed or did not answer; the subclass says which.
         """
-        return self._call(verb, arguments, timeout)
+        if timeout is not None:
+            timeout = number("timeout", timeout, above=0, high=DURATION_MAX_S + 60)
+        return self._call(text("verb", verb), arguments, timeout)
 
     def status(self) -> dict[str, Any]:
         """Return what it is doing, its lockouts and its holder."""
@@ -248,7 +263,9 @@ class RemoteRobot:
             return {}
         named = self.status().get("robots")
         names = [each for each in named if isinstance(each, str)] if isinstance(named, Mapping | list) else []
-        return {name: RobotOfWorld(self, name) for name in names[:ROBOTS_MAX]}
+        for name in names[:ROBOTS_MAX]:
+            self._of_world.setdefault(name, RobotOfWorld(self, name))
+        return {name: self._of_world[name] for name in names[:ROBOTS_MAX]}
 
     def __getattr__(self, name: str) -> Callable[..., dict[str, Any]]:
         # Copying and pickling ask for underscore names before there is a description.
@@ -293,29 +310,15 @@ class RemoteRobot:
             anew: ask the robot itself; what is known stays where it does not answer.
         """
         try:
-            description = self._bounded(self._network.describe(self.address, anew=anew))
+            description = RobotDescription.of(self._network.describe(self.address, anew=anew))
         except RefusalError as exc:
             logger.warning("%s: its verbs cannot be read: %s", self.id, exc)
             return self._described_as or _Known(RobotDescription(), {})
-        names: dict[str, list[str]] = {}
-        for wire in description.verbs:
-            names.setdefault(python_name(wire), []).append(wire)
-        known = _Known(
-            description,
-            {
-                name: wires[0]
-                for name, wires in names.items()
-                if len(wires) == 1 and name not in _RESERVED and name[0] != "_"
-            },
-        )
+        known = _Known.of(description)
         self._described_as = known
         return known
 
-    def _bounded(self, functions: object) -> RobotDescription:
-        """Read what the network has of its verbs."""
-        return RobotDescription.of(functions)
-
-    def _sent(self, verb: AdvertisedVerb | None, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    def _sent(self, verb: str, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         """Return the arguments as they are sent."""
         del verb
         return arguments
@@ -372,7 +375,7 @@ class RemoteRobot:
         if timeout is None:
             timeout = _patience(description, arguments)
         try:
-            answer: Envelope = self._network.call(self.address, verb, self._sent(description, arguments), timeout)
+            answer: Envelope = self._network.call(self.address, verb, self._sent(verb, arguments), timeout)
         except UnknownVerbError:
             self._describe(anew=True)
             raise self._unknown(verb) from None
@@ -415,8 +418,9 @@ class RobotOfWorld(RemoteRobot):
     """
 
     def __init__(self, world: RemoteRobot, name: str) -> None:
-        super().__init__(FoundRobot(f"{world.id}/{name}", world.type, name), world._network, world._networks)
         self._world, self._name = world, name
+        super().__init__(FoundRobot(f"{world.id}/{name}", world.type, name), world._network, world._networks)
+        self._whole: _Known | None = None
         self._shared_id = world._shared_id
 
     @property
@@ -438,12 +442,30 @@ class RobotOfWorld(RemoteRobot):
         own = robots.get(self._name) if isinstance(robots, Mapping) else None
         return {**answer, **(own if isinstance(own, Mapping) else {})}
 
-    def _bounded(self, functions: object) -> RobotDescription:
-        whole = super()._bounded(functions)
-        return replace(whole, verbs={name: verb for name, each in whole.verbs.items() if (verb := _of_one(each))})
+    @property
+    def _known(self) -> _Known:
+        current = self._described_as is not None and self._world._known is self._whole
+        return (self._described_as if current else None) or self._describe()
 
-    def _sent(self, verb: AdvertisedVerb | None, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-        named = verb is not None and ROBOT_NAME in self._world.verbs[verb.name].by_name
+    def _describe(self, *, anew: bool = False) -> _Known:
+        whole = self._world._describe(anew=True) if anew else self._world._known
+        verbs = {name: verb for name, each in whole.description.verbs.items() if (verb := _of_one(each))}
+        self._described_as, self._whole = _Known.of(replace(whole.description, verbs=verbs)), whole
+        return self._described_as
+
+    @property
+    def _network(self) -> NetworkAdapter:
+        return self._world._network
+
+    @_network.setter
+    def _network(self, network: NetworkAdapter) -> None:
+        if network is not self._world._network:
+            self._world._network, self._world._described_as = network, None
+
+    def _sent(self, verb: str, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+        whole = self._world.verbs.get(verb)
+        # A motion that is not described is never sent without the robot's name: it would move another one.
+        named = verb not in {*READS, *OF_THE_HOLDER} if whole is None else ROBOT_NAME in whole.by_name
         return {**arguments, ROBOT_NAME: self._name} if named else arguments
 
     def _stopped_on(self, network: NetworkAdapter) -> object:
@@ -459,46 +481,6 @@ def _of_one(verb: AdvertisedVerb) -> AdvertisedVerb | None:
 
 _RESERVED = frozenset(dir(RemoteRobot))
 """Names of members, which no verb of a robot takes."""
-
-
-class EventFeed:
-    """Events of one robot as they come; an iterator and context manager."""
-
-    def __init__(self, robot: str, network: NetworkAdapter, timeout: float | None) -> None:
-        self._arrived: queue.Queue[RobotEvent] = queue.Queue(EVENTS_MAX)
-        self._timeout = timeout
-        self._end: Callable[[], None] | None = network.subscribe(robot, self._push)
-
-    def close(self) -> None:
-        """Receive no more events."""
-        end, self._end = self._end, None
-        if end is not None:
-            end()
-
-    def __iter__(self) -> Self:
-        return self
-
-    def __next__(self) -> RobotEvent:
-        try:
-            return self._arrived.get(timeout=self._timeout)
-        except queue.Empty:
-            self.close()
-            raise StopIteration from None
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_exception: object) -> None:
-        self.close()
-
-    def _push(self, event: RobotEvent) -> None:
-        while True:
-            try:
-                self._arrived.put_nowait(event)
-            except queue.Full:
-                self._arrived.get_nowait()
-            else:
-                return
 
 
 def verdict_of_answer(answer: object, name: str) -> StopVerdict:
@@ -564,7 +546,11 @@ def _decoded(jpeg: object) -> NDArray[np.uint8]:
     numpy = optional_module("numpy", what="picture", extra="sim")
     if not isinstance(jpeg, str):
         raise ValueError("there is no jpeg in it")  # noqa: TRY004 - the answer's value, not the caller's type
-    with images.open(io.BytesIO(base64.b64decode(jpeg, validate=True)), formats=("JPEG",)) as image:
+    try:
+        opened = images.open(io.BytesIO(base64.b64decode(jpeg, validate=True)), formats=("JPEG",))
+    except images.DecompressionBombError as exc:
+        raise ValueError(str(exc)) from exc
+    with opened as image:
         # The header is read before the pixels, so that a small file cannot ask for gigabytes.
         if image.width * image.height > PIXELS_MAX:
             raise ValueError(f"it has {image.width} x {image.height} pixels")
