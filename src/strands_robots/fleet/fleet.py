@@ -104,7 +104,7 @@ class Fleet:
         absent: networks that are not joined, with the reason.
 
     Attributes:
-        absent: networks that are not joined, with the reason. A mesh without a hub is absent and no error.
+        absent: networks that are not joined or do not answer, with the reason. A mesh without a hub is no error.
     """
 
     def __init__(self, networks: Sequence[NetworkAdapter], absent: Mapping[str, str] | None = None) -> None:
