@@ -111,9 +111,9 @@ class NoSuchRobotError(RefusalError, LookupError):
 
 
 class AmbiguousRobotError(RefusalError):
-    """Robots on two networks have this id, so a motion is sent to neither."""
+    """Two networks have a robot of this id, and no key proves which one is meant."""
 
-    usual_remedy = "Give one of them another id; halt() reaches both."
+    usual_remedy = "Give one of them another id, or leave the mesh out: connect(mesh=False). halt() reaches both."
 
 
 class NoAnswerError(RefusalError, TimeoutError):

@@ -8,6 +8,8 @@ from typing import Any
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.errors import NoSuchRobotError, UnknownVerbError, UnreachableError
 from strands_robots.fleet.adapter import DEVICE_CONNECT, FIND_S, STOP_S, FoundRobot, OnEvent
+from strands_robots.safety.identity import SigningIdentity
+from strands_robots.safety.statements import Purpose, signed
 
 Answer = Callable[[Mapping[str, Any]], Envelope]
 
@@ -54,11 +56,22 @@ class ScriptedNetwork:
         self.unreachable = ""
         self.subscribers: list[OnEvent] = []
         self.joined = False
+        self.sessions = 0
+        self.enrolled: dict[str, bytes] = {}
 
     def open(self) -> None:
         if self.unreachable:
             raise UnreachableError(self.unreachable)
         self.joined = True
+
+    def sign_with(self, key: SigningIdentity) -> None:
+        """Have every robot sign its status."""
+
+        def status(arguments: Mapping[str, Any]) -> Envelope:
+            fields = {"nonce": arguments.get("nonce", "")}
+            return success("idle", statement=signed(key, Purpose.LOCKOUT_STATE, self.calls[-1][0], fields))
+
+        self.answers["getStatus"] = status
 
     def find(self, timeout: float = FIND_S) -> list[FoundRobot]:
         return [FoundRobot(name, "strands_robot", "so100") for name in self.robots]
@@ -66,7 +79,13 @@ class ScriptedNetwork:
     def bears(self, robot: str) -> bool:
         return robot in self.robots
 
-    def describe(self, robot: str) -> object:
+    def session(self, robot: str) -> object:
+        return self.sessions
+
+    def enrolled_key(self, robot: str) -> bytes | None:
+        return self.enrolled.get(robot)
+
+    def describe(self, robot: str, *, anew: bool = False) -> object:
         return self.robots[robot]
 
     def call(self, robot: str, verb: str, arguments: Mapping[str, Any], timeout: float) -> Envelope:

@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
 from tests.fleet.scripted import OURS, ScriptedNetwork
 
 from strands_robots import errors
-from strands_robots.envelope import error
+from strands_robots.envelope import error, success
 from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
 from strands_robots.fleet.fleet import Fleet, connect
+from strands_robots.fleet.link_flags import LinkFlags
+from strands_robots.safety.identity import ROBOTS, KeyFile, SigningIdentity
+from strands_robots.safety.statements import Purpose, signed
 from strands_robots.utils import ValidationError
 
 
@@ -54,8 +62,54 @@ def test_motion_of_an_id_on_both_is_refused_naming_both(
     with pytest.raises(errors.AmbiguousRobotError), both.control():
         pytest.fail("controlled")
     assert both.status()["status"] == "success"
+    moved = [call for call in (*device_connect.calls, *mesh.calls) if call[1] != "getStatus"]
+    assert not moved
+
+
+@pytest.fixture
+def keys(tmp_path: Path) -> list[SigningIdentity]:
+    return [KeyFile(ROBOTS, name, tmp_path).load_or_make() for name in ("one", "two")]
+
+
+def test_id_on_both_is_one_robot_where_one_key_signs_both(
+    fleet: Fleet, device_connect: ScriptedNetwork, mesh: ScriptedNetwork, keys: list[SigningIdentity]
+) -> None:
+    device_connect.sign_with(keys[0])
+    mesh.sign_with(keys[0])
+    both = fleet["both"]
+    both.move_to(x=1)
+    both.move_to(x=2)
+    assert [call[1] for call in device_connect.calls] == ["getStatus", "moveTo", "moveTo"]
+    assert [call[1] for call in mesh.calls] == ["getStatus"]
+    mesh.sign_with(keys[1])
+    mesh.sessions += 1
+    with pytest.raises(errors.AmbiguousRobotError, match=r"another id.*connect\(mesh=False\)"):
+        both.move_to(x=3)
+
+
+def test_enrolled_robot_wins_an_id_on_both(
+    fleet: Fleet, device_connect: ScriptedNetwork, mesh: ScriptedNetwork, keys: list[SigningIdentity]
+) -> None:
+    device_connect.sign_with(keys[0])
+    mesh.sign_with(keys[1])
+    device_connect.enrolled = mesh.enrolled = {"both": keys[1].public}
+    both = fleet["both"]
+    both.move_to(x=1)
+    assert both.network == MESH
     assert [call[1] for call in device_connect.calls] == ["getStatus"]
-    assert not mesh.calls
+    assert [call[1] for call in mesh.calls] == ["getStatus", "moveTo"]
+    fleet.robots()
+    assert both.network == MESH
+
+
+def test_recorded_signature_proves_nothing(
+    fleet: Fleet, device_connect: ScriptedNetwork, mesh: ScriptedNetwork, keys: list[SigningIdentity]
+) -> None:
+    device_connect.sign_with(keys[0])
+    old = signed(keys[0], Purpose.LOCKOUT_STATE, "both", {"nonce": "0" * 32})
+    mesh.answers["getStatus"] = lambda arguments: success("idle", statement=old)
+    with pytest.raises(errors.AmbiguousRobotError):
+        fleet["both"].move_to(x=1)
 
 
 def test_halt_of_an_id_on_both_reaches_both(
@@ -113,6 +167,80 @@ def test_stop_of_all_names_a_network_that_fails(fleet: Fleet, mesh: ScriptedNetw
     assert not verdicts["the robots on mesh"].stopped
 
 
+class Lost(Exception):
+    """Raised by a network's own library."""
+
+
+def test_network_that_fails_is_absent_and_the_others_go_on(
+    fleet: Fleet, device_connect: ScriptedNetwork, mesh: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def lost(*_arguments: object) -> Any:
+        raise Lost("cable")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(device_connect, "find", lost)
+        patch.setattr(device_connect, "stop_all", lost)
+        assert [robot.id for robot in fleet.robots()] == ["arm-2", "both"]
+        assert fleet.absent == {DEVICE_CONNECT: "Lost: cable"}
+        verdicts = fleet.stop()
+        assert verdicts["arm-2"].stopped
+        assert not verdicts["the robots on device_connect"].stopped
+        patch.setattr(mesh, "find", lost)
+        with pytest.raises(errors.UnreachableError, match="mesh: Lost: cable"):
+            fleet.robots()
+    assert len(fleet.robots()) == 3
+    assert fleet.absent == {}
+
+
+def test_other_network_is_left_where_one_fails(
+    device_connect: ScriptedNetwork, mesh: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def lost() -> None:
+        raise Lost("bad certificate")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(device_connect, "open", lost)
+        with pytest.raises(Lost), Fleet([device_connect, mesh]):
+            pytest.fail("joined")
+    assert not mesh.joined
+    with Fleet([device_connect, mesh]):
+        monkeypatch.setattr(device_connect, "close", lost)
+    assert not mesh.joined
+
+
+@pytest.mark.parametrize(
+    "use", [Fleet.robots, Fleet.where, Fleet.stop, list, lambda fleet: fleet["arm-1"], lambda fleet: "arm-9" in fleet]
+)
+def test_fleet_that_is_not_joined_says_so(use: Any, device_connect: ScriptedNetwork) -> None:
+    fleet = Fleet([device_connect])
+    for _ in range(2):
+        with pytest.raises(errors.UnreachableError, match="not joined: use it as a context manager"):
+            use(fleet)
+        with fleet:
+            assert fleet["arm-1"]
+
+
+def test_id_that_is_no_text_is_refused(fleet: Fleet) -> None:
+    with pytest.raises(ValidationError, match="not 5"):
+        fleet[5]  # type: ignore[index]
+    assert 5 not in fleet
+
+
+ENDING = """
+import atexit
+from tests.fleet.scripted import ScriptedNetwork
+from strands_robots.fleet import Fleet
+fleet = Fleet([ScriptedNetwork("device_connect"), ScriptedNetwork("mesh")]).__enter__()
+arm = fleet["arm-1"]
+atexit.register(lambda: print(arm.halt().stopped, fleet.stop()["arm-1"].stopped))
+"""
+
+
+def test_robots_are_stopped_while_the_interpreter_ends() -> None:
+    ended = subprocess.run([sys.executable, "-c", ENDING], capture_output=True, text=True, check=False)
+    assert (ended.stdout, ended.stderr) == ("True True\n", "")
+
+
 def test_networks_are_left_at_the_end(device_connect: ScriptedNetwork, mesh: ScriptedNetwork) -> None:
     with Fleet([device_connect, mesh]):
         assert device_connect.joined
@@ -126,6 +254,7 @@ def test_networks_are_left_at_the_end(device_connect: ScriptedNetwork, mesh: Scr
     [
         ({"connect": ["tcp/192.0.2.1:7447"]}, "needs authentication: certificates \\(tls_ca, tls_cert, tls_key\\)"),
         ({"nats": ["nats://127.0.0.1:4222"], "multicast": True}, "nats names a broker"),
+        ({"nats": "nats://192.0.2.1:4222"}, "needs authentication"),
         ({"tls_ca": "/absent"}, "tls_ca /absent is no file"),
         ({"name": "a.b"}, "name must be"),
     ],
@@ -133,6 +262,17 @@ def test_networks_are_left_at_the_end(device_connect: ScriptedNetwork, mesh: Scr
 def test_connect_refuses_arguments_by_name(arguments: Any, named: str) -> None:
     with pytest.raises(ValidationError, match=named):
         connect(**arguments)
+
+
+def test_connect_takes_credentials_and_sets_no_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("MESSAGING_CREDENTIALS_FILE", raising=False)
+    file = tmp_path / "arm.creds.json"
+    secrets = {"urls": ["nats://127.0.0.1:4222"], "jwt": "j", "nkey_seed": "s"}
+    file.write_text(json.dumps({"tenant": "lab", "nats": secrets}))
+    for flags in (LinkFlags(credentials=file), LinkFlags(nats=["nats://127.0.0.1:4222"], credentials=file)):
+        link = flags.link()
+        assert (link.transport, link.tenant, link.jwt) == ("nats", "lab", "j")
+    assert "MESSAGING_CREDENTIALS_FILE" not in os.environ
 
 
 def test_connect_without_arguments_is_this_machine(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,9 +19,10 @@ from tests.fleet.scripted import LEASE, OURS, ScriptedNetwork, function
 from strands_robots import errors
 from strands_robots.envelope import error, success
 from strands_robots.errors import RefusalError
+from strands_robots.fleet import event_feed
 from strands_robots.fleet.adapter import FoundRobot, RobotEvent
 from strands_robots.fleet.remote_robot import RemoteRobot
-from strands_robots.utils import WAIT_S
+from strands_robots.utils import WAIT_S, ValidationError
 
 
 @pytest.fixture
@@ -71,6 +72,8 @@ class TestVerbsAsMethods:
             arm.move_too()
         with pytest.raises(errors.UnknownVerbError, match="moveTo"):
             arm.call("moveTwo")
+        with pytest.raises(errors.UnknownVerbError, match=r"Near it: stop\.$"):
+            arm.call("stopp")
 
     def test_names_of_members_are_reachable_by_call_alone(self) -> None:
         names = ("halt", "call", "id", "__class__", "_private", "control", "brew")
@@ -88,6 +91,17 @@ class TestVerbsAsMethods:
         with pytest.raises(AttributeError, match=r"Reach it by call\(\): brew_coffee, brewCoffee"):
             robot.brew_coffee()
         assert robot.call("brewCoffee")["verb"] == "brewCoffee"
+
+    def test_robot_that_comes_back_with_other_verbs_is_described_anew(self) -> None:
+        robot, network = robot_with(function("brew"))
+        assert robot.brew()
+        network.robots["r"] = (function("jump"), function("fly"))
+        assert robot.jump()["verb"] == "jump"
+        assert not hasattr(robot, "brew")
+        network.robots["r"] = (function("swim"),)
+        with pytest.raises(errors.UnknownVerbError, match="swim"):
+            robot.fly()
+        assert list(robot.verbs) == ["swim"]
 
     def test_copy_asks_the_robot_for_nothing(self, arm: RemoteRobot, network: ScriptedNetwork) -> None:
         assert copy.copy(arm).id == "arm-1"
@@ -174,7 +188,7 @@ class TestHalt:
 
     def test_halt_asks_for_no_description(self) -> None:
         robot, network = robot_with()
-        network.describe = lambda robot: pytest.fail("described")  # type: ignore[method-assign]
+        network.describe = lambda *_, **__: pytest.fail("described")  # type: ignore[method-assign]
         assert robot.halt().stopped
 
 
@@ -215,10 +229,74 @@ class TestControl:
         with arm.control(ttl_s=0.06):
             eventually(lambda: renewed() >= 3, what="three renewals")
 
+    def test_nested_and_overlapping_blocks_share_the_lease(self, arm: RemoteRobot, network: ScriptedNetwork) -> None:
+        first, second = arm.control(), arm.control()
+        with first, arm.control():
+            second.__enter__()
+        arm.move_to(x=1)
+        second.__exit__(None, None, None)
+        arm.move_to(x=2)
+        said = [(verb, arguments.get("lease_id")) for _, verb, arguments, _ in network.calls]
+        assert said == [
+            ("acquireControl", None),
+            ("moveTo", "secret"),
+            ("releaseControl", "secret"),
+            ("moveTo", None),
+        ]
+        with arm.control():
+            arm.move_to(x=3)
+        assert network.calls[-2][2] == {"x": 3, "lease_id": "secret"}
+
+    def test_verb_without_a_description_carries_the_lease(self, arm: RemoteRobot, network: ScriptedNetwork) -> None:
+        network.answers["newVerb"] = network.answers["status"] = lambda arguments: success("done")
+        with arm.control():
+            arm.call("newVerb", x=1)
+            arm.call("status")
+        said = {verb: arguments for _, verb, arguments, _ in network.calls}
+        assert (said["newVerb"], said["status"]) == ({"x": 1, "lease_id": "secret"}, {})
+
     def test_robot_without_leases_refuses(self) -> None:
         robot, _ = robot_with(function("go"))
         with pytest.raises(errors.UnknownVerbError, match="no control lease"), robot.control():
             pytest.fail("controlled")
+
+
+class TestRobotsOfAWorld:
+    @pytest.fixture
+    def world(self) -> tuple[RemoteRobot, ScriptedNetwork]:
+        name = {"robot_name": {"type": "string"}}
+        functions = (
+            function("getStatus", "read"),
+            function("start", **name, **LEASE),
+            function("acquireControl", ttl_s={}, **name, **LEASE),
+            function("renewControl", lease_id={"type": "string"}),
+            function("releaseControl", lease_id={"type": "string"}),
+        )
+        robot, network = robot_with(*functions)
+        network.answers["getStatus"] = lambda arguments: success("idle", robots=["left", "right"])
+        network.answers["acquireControl"] = lambda arguments: success("held", lease_id="secret")
+        return robot, network
+
+    def test_robot_is_the_same_object_so_that_its_lease_counts(
+        self, world: tuple[RemoteRobot, ScriptedNetwork]
+    ) -> None:
+        robot, network = world
+        with robot.robots["left"].control():
+            robot.robots["left"].start()
+            robot.robots["right"].start()
+        said = [arguments for _, verb, arguments, _ in network.calls if verb == "start"]
+        assert said == [{"lease_id": "secret", "robot_name": "left"}, {"robot_name": "right"}]
+
+    def test_robot_outlives_a_new_description_of_its_world(self, world: tuple[RemoteRobot, ScriptedNetwork]) -> None:
+        robot, network = world
+        left = robot.robots["left"]
+        assert left.start()
+        network.robots["r"] = (function("jump", robot_name={"type": "string"}),)
+        robot.rediscovered(FoundRobot("r"), network)
+        assert left.jump()
+        with pytest.raises(errors.UnknownVerbError):
+            left.call("start")
+        assert network.calls[-1][2] == {"robot_name": "left"}
 
 
 class TestWhatItIs:
@@ -249,6 +327,35 @@ class TestEventsAndPictures:
                 network.subscribers[0](RobotEvent("arm-1", "streamStep", {"step": step}))
             assert [event.payload["step"] for event in events] == [0, 1, 2]
         assert not network.subscribers
+
+    def test_waiting_events_are_bounded_in_number_and_bytes(
+        self, arm: RemoteRobot, network: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(event_feed, "EVENTS_MAX", 3)
+        monkeypatch.setattr(event_feed, "BYTES_MAX", 10_000)
+        with arm.events(timeout=0.05) as events:
+            for step in range(5):
+                network.subscribers[0](RobotEvent("arm-1", "streamStep", {"step": step}))
+            assert [event.payload["step"] for event in events] == [2, 3, 4]
+        with arm.events(timeout=0.05) as events:
+            for step in range(3):
+                network.subscribers[0](RobotEvent("arm-1", "streamStep", {"step": step, "rows": [{}] * 50}))
+            assert [event.payload["step"] for event in events] == [1, 2]
+
+    @pytest.mark.parametrize("timeout", [0, -1, float("nan"), 1e9, "x", True])
+    def test_timeout_outside_its_domain_is_refused(self, arm: RemoteRobot, timeout: Any) -> None:
+        with pytest.raises(ValidationError, match="timeout"):
+            arm.call("getStatus", timeout=timeout)
+
+    def test_picture_that_asks_for_gigabytes_is_refused(self, arm: RemoteRobot, network: ScriptedNetwork) -> None:
+        jpeg = io.BytesIO()
+        Image.new("RGB", (8, 8)).save(jpeg, "JPEG")
+        # The frame header has the height and the width behind the precision.
+        head, marker, rest = jpeg.getvalue().partition(b"\xff\xc0\x00\x11\x08")
+        huge = base64.b64encode(head + marker + b"\xff\xff\xff\xff" + rest[4:]).decode()
+        network.answers["getPicture"] = lambda arguments: success("", jpeg=huge)
+        with pytest.raises(errors.RobotError, match="no picture"):
+            arm.picture()
 
     def test_picture_is_an_array(self, arm: RemoteRobot, network: ScriptedNetwork) -> None:
         jpeg = io.BytesIO()

@@ -67,6 +67,9 @@ class Network:
             CliError: the flags contradict one another, or leave this machine without authentication.
             MissingExtraError: Device Connect is not installed.
         """
+        if self.credentials:
+            # For the processes that a command starts, and for what it prints.
+            settings.put("MESSAGING_CREDENTIALS_FILE", str(self.credentials))
         try:
             return self._stated.link(as_flag)
         except ValidationError as exc:

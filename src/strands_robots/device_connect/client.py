@@ -7,13 +7,14 @@ Device Connect.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import queue
 import threading
 import time
 import uuid
 from collections.abc import Callable, Collection, Coroutine, Generator, Mapping
-from concurrent.futures import Future
+from concurrent.futures import CancelledError, Future
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
@@ -49,6 +50,9 @@ CONNECT_MARGIN_S = 3.0
 PURPOSES = {"getStatus": Purpose.LOCKOUT_STATE, "resume": Purpose.RESUME_ANSWER}
 """Functions whose answer has a signed part, with its purpose."""
 
+LAST_TASKS_S = 1.0
+CLOSED = "the client was closed before there was an answer"
+
 IN_FLIGHT = 64
 """Calls of :meth:`FleetClient.call_each` that wait for an answer at a time."""
 
@@ -62,6 +66,10 @@ class NoSuchDeviceError(StrandsRobotsError, LookupError):
 
 class DeviceTimeoutError(StrandsRobotsError, TimeoutError):
     """The device is on the network and did not answer in time."""
+
+
+class ClientClosedError(StrandsRobotsError, TimeoutError):
+    """The client was closed before or while the answer was awaited."""
 
 
 class CallRefusedError(StrandsRobotsError, RuntimeError):
@@ -100,6 +108,9 @@ class FleetClient:
         self._messaging: Any = None
         self._discovery: Discovery | None = None
         self._network = network_of(link)
+        self._lock = threading.Lock()
+        self._pending: set[Future[Any]] = set()
+        self._closed = False
 
     def __enter__(self) -> Self:
         self._thread.start()
@@ -116,12 +127,24 @@ class FleetClient:
         self.close()
 
     def close(self) -> None:
-        """Leave the network; the loop and its thread end."""
+        """Leave the network; waiting calls get :class:`ClientClosedError`."""
+        with self._lock:
+            self._closed, pending = True, tuple(self._pending)
         if self._loop.is_closed():
             return
-        if self._messaging is not None:
-            messaging, self._messaging = self._messaging, None
-            self.run(messaging.close(), LOOP_JOIN_TIMEOUT_S)
+        for each in pending:
+            each.cancel()
+        messaging, self._messaging = self._messaging, None
+        try:
+            if self._thread.is_alive():
+                asyncio.run_coroutine_threadsafe(_ended(messaging), self._loop).result(LOOP_JOIN_TIMEOUT_S)
+        finally:
+            self._end_loop()
+
+    def _end_loop(self) -> None:
+        if not self._thread.is_alive():
+            self._loop.close()
+            return
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join(LOOP_JOIN_TIMEOUT_S)
         if not self._thread.is_alive():
@@ -309,16 +332,32 @@ class FleetClient:
         return self.run(all_of_them(), 2 * timeout + 4.0)
 
     def run(self, work: Coroutine[Any, Any, T], within: float) -> T:
-        """Run a coroutine on the client's loop and wait for it."""
-        done: Future[T] = asyncio.run_coroutine_threadsafe(work, self._loop)
+        """Run a coroutine on the client's loop and wait for it.
+
+        Raises:
+            ClientClosedError: the client is closed before it is done.
+        """
+        done = self._submitted(work)
         try:
             return done.result(within)
+        except CancelledError:
+            raise ClientClosedError(CLOSED) from None
         except BaseException:
             done.cancel()
             raise
 
     async def _awaited(self, work: Coroutine[Any, Any, T]) -> T:
-        return await asyncio.wrap_future(asyncio.run_coroutine_threadsafe(work, self._loop))
+        return await asyncio.wrap_future(self._submitted(work))
+
+    def _submitted(self, work: Coroutine[Any, Any, T]) -> Future[T]:
+        with self._lock:
+            if self._closed:
+                work.close()
+                raise ClientClosedError(CLOSED)
+            done: Future[T] = asyncio.run_coroutine_threadsafe(work, self._loop)
+            self._pending.add(done)
+        done.add_done_callback(self._pending.discard)
+        return done
 
     @property
     def _found(self) -> Discovery:
@@ -408,13 +447,25 @@ class EventSubscription:
         """Receive no more events."""
         handle, self._handle = self._handle, None
         if handle is not None:
-            self._client.run(handle.unsubscribe(), 5.0)
+            with contextlib.suppress(ClientClosedError):
+                self._client.run(handle.unsubscribe(), 5.0)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_exception: object) -> None:
         self.close()
+
+
+async def _ended(messaging: Any) -> None:
+    """Leave the network and wait until cancelled calls have ended."""
+    if messaging is not None:
+        await messaging.close()
+    others = asyncio.all_tasks() - {asyncio.current_task()}
+    for each in others:
+        each.cancel()
+    if others:
+        await asyncio.wait(others, timeout=LAST_TASKS_S)
 
 
 def _event(data: bytes, subject: str) -> DeviceEvent | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
+from pathlib import Path
 
 from strands_robots import settings
 from strands_robots.device_connect.backends import LinkConfig, link_from_environment, loopback_config
@@ -24,16 +25,19 @@ _NAMES_A_NETWORK = (
 )
 
 
-def usual_link(tenant: str | None = None, port: int | None = None) -> LinkConfig:
+def usual_link(
+    tenant: str | None = None, port: int | None = None, credentials_file: str | Path | None = None
+) -> LinkConfig:
     """Return the link that the environment names, else one on this machine alone.
 
     Args:
         tenant: ``TENANT`` by default.
         port: the loopback port where local robots meet; giving it means this machine alone.
+        credentials_file: that of the environment by default.
     """
     tenant = tenant or settings.raw("TENANT")
-    if port is None and any(settings.is_set(name) for name in _NAMES_A_NETWORK):
-        return link_from_environment(tenant)
+    if port is None and (credentials_file or any(settings.is_set(name) for name in _NAMES_A_NETWORK)):
+        return link_from_environment(tenant, credentials_file=credentials_file)
     return loopback_config(port, tenant)
 
 

@@ -13,6 +13,9 @@ DEVICE_CONNECT, MESH = "device_connect", "mesh"
 FIND_S = 2.0
 """Seconds at most in which robots are looked for."""
 
+CLOSED = "the fleet was closed before it answered"
+"""Reason of a call that :meth:`NetworkAdapter.close` ends."""
+
 STOP_S = 5.0
 """Seconds in which a robot has to answer a stop."""
 
@@ -65,8 +68,17 @@ class NetworkAdapter(Protocol):
     def bears(self, robot: str) -> bool:
         """Return whether a robot of this id is known here; asks no one."""
 
-    def describe(self, robot: str) -> object:
-        """Return the robot's functions as they came over the wire; never raises."""
+    def session(self, robot: str) -> object:
+        """Return what differs once another robot may answer to this id; asks no one."""
+
+    def enrolled_key(self, robot: str) -> bytes | None:
+        """Return the public key that is enrolled for this id; None for none."""
+
+    def describe(self, robot: str, *, anew: bool = False) -> object:
+        """Return the robot's functions as they came over the wire.
+
+        ``anew`` asks the robot itself.
+        """
 
     def call(self, robot: str, verb: str, arguments: Mapping[str, Any], timeout: float) -> Envelope:
         """Call a verb and return the answer, also one of status error.

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import logging
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from strands_robots.envelope import Envelope
@@ -15,7 +17,8 @@ from strands_robots.errors import (
     UnknownVerbError,
     UnreachableError,
 )
-from strands_robots.fleet.adapter import DEVICE_CONNECT, FIND_S, STOP_S, FoundRobot, OnEvent, RobotEvent
+from strands_robots.fleet.adapter import CLOSED, DEVICE_CONNECT, FIND_S, STOP_S, FoundRobot, OnEvent, RobotEvent
+from strands_robots.safety.identity import KeyFileError
 from strands_robots.utils import ValidationError, plain_text
 
 if TYPE_CHECKING:
@@ -23,8 +26,13 @@ if TYPE_CHECKING:
     from strands_robots.device_connect.client import DeviceEvent, FleetClient
     from strands_robots.device_connect.discovery import Peer
 
+logger = logging.getLogger(__name__)
+
 UNKNOWN_METHOD, BAD_PARAMS = -32601, -32602
 """JSON-RPC's codes of an unknown function and of arguments that do not fit."""
+
+DESCRIBE_S = 2.0
+"""Seconds in which a device has to describe itself."""
 
 UNKNOWN_STOP_S = 1.0
 """Seconds in which a device that was not found has to answer a stop."""
@@ -47,6 +55,7 @@ class DeviceConnectNetwork:
 
         self._client = FleetClient(link, source)
         self._peers: dict[str, Peer] = {}
+        self._discoveries = 0
         self._open = False
 
     def open(self) -> None:
@@ -61,7 +70,9 @@ class DeviceConnectNetwork:
 
     def find(self, timeout: float = FIND_S) -> list[FoundRobot]:
         """Return the devices of the tenant."""
-        self._peers = {peer.id: peer for peer in self._connected.peers(timeout)}
+        self._discoveries += 1
+        with _carried():
+            self._peers = {peer.id: peer for peer in self._connected.peers(timeout)}
         return [
             FoundRobot(peer.id, plain_text(peer.type, 100), plain_text(peer.model, 100))
             for peer in self._peers.values()
@@ -71,8 +82,30 @@ class DeviceConnectNetwork:
         """Return whether a device of this id was found or has announced itself."""
         return robot in self._peers or (self._open and robot in self._client.known())
 
-    def describe(self, robot: str) -> object:
+    def session(self, robot: str) -> object:
+        """Return the number of discoveries: a device has no session."""
+        return self._discoveries
+
+    def enrolled_key(self, robot: str) -> bytes | None:
+        """Return the device's enrolled key."""
+        from strands_robots.device_connect.enrollment import enrolled_robots  # noqa: PLC0415 - loaded when it is used
+
+        try:
+            return enrolled_robots(self._client.link).get(robot)
+        except (KeyFileError, OSError) as exc:
+            logger.warning("The enrolled keys cannot be used, so none counts: %s", exc)
+            return None
+
+    def describe(self, robot: str, *, anew: bool = False) -> object:
         """Return the functions that the device announced."""
+        if anew:
+            try:
+                self._peers[robot] = self._connected.describe(robot, DESCRIBE_S)
+            except Exception as exc:
+                refusal = _refusal(exc, robot, "requestRegistration")
+                if refusal is None:
+                    raise
+                logger.debug("%s: it does not describe itself anew: %s", robot, refusal)
         peer = self._peers.get(robot)
         return None if peer is None else peer.functions
 
@@ -97,7 +130,8 @@ class DeviceConnectNetwork:
 
     def stop_all(self, timeout: float = STOP_S) -> dict[str, Envelope]:
         """Stop each device when it is found."""
-        return self._connected.stop_all(timeout)
+        with _carried():
+            return self._connected.stop_all(timeout)
 
     def subscribe(self, robot: str, on_event: OnEvent) -> Callable[[], None]:
         """Receive the device's events."""
@@ -105,7 +139,8 @@ class DeviceConnectNetwork:
         def arrived(event: DeviceEvent) -> None:
             on_event(RobotEvent(event.device, plain_text(event.name, 100), event.payload))
 
-        return self._connected.subscription(robot, arrived).close
+        with _carried():
+            return self._connected.subscription(robot, arrived).close
 
     def close(self) -> None:
         """Disconnect."""
@@ -119,11 +154,30 @@ class DeviceConnectNetwork:
         return self._client
 
 
+@contextmanager
+def _carried() -> Iterator[None]:
+    """Raise :class:`UnreachableError` for what the network cannot carry."""
+    from device_connect_edge.messaging import MessagingError  # noqa: PLC0415 - loaded when it is used
+
+    try:
+        yield
+    except (MessagingError, TimeoutError, OSError) as exc:
+        if isinstance(exc, RefusalError):
+            raise
+        raise UnreachableError(plain_text(str(exc)) or "Device Connect did not answer in time") from exc
+
+
 def _refusal(exc: Exception, robot: str, verb: str) -> RefusalError | None:
     from device_connect_edge.messaging import MessagingError  # noqa: PLC0415 - loaded when it is used
 
-    from strands_robots.device_connect.client import CallRefusedError, NoSuchDeviceError  # noqa: PLC0415 - as above
+    from strands_robots.device_connect.client import (  # noqa: PLC0415 - as above
+        CallRefusedError,
+        ClientClosedError,
+        NoSuchDeviceError,
+    )
 
+    if isinstance(exc, ClientClosedError):
+        return NoAnswerError(CLOSED, robot=robot, verb=verb)
     why, cause = plain_text(str(exc)), None
     if isinstance(exc, CallRefusedError):
         cause = {UNKNOWN_METHOD: UnknownVerbError, BAD_PARAMS: ArgumentsError}.get(exc.code, RobotError)

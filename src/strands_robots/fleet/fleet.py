@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Self
@@ -13,8 +13,11 @@ from strands_robots.errors import NoSuchRobotError, RefusalError, UnreachableErr
 from strands_robots.fleet.adapter import DEVICE_CONNECT, FIND_S, MESH, STOP_S, FoundRobot, NetworkAdapter
 from strands_robots.fleet.link_flags import LinkFlags
 from strands_robots.fleet.remote_robot import RemoteRobot, combined, verdict_of_answer
+from strands_robots.fleet.side_by_side import side_by_side
 from strands_robots.safety.stopping import StopVerdict
-from strands_robots.utils import device_id, near
+from strands_robots.utils import DURATION_MAX_S, ValidationError, device_id, near, number, plain_text, shown
+
+logger = logging.getLogger(__name__)
 
 SOURCE = "strands-robots"
 """Caller's name where none is given."""
@@ -22,9 +25,9 @@ SOURCE = "strands-robots"
 
 def connect(
     *,
-    nats: Sequence[str] | None = None,
-    connect: Sequence[str] | None = None,
-    listen: Sequence[str] | None = None,
+    nats: Sequence[str] | str | None = None,
+    connect: Sequence[str] | str | None = None,
+    listen: Sequence[str] | str | None = None,
     multicast: bool = False,
     port: int | None = None,
     tenant: str | None = None,
@@ -45,7 +48,7 @@ def connect(
             print(fleet.robots())
 
     Args:
-        nats: NATS servers, such as ``nats://host:4222``.
+        nats: NATS servers, such as ``nats://host:4222``; one or a list, as the next two.
         connect: Zenoh endpoints to connect to, such as ``tls/host:7447``.
         listen: Zenoh endpoints to listen on.
         multicast: find peers on the local network by multicast.
@@ -66,7 +69,7 @@ def connect(
     source, absent = device_id("name", name), dict[str, str]()
     files = {"tls_ca": tls_ca, "tls_cert": tls_cert, "tls_key": tls_key, "credentials": credentials}
     paths = {each: Path(file).expanduser() for each, file in files.items() if file is not None}
-    flags = LinkFlags(nats, connect, listen, multicast, port, tenant, insecure, **paths)
+    flags = LinkFlags(_items(nats), _items(connect), _items(listen), multicast, port, tenant, insecure, **paths)
     networks: list[NetworkAdapter] = []
     if flags != LinkFlags() or find_spec("device_connect_edge") is not None:
         from strands_robots.fleet.device_connect import DeviceConnectNetwork  # noqa: PLC0415 - loaded when it is used
@@ -93,15 +96,15 @@ class Fleet:
                 print(robot.id, robot.type, robot.network)
             arm = fleet["arm-1"]
 
-    An id that both networks have is one robot: Device Connect answers its reads, its motions are refused, and
-    :meth:`RemoteRobot.halt` stops both.
+    An id that both networks have is one robot where both answers are signed by one key: Device Connect is used. Of two
+    robots the enrolled one is moved. Where no key decides, motions are refused; :meth:`RemoteRobot.halt` stops both.
 
     Args:
         networks: those to join, the one whose robots win an id first.
         absent: networks that are not joined, with the reason.
 
     Attributes:
-        absent: networks that are not joined, with the reason. A mesh without a hub is absent and no error.
+        absent: networks that are not joined or do not answer, with the reason. A mesh without a hub is no error.
     """
 
     def __init__(self, networks: Sequence[NetworkAdapter], absent: Mapping[str, str] | None = None) -> None:
@@ -116,12 +119,15 @@ class Fleet:
         Raises:
             UnreachableError: none of them can be reached.
         """
-        with ThreadPoolExecutor(max(1, len(self._stated)), "fleet-open") as pool:
-            problems = list(pool.map(_opened, self._stated))
-        self.absent |= {each.name: why for each, why in zip(self._stated, problems, strict=True) if why}
+        problems = side_by_side(_opened, self._stated)
+        unexpected = next((each for each in problems if isinstance(each, Exception)), None)
+        if unexpected is not None:
+            _close([each for each, why in zip(self._stated, problems, strict=True) if not why])
+            raise unexpected
+        self.absent |= {each.name: str(why) for each, why in zip(self._stated, problems, strict=True) if why}
         self._networks = tuple(each for each, why in zip(self._stated, problems, strict=True) if not why)
         if not self._networks:
-            raise UnreachableError("; ".join(f"{name}: {why.rstrip('.')}" for name, why in self.absent.items()))
+            raise UnreachableError(self._absences)
         return self
 
     def __exit__(self, *_exception: object) -> None:
@@ -130,20 +136,33 @@ class Fleet:
     def close(self) -> None:
         """Leave the networks."""
         networks, self._networks = self._networks, ()
-        for each in networks:
-            each.close()
+        _close(networks)
 
     def robots(self, timeout: float = FIND_S) -> list[RemoteRobot]:
         """Look for robots and return them, sorted by id.
 
+        A network that fails is named in :attr:`absent` until it answers again.
+
         Args:
             timeout: seconds at most; it ends early once no more robots come.
+
+        Raises:
+            UnreachableError: no network answers, or the fleet is not joined.
         """
+        seconds, networks = number("timeout", timeout, low=0, high=DURATION_MAX_S), self._joined
         found: dict[str, tuple[FoundRobot, NetworkAdapter]] = {}
-        with ThreadPoolExecutor(max(1, len(self._networks)), "fleet-find") as pool:
-            listed = list(pool.map(lambda each: each.find(timeout), self._networks))
+        listed = side_by_side(lambda each: _found(each, seconds), networks)
+        for network, robots in zip(networks, listed, strict=True):
+            self.absent.pop(network.name, None)
+            if isinstance(robots, str):
+                logger.warning("Robots on %s cannot be looked for: %s", network.name, robots)
+                self.absent[network.name] = robots
+        if all(isinstance(each, str) for each in listed):
+            raise UnreachableError(self._absences)
         # The first network is the last to write, so its robots win an id.
-        for network, robots in reversed(list(zip(self._networks, listed, strict=True))):
+        for network, robots in reversed(list(zip(networks, listed, strict=True))):
+            if isinstance(robots, str):
+                continue
             found |= {each.id: (each, network) for each in robots}
         for name, (each, network) in found.items():
             known = self._robots.get(name)
@@ -171,8 +190,7 @@ class Fleet:
 
         A robot is stopped as soon as it is found. Never raises for a verdict.
         """
-        with ThreadPoolExecutor(max(1, len(self._networks)), "fleet-stop") as pool:
-            answers = list(pool.map(_all_stopped, self._networks))
+        answers = side_by_side(_all_stopped, self._joined)
         verdicts: dict[str, list[StopVerdict]] = {name: [] for name in self._robots}
         for each in answers:
             for name, answer in each.items():
@@ -184,7 +202,11 @@ class Fleet:
 
         Raises:
             NoSuchRobotError: no robot in reach has it; the message names similar ones and absent networks.
+            UnreachableError: no network answers, or the fleet is not joined.
         """
+        if not isinstance(robot, str):
+            raise ValidationError(f"A robot's id is a text, not {shown(robot)}.")
+        _ = self._joined
         if robot not in self._robots:
             self.robots()
         if robot not in self._robots:
@@ -194,27 +216,63 @@ class Fleet:
         return self._robots[robot]
 
     def __contains__(self, robot: object) -> bool:
-        return robot in self._robots or robot in {each.id for each in self.robots()}
+        return isinstance(robot, str) and (robot in self._robots or robot in {each.id for each in self.robots()})
 
     def __iter__(self) -> Iterator[RemoteRobot]:
         return iter(self.robots())
+
+    @property
+    def _joined(self) -> tuple[NetworkAdapter, ...]:
+        if not self._networks:
+            raise UnreachableError("not joined: use it as a context manager", remedy="with connect() as fleet: ...")
+        return self._networks
+
+    @property
+    def _absences(self) -> str:
+        return "; ".join(f"{name}: {why.rstrip('.')}" for name, why in self.absent.items())
 
     def __repr__(self) -> str:
         joined = ", ".join(each.name for each in self._networks) or "no network"
         return f"<Fleet on {joined}{''.join(f'; {name} is absent: {why}' for name, why in self.absent.items())}>"
 
 
-def _opened(network: NetworkAdapter) -> str:
+def _items(stated: Sequence[str] | str | None) -> Sequence[str] | None:
+    """Return one text as a list of one."""
+    return [stated] if isinstance(stated, str) else stated
+
+
+def _opened(network: NetworkAdapter) -> str | Exception:
     """Join a network; return the reason where that fails."""
     try:
         network.open()
     except UnreachableError as exc:
         return exc.why
+    except Exception as exc:  # noqa: BLE001 - it is raised once the other networks are left
+        return exc
     return ""
+
+
+def _close(networks: Sequence[NetworkAdapter]) -> None:
+    """Leave each network, also where another one fails."""
+    for each in networks:
+        try:
+            each.close()
+        except Exception as exc:  # noqa: BLE001 - the others are left all the same
+            logger.warning("%s was not left in good order: %s", each.name, exc)
+
+
+def _found(network: NetworkAdapter, timeout: float) -> list[FoundRobot] | str:
+    """Return the robots of a network, or the reason where that fails."""
+    try:
+        return network.find(timeout)
+    except RefusalError as exc:
+        return exc.why
+    except Exception as exc:  # noqa: BLE001 - the other networks have their robots
+        return plain_text(f"{type(exc).__name__}: {exc}")
 
 
 def _all_stopped(network: NetworkAdapter) -> Mapping[str, object]:
     try:
         return network.stop_all(STOP_S)
-    except (RefusalError, TimeoutError, OSError) as exc:
+    except Exception as exc:  # noqa: BLE001 - a stop that fails is a verdict, whatever it raised
         return {f"the robots on {network.name}": exc}

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 from strands_robots.envelope import Envelope
@@ -61,3 +62,36 @@ class HeldLease:
                 return
             except RefusalError as exc:
                 logger.warning("%s: its control lease could not be renewed: %s", self._robot, exc)
+
+
+class SharedLease:
+    """Lease that all blocks of one robot share; the last block releases it."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._held: HeldLease | None = None
+        self._blocks = 0
+
+    @property
+    def lease_id(self) -> str:
+        """The secret of the lease that is held now; empty without one."""
+        held = self._held
+        return "" if held is None else held.lease_id
+
+    @contextmanager
+    def block(self, acquire: Callable[[], HeldLease]) -> Iterator[None]:
+        """Hold the lease for the block, acquired by ``acquire`` where none is held."""
+        with self._lock:
+            if self._held is None:
+                self._held = acquire()
+            self._blocks += 1
+        try:
+            yield
+        finally:
+            # A block that begins meanwhile waits for the release, so that it is not refused for our own lease.
+            with self._lock:
+                self._blocks -= 1
+                held = self._held
+                if held is not None and not self._blocks:
+                    self._held = None
+                    held.release()

@@ -86,13 +86,11 @@ class LinkFlags:
     def _reached(self) -> LinkConfig:
         backends = _backends()
         tenant = self.stated_tenant
-        if self.credentials:
-            settings.put("MESSAGING_CREDENTIALS_FILE", str(self.credentials))
         if self.nats or self.connect or self.listen or self.multicast:
             transport = "nats" if self.nats else "zenoh"
             link: LinkConfig = backends.LinkConfig(transport=transport, tenant=tenant)
             if self.credentials:
-                link = backends.link_from_environment(tenant, transport)
+                link = backends.link_from_environment(tenant, transport, self.credentials)
             return replace(
                 link,
                 mode="peer" if self.listen or self.multicast else "auto",
@@ -103,7 +101,7 @@ class LinkFlags:
             )
         from strands_robots.device_connect.links import usual_link  # noqa: PLC0415 - loaded when a network is used
 
-        return usual_link(tenant, self.port)
+        return usual_link(tenant, self.port, self.credentials)
 
     def _secured(self, link: LinkConfig, spelled: Spelled) -> LinkConfig:
         return replace(

@@ -9,15 +9,15 @@ import json
 import math
 import time
 from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from itertools import count
 from typing import TYPE_CHECKING, Any
 
 from strands_robots import settings
 from strands_robots.envelope import Envelope, error, is_error
 from strands_robots.errors import ArgumentsError, NoAnswerError, NoSuchRobotError, UnreachableError
-from strands_robots.fleet.adapter import FIND_S, MESH, STOP_S, FoundRobot, OnEvent, RobotEvent
+from strands_robots.fleet.adapter import CLOSED, FIND_S, MESH, STOP_S, FoundRobot, OnEvent, RobotEvent
 from strands_robots.fleet.refusals import refusal_of_text
+from strands_robots.fleet.side_by_side import side_by_side
 from strands_robots.safety.peer_answers import enrolled_peers, stop_distrust
 from strands_robots.safety.statements import ALARM
 from strands_robots.safety.stopping import explain, grade
@@ -31,7 +31,6 @@ DESCRIBE_S = 5.0
 """Seconds in which a peer has to describe its verbs."""
 
 LOOK_S = 0.05
-PARALLEL = 32
 _ALIASES = {"getStatus": "status", "getState": "state", "getFeatures": "features"}
 """Reads of every robot by their names on Device Connect, which the mesh has always called otherwise."""
 
@@ -52,6 +51,7 @@ class MeshNetwork:
         self._mesh: Mesh | None = None
         self._joined = math.inf
         self._subscriptions = count()
+        self._discoveries = 0
 
     def open(self) -> None:
         """Join; raise :class:`UnreachableError` where there is no mesh."""
@@ -74,6 +74,7 @@ class MeshNetwork:
     def find(self, timeout: float = FIND_S) -> list[FoundRobot]:
         """Return the robots in reach, once they had the time to announce themselves."""
         self._settle(timeout)
+        self._discoveries += 1
         return [
             FoundRobot(str(row["peer_id"]), plain_text(row.get("type"), 100), plain_text(row.get("tool_name"), 100))
             for row in self._rows()
@@ -84,10 +85,19 @@ class MeshNetwork:
         row = self._joined_mesh.get_peer(robot)
         return row is not None and bool(row["reachable"]) and _has_robot(row)
 
-    def describe(self, robot: str) -> object:
+    def session(self, robot: str) -> object:
+        """Return the session of the peer, and the number of discoveries."""
+        return self._joined_mesh.peer_wire_zid(robot), self._discoveries
+
+    def enrolled_key(self, robot: str) -> bytes | None:
+        """Return the peer's enrolled key."""
+        return (enrolled_peers() or {}).get(robot)
+
+    def describe(self, robot: str, *, anew: bool = False) -> object:
         """Return the robot's functions, of an older one those of its kind."""
         from strands_robots.serving.peer_verbs import KINDS, PEER_VERBS  # noqa: PLC0415 - loaded when it is used
 
+        del anew  # the robot is always asked
         row = self._joined_mesh.get_peer(robot) or {}
         reply = self._joined_mesh.send(robot, {"action": "describe"}, DESCRIBE_S)
         result = reply.get("result")
@@ -121,6 +131,8 @@ class MeshNetwork:
             return dict(result) if isinstance(result, Mapping) else {"result": result}
         if reply.get("type") == "error":
             raise refusal_of_text(robot, verb, reply.get("error"))
+        if self._mesh is None:
+            raise NoAnswerError(CLOSED, robot=robot, verb=verb)
         if reply.get("status") == "timeout":
             raise NoAnswerError(f"It did not answer within {timeout:g} s", robot=robot, verb=verb)
         why = plain_text(reply.get("reason") or reply.get("error"))
@@ -144,9 +156,8 @@ class MeshNetwork:
         answers = {name: _stop_answer(name, each, keys) for each in replies if (name := str(each["responder_id"]))}
         self._settle(0.0)
         rest = [row["peer_id"] for row in self._rows() if is_error(answers.get(row["peer_id"], error("no answer")))]
-        with ThreadPoolExecutor(PARALLEL, "fleet-stop") as pool:
-            for name, answer in zip(rest, pool.map(lambda each: self.stop(each, timeout), rest), strict=True):
-                answers[name] = answer or error("It is gone.", stopped=None)
+        for name, answer in zip(rest, side_by_side(lambda each: self.stop(each, timeout), rest), strict=True):
+            answers[name] = answer or error("It is gone.", stopped=None)
         return {row["peer_id"]: answers[row["peer_id"]] for row in self._rows() if row["peer_id"] in answers}
 
     def subscribe(self, robot: str, on_event: OnEvent) -> Callable[[], None]:

@@ -9,24 +9,25 @@ from __future__ import annotations
 import base64
 import io
 import logging
-import queue
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Self
 
 from strands_robots.envelope import Envelope, is_error
 from strands_robots.errors import AmbiguousRobotError, NoSuchRobotError, RefusalError, RobotError, UnknownVerbError
-from strands_robots.fleet.adapter import STOP_S, FoundRobot, NetworkAdapter, RobotEvent
+from strands_robots.fleet.adapter import STOP_S, FoundRobot, NetworkAdapter
 from strands_robots.fleet.description import docstring, python_name, signature
-from strands_robots.fleet.lease import HeldLease
+from strands_robots.fleet.event_feed import EventFeed
+from strands_robots.fleet.lease import HeldLease, SharedLease
 from strands_robots.fleet.refusals import refusal_of
+from strands_robots.fleet.shared_id import SharedId
+from strands_robots.fleet.side_by_side import side_by_side
 from strands_robots.safety.stopping import StopVerdict, graded
 from strands_robots.serving.advertised import AdvertisedVerb, RobotDescription
 from strands_robots.serving.verbs import LEASE_ID
-from strands_robots.utils import DURATION_MAX_S, WAIT_S, near, number, optional_module, plain_text
+from strands_robots.utils import DURATION_MAX_S, WAIT_S, near, number, optional_module, plain_text, text
 
 if TYPE_CHECKING:
     import numpy as np
@@ -36,9 +37,6 @@ logger = logging.getLogger(__name__)
 
 CALL_S = 10.0
 """Seconds in which a robot has to have started a motion or answered a read; it gives up itself by then."""
-
-EVENTS_MAX = 10_000
-"""Events that wait for a slow reader; a further one displaces the oldest."""
 
 PIXELS_MAX = 4096 * 4096
 HALTED_MAX = 64
@@ -50,8 +48,35 @@ ROBOT_NAME = "robot_name"
 OF_THE_HOLDER = ("renewControl", "releaseControl", "resume")
 """Verbs that write and move nothing; they go to the robot that reads go to."""
 
+READS = frozenset({"getStatus", "getState", "getFeatures", "status", "state", "features"})
+"""Names of reads that a mesh peer answers to without describing each of them."""
+
 Networks = Callable[[], Sequence[NetworkAdapter]]
 """Returns the networks that are joined now."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Known:
+    """Verbs of a robot as it described them once, with their names in Python."""
+
+    description: RobotDescription
+    names: Mapping[str, str]
+    methods: dict[str, Callable[..., dict[str, Any]]] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, description: RobotDescription) -> Self:
+        """Name the verbs that a method can have."""
+        names: dict[str, list[str]] = {}
+        for wire in description.verbs:
+            names.setdefault(python_name(wire), []).append(wire)
+        return cls(
+            description,
+            {
+                name: wires[0]
+                for name, wires in names.items()
+                if len(wires) == 1 and name not in _RESERVED and name[0] != "_"
+            },
+        )
 
 
 class RemoteRobot:
@@ -79,10 +104,10 @@ class RemoteRobot:
     def __init__(self, found: FoundRobot, network: NetworkAdapter, networks: Networks | None = None) -> None:
         self._found, self._network = found, network
         self._networks: Networks = networks or (lambda: (network,))
-        self._description: RobotDescription | None = None
-        self._names: dict[str, str] = {}
-        self._methods: dict[str, Callable[..., dict[str, Any]]] = {}
-        self._lease: HeldLease | None = None
+        self._described_as: _Known | None = None
+        self._lease = SharedLease()
+        self._shared_id = SharedId()
+        self._of_world: dict[str, RobotOfWorld] = {}
 
     @property
     def id(self) -> str:
@@ -139,13 +164,15 @@ class RemoteRobot:
 
         Args:
             verb: such as ``moveTo``.
-            timeout: seconds to wait for the answer; by default as long as the verb may take.
+            timeout: seconds to wait for the answer, above 0; by default as long as the verb may take.
             arguments: checked by the robot.
 
         Raises:
             RefusalError: the robot refused it, failed or did not answer; the subclass says which.
         """
-        return self._call(verb, arguments, timeout)
+        if timeout is not None:
+            timeout = number("timeout", timeout, above=0, high=DURATION_MAX_S + 60)
+        return self._call(text("verb", verb), arguments, timeout)
 
     def status(self) -> dict[str, Any]:
         """Return what it is doing, its lockouts and its holder."""
@@ -201,11 +228,7 @@ class RemoteRobot:
         """
         began, networks = time.monotonic(), tuple(self._networks()) or (self._network,)
         logger.debug("%s is halted: %s", self.id, reason)
-        if len(networks) == 1:
-            answers = [self._stopped_on(networks[0])]
-        else:
-            with ThreadPoolExecutor(len(networks), "fleet-halt") as pool:
-                answers = list(pool.map(self._stopped_on, networks))
+        answers = side_by_side(self._stopped_on, networks)
         bearers = [(each, said) for each, said in zip(networks, answers, strict=True) if said is not None]
         verdicts = [
             verdict_of_answer(said, self.id if len(bearers) == 1 else f"{self.id} on {each.name}")
@@ -218,25 +241,16 @@ class RemoteRobot:
         """Hold the robot for the block: motions of other callers are refused.
 
         The lease is renewed in the background and released at the end, also after an exception. If this process dies,
-        the robot halts when ``ttl_s`` seconds are over.
+        the robot halts when ``ttl_s`` seconds are over. Blocks of this object that overlap or nest, on any thread,
+        share one lease with the ``ttl_s`` of the first; it is released at the end of the last one.
 
         Raises:
             ControlError: another caller holds it.
             UnknownVerbError: it has no control lease.
         """
         seconds = number("ttl_s", ttl_s, above=0)
-        if not self.has_lease:
-            raise UnknownVerbError("It has no control lease", robot=self.id, verb="acquireControl")
-        answer = self._call("acquireControl", {"ttl_s": seconds}, None)
-        lease_id = answer.get("lease_id")
-        if not isinstance(lease_id, str) or not lease_id:
-            raise RobotError("It gave no lease_id", robot=self.id, verb="acquireControl", envelope=answer)
-        before, self._lease = self._lease, HeldLease(self.id, self._call, lease_id, seconds)
-        try:
+        with self._lease.block(lambda: self._acquired(seconds)):
             yield self
-        finally:
-            held, self._lease = self._lease, before
-            held.release()
 
     @property
     def robots(self) -> Mapping[str, RobotOfWorld]:
@@ -249,60 +263,62 @@ class RemoteRobot:
             return {}
         named = self.status().get("robots")
         names = [each for each in named if isinstance(each, str)] if isinstance(named, Mapping | list) else []
-        return {name: RobotOfWorld(self, name) for name in names[:ROBOTS_MAX]}
+        for name in names[:ROBOTS_MAX]:
+            self._of_world.setdefault(name, RobotOfWorld(self, name))
+        return {name: self._of_world[name] for name in names[:ROBOTS_MAX]}
 
     def __getattr__(self, name: str) -> Callable[..., dict[str, Any]]:
         # Copying and pickling ask for underscore names before there is a description.
         if name.startswith("_"):
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-        described = self._described
-        method = self._methods.get(name)
-        if method is None:
-            wire = self._names.get(name)
-            if wire is None:
-                raise self._unknown(name)
-            method = self._methods[name] = self._method(name, described.verbs[wire])
-        return method
+        known = self._known
+        if name not in known.names:
+            # It may have come back with other verbs.
+            known = self._describe(anew=True)
+        wire = known.names.get(name)
+        if wire is None:
+            raise self._unknown(name)
+        if name not in known.methods:
+            known.methods[name] = self._method(name, known.description.verbs[wire])
+        return known.methods[name]
 
     def __dir__(self) -> list[str]:
-        described = self._described
-        return sorted({*object.__dir__(self), *(self._names if described.verbs else ())})
+        return sorted({*object.__dir__(self), *self._names})
 
     def __repr__(self) -> str:
         kind = self.model or self.type
-        known = self._description is not None or self._network.announces_verbs
+        known = self._described_as is not None or self._network.announces_verbs
         lacking = self._lacking() if known else ""
         return f"<RemoteRobot {self.id} ({', '.join(filter(None, (kind, self.network, lacking)))})>"
 
     @property
     def _described(self) -> RobotDescription:
-        if self._description is None:
-            self._describe()
-        return self._description or RobotDescription()
+        return self._known.description
 
-    def _describe(self) -> None:
-        """Ask the network for the robot's verbs, and name the methods."""
+    @property
+    def _names(self) -> Mapping[str, str]:
+        return self._known.names
+
+    @property
+    def _known(self) -> _Known:
+        return self._described_as or self._describe()
+
+    def _describe(self, *, anew: bool = False) -> _Known:
+        """Ask the network for the robot's verbs, and name the methods.
+
+        Args:
+            anew: ask the robot itself; what is known stays where it does not answer.
+        """
         try:
-            description = self._bounded(self._network.describe(self.address))
+            description = RobotDescription.of(self._network.describe(self.address, anew=anew))
         except RefusalError as exc:
             logger.warning("%s: its verbs cannot be read: %s", self.id, exc)
-            return
-        names: dict[str, list[str]] = {}
-        for wire in description.verbs:
-            names.setdefault(python_name(wire), []).append(wire)
-        self._names = {
-            name: wires[0]
-            for name, wires in names.items()
-            if len(wires) == 1 and name not in _RESERVED and name[0] != "_"
-        }
-        self._methods = {}
-        self._description = description
+            return self._described_as or _Known(RobotDescription(), {})
+        known = _Known.of(description)
+        self._described_as = known
+        return known
 
-    def _bounded(self, functions: object) -> RobotDescription:
-        """Read what the network has of its verbs."""
-        return RobotDescription.of(functions)
-
-    def _sent(self, verb: AdvertisedVerb | None, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    def _sent(self, verb: str, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         """Return the arguments as they are sent."""
         del verb
         return arguments
@@ -312,7 +328,19 @@ class RemoteRobot:
 
     def rediscovered(self, found: FoundRobot, network: NetworkAdapter) -> None:
         """Take what a new discovery found; its verbs are read again when they are used."""
-        self._found, self._network, self._description = found, network, None
+        decided = self._shared_id.decided
+        if decided is not None and decided is not network and decided.bears(self.address):
+            network = decided
+        self._found, self._network, self._described_as = found, network, None
+
+    def _acquired(self, ttl_s: float) -> HeldLease:
+        if not self.has_lease:
+            raise UnknownVerbError("It has no control lease", robot=self.id, verb="acquireControl")
+        answer = self._call("acquireControl", {"ttl_s": ttl_s}, None)
+        lease_id = answer.get("lease_id")
+        if not isinstance(lease_id, str) or not lease_id:
+            raise RobotError("It gave no lease_id", robot=self.id, verb="acquireControl", envelope=answer)
+        return HeldLease(self.id, self._call, lease_id, ttl_s)
 
     def _lacking(self) -> str:
         return ", ".join(f"no {name}" for name in self._described.lacking)
@@ -335,32 +363,47 @@ class RemoteRobot:
 
     def _call(self, verb: str, arguments: Mapping[str, Any], timeout: float | None) -> dict[str, Any]:
         description = self._described.verbs.get(verb)
-        if (description is None or description.kind == "motion") and verb not in OF_THE_HOLDER:
-            self._refuse_ambiguous(verb)
-            held = self._lease
-            if held is not None and description is not None and LEASE_ID in description.leases - arguments.keys():
-                arguments = {**arguments, LEASE_ID: held.lease_id}
+        kind = ("read" if verb in READS else "motion") if description is None else description.kind
+        if kind == "motion" and verb not in OF_THE_HOLDER:
+            if self._decide(verb):
+                description = self._described.verbs.get(verb)
+            lease_id = self._lease.lease_id
+            # A verb that is not described may be a motion, which the robot refuses without the lease.
+            takes_it = description is None or LEASE_ID in description.leases
+            if lease_id and takes_it and LEASE_ID not in arguments:
+                arguments = {**arguments, LEASE_ID: lease_id}
         if timeout is None:
             timeout = _patience(description, arguments)
         try:
-            answer: Envelope = self._network.call(self.address, verb, self._sent(description, arguments), timeout)
+            answer: Envelope = self._network.call(self.address, verb, self._sent(verb, arguments), timeout)
         except UnknownVerbError:
+            self._describe(anew=True)
             raise self._unknown(verb) from None
         if is_error(answer):
             raise refusal_of(self.id, verb, answer)
         return answer
 
-    def _refuse_ambiguous(self, verb: str) -> None:
+    def _decide(self, verb: str) -> bool:
+        """Use the network that motions go to; True where it is another one."""
         networks = self._networks()
         bearers = [each for each in networks if each.bears(self.address)] if len(networks) > 1 else ()
-        if len(bearers) > 1:
+        if len(bearers) < 2:
+            return False
+        decided = self._shared_id.decide(self.address, bearers)
+        if decided is None:
             named = " and ".join(each.name for each in bearers)
             raise AmbiguousRobotError(
-                f"{verb} is sent to neither: {named} both have a robot of this id", robot=self.id, verb=verb
+                f"{verb} is sent to neither: {named} both have a robot of this id, and no key decides",
+                robot=self.id,
+                verb=verb,
             )
+        if decided is self._network:
+            return False
+        self._network, self._described_as = decided, None
+        return True
 
     def _unknown(self, verb: str) -> UnknownVerbError:
-        named = [*self.verbs, *self._names]
+        named = tuple(dict.fromkeys((*self.verbs, *self._names)))
         called = ", ".join(name for name in self.verbs if python_name(name) == verb)
         remedy = f"Reach it by call(): {called}." if called else near(verb, named).strip()
         return UnknownVerbError(f"It has no verb {verb[:100]}", robot=self.id, verb=verb, remedy=remedy)
@@ -375,8 +418,10 @@ class RobotOfWorld(RemoteRobot):
     """
 
     def __init__(self, world: RemoteRobot, name: str) -> None:
-        super().__init__(FoundRobot(f"{world.id}/{name}", world.type, name), world._network, world._networks)
         self._world, self._name = world, name
+        super().__init__(FoundRobot(f"{world.id}/{name}", world.type, name), world._network, world._networks)
+        self._whole: _Known | None = None
+        self._shared_id = world._shared_id
 
     @property
     def address(self) -> str:
@@ -397,12 +442,30 @@ class RobotOfWorld(RemoteRobot):
         own = robots.get(self._name) if isinstance(robots, Mapping) else None
         return {**answer, **(own if isinstance(own, Mapping) else {})}
 
-    def _bounded(self, functions: object) -> RobotDescription:
-        whole = super()._bounded(functions)
-        return replace(whole, verbs={name: verb for name, each in whole.verbs.items() if (verb := _of_one(each))})
+    @property
+    def _known(self) -> _Known:
+        current = self._described_as is not None and self._world._known is self._whole
+        return (self._described_as if current else None) or self._describe()
 
-    def _sent(self, verb: AdvertisedVerb | None, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-        named = verb is not None and ROBOT_NAME in self._world.verbs[verb.name].by_name
+    def _describe(self, *, anew: bool = False) -> _Known:
+        whole = self._world._describe(anew=True) if anew else self._world._known
+        verbs = {name: verb for name, each in whole.description.verbs.items() if (verb := _of_one(each))}
+        self._described_as, self._whole = _Known.of(replace(whole.description, verbs=verbs)), whole
+        return self._described_as
+
+    @property
+    def _network(self) -> NetworkAdapter:
+        return self._world._network
+
+    @_network.setter
+    def _network(self, network: NetworkAdapter) -> None:
+        if network is not self._world._network:
+            self._world._network, self._world._described_as = network, None
+
+    def _sent(self, verb: str, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+        whole = self._world.verbs.get(verb)
+        # A motion that is not described is never sent without the robot's name: it would move another one.
+        named = verb not in {*READS, *OF_THE_HOLDER} if whole is None else ROBOT_NAME in whole.by_name
         return {**arguments, ROBOT_NAME: self._name} if named else arguments
 
     def _stopped_on(self, network: NetworkAdapter) -> object:
@@ -418,46 +481,6 @@ def _of_one(verb: AdvertisedVerb) -> AdvertisedVerb | None:
 
 _RESERVED = frozenset(dir(RemoteRobot))
 """Names of members, which no verb of a robot takes."""
-
-
-class EventFeed:
-    """Events of one robot as they come; an iterator and context manager."""
-
-    def __init__(self, robot: str, network: NetworkAdapter, timeout: float | None) -> None:
-        self._arrived: queue.Queue[RobotEvent] = queue.Queue(EVENTS_MAX)
-        self._timeout = timeout
-        self._end: Callable[[], None] | None = network.subscribe(robot, self._push)
-
-    def close(self) -> None:
-        """Receive no more events."""
-        end, self._end = self._end, None
-        if end is not None:
-            end()
-
-    def __iter__(self) -> Self:
-        return self
-
-    def __next__(self) -> RobotEvent:
-        try:
-            return self._arrived.get(timeout=self._timeout)
-        except queue.Empty:
-            self.close()
-            raise StopIteration from None
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_exception: object) -> None:
-        self.close()
-
-    def _push(self, event: RobotEvent) -> None:
-        while True:
-            try:
-                self._arrived.put_nowait(event)
-            except queue.Full:
-                self._arrived.get_nowait()
-            else:
-                return
 
 
 def verdict_of_answer(answer: object, name: str) -> StopVerdict:
@@ -523,7 +546,11 @@ def _decoded(jpeg: object) -> NDArray[np.uint8]:
     numpy = optional_module("numpy", what="picture", extra="sim")
     if not isinstance(jpeg, str):
         raise ValueError("there is no jpeg in it")  # noqa: TRY004 - the answer's value, not the caller's type
-    with images.open(io.BytesIO(base64.b64decode(jpeg, validate=True)), formats=("JPEG",)) as image:
+    try:
+        opened = images.open(io.BytesIO(base64.b64decode(jpeg, validate=True)), formats=("JPEG",))
+    except images.DecompressionBombError as exc:
+        raise ValueError(str(exc)) from exc
+    with opened as image:
         # The header is read before the pixels, so that a small file cannot ask for gigabytes.
         if image.width * image.height > PIXELS_MAX:
             raise ValueError(f"it has {image.width} x {image.height} pixels")

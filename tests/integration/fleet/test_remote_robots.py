@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -134,6 +136,25 @@ class TestOnEachNetwork:
             with other.control():
                 assert other.call("getControl")["held"] is True
 
+    def test_call_under_way_ends_when_the_fleet_is_closed(self, site: Site) -> None:
+        asked, over = threading.Event(), threading.Event()
+
+        def features() -> dict[str, Any]:
+            asked.set()
+            over.wait(20.0)
+            return {"status": "success"}
+
+        site.toy.get_features = features  # type: ignore[method-assign]
+        with connect(name="other") as fleet, ThreadPoolExecutor(1) as pool:
+            waiting = pool.submit(fleet["arm-1"].features)
+            try:
+                assert asked.wait(10.0)
+                fleet.close()
+                with pytest.raises(errors.NoAnswerError, match="the fleet was closed"):
+                    waiting.result(3.0)
+            finally:
+                over.set()
+
     def test_locked_robot_refuses_motion(self, site: Site) -> None:
         site.arm.status()
         site.toy.gate.attach(_Lock())
@@ -255,6 +276,23 @@ class TestBothNetworks:
         finally:
             stop_device_connect(runtime)
             toy.close()
+
+    def test_robot_that_is_served_on_both_is_driven(self, ports: int, allowed: None, patient_halts: None) -> None:
+        with ExitStack() as stack:
+            toy = ToyRobot("toy")
+            stack.callback(toy.close)
+            mesh = init_mesh(toy, "arm-1", "sim")
+            assert mesh is not None
+            stack.callback(mesh.close)
+            runtime = init_device_connect_sync(toy, peer_id="arm-1", link=loopback_config(ports))
+            stack.callback(stop_device_connect, runtime)
+            fleet = stack.enter_context(connect())
+            arm = fleet["arm-1"]
+            assert (arm.network, fleet.absent) == (DEVICE_CONNECT, {})
+            with arm.control():
+                arm.execute(instruction="wave", duration=300.0, policy_provider="mock")
+            eventually(lambda: toy.writes, what="a first write")
+            assert arm.halt().stopped is True
 
     def test_robot_in_another_process_on_the_mesh_is_reached(self, far_world: MeshPeer) -> None:
         with connect() as fleet:

@@ -277,13 +277,20 @@ def loopback_config(meet_port: int | None = None, tenant: str = "default") -> Li
     return LinkConfig(mode="peer", meet_port=meet, multicast=False, tenant=tenant)
 
 
-def link_from_environment(tenant: str = "default", transport: str | None = None) -> LinkConfig:
+def link_from_environment(
+    tenant: str = "default", transport: str | None = None, credentials_file: str | Path | None = None
+) -> LinkConfig:
     """Return the link of the framework's own variables, else a multicast peer.
+
+    Args:
+        tenant: the tenant of the credentials where this is the default one.
+        transport: that of the environment by default.
+        credentials_file: that of the environment by default.
 
     Raises:
         ValidationError: an unknown backend, or a credentials file that cannot be read.
     """
-    credentials = _credentials_file()
+    credentials = _credentials_in(credentials_file)
     backend = transport or (settings.raw("MESSAGING_BACKEND") if settings.is_set("MESSAGING_BACKEND") else "")
     urls = _first_set("MESSAGING_URLS", *_URLS_OF.get(backend, ("NATS_URL", "ZENOH_CONNECT")))
     if not backend:
@@ -385,8 +392,8 @@ def _backend_of(urls: Sequence[str], credentials: Mapping[str, Any]) -> str:
     return "nats" if "nats" in credentials and "zenoh" not in credentials else "zenoh"
 
 
-def _credentials_file() -> dict[str, Any]:
-    name = settings.raw("MESSAGING_CREDENTIALS_FILE") or settings.raw("NATS_CREDENTIALS_FILE")
+def _credentials_in(stated: str | Path | None) -> dict[str, Any]:
+    name = str(stated or "") or settings.raw("MESSAGING_CREDENTIALS_FILE") or settings.raw("NATS_CREDENTIALS_FILE")
     if not name:
         return {}
     try:
