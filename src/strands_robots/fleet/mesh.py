@@ -122,10 +122,16 @@ class MeshNetwork:
             raise ArgumentsError(str(exc), robot=robot, verb=verb) from exc
         if "action" in arguments:
             raise ArgumentsError("the mesh cannot carry an argument called action", robot=robot, verb=verb)
-        if not self._waited_for(robot):
-            raise NoSuchRobotError(f"No robot {robot!r} is on the mesh", robot=robot, verb=verb)
-        command = {**arguments, "action": self._action(robot, verb)}
-        reply = self._joined_mesh.send(robot, command, timeout)
+        mesh = self._joined_mesh
+        try:
+            if not self._waited_for(robot):
+                raise NoSuchRobotError(f"No robot {robot!r} is on the mesh", robot=robot, verb=verb)
+            action = self._action(robot, verb)
+        except UnreachableError:
+            if self._mesh is mesh:
+                raise
+            raise NoAnswerError(CLOSED, robot=robot, verb=verb) from None
+        reply = mesh.send(robot, {**arguments, "action": action}, timeout)
         if reply.get("type") == "response":
             result = reply.get("result")
             return dict(result) if isinstance(result, Mapping) else {"result": result}
