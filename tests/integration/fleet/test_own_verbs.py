@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from typing import Any
 
@@ -149,3 +150,17 @@ def test_lease_holds_for_own_verbs(served: Served) -> None:
                 other.brew_coffee(1)
             assert other.beans_left()["result"] == 250.0
         assert other.brew_coffee(1)["cups"] == 1
+
+
+def test_call_under_way_ends_when_the_fleet_is_closed(served: Served) -> None:
+    body = Stubborn()
+    served.robot(body, "mill-6")
+    with connect(name="other") as fleet, ThreadPoolExecutor(1) as pool:
+        waiting = pool.submit(fleet["mill-6"].grind)
+        try:
+            eventually(body.started.is_set)
+            fleet.close()
+            with pytest.raises(errors.NoAnswerError, match="the fleet was closed"):
+                waiting.result(10.0)
+        finally:
+            body.released.set()

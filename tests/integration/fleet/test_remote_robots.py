@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -135,25 +133,6 @@ class TestOnEachNetwork:
                 site.arm.halt()
             with other.control():
                 assert other.call("getControl")["held"] is True
-
-    def test_call_under_way_ends_when_the_fleet_is_closed(self, site: Site) -> None:
-        asked, over = threading.Event(), threading.Event()
-
-        def features() -> dict[str, Any]:
-            asked.set()
-            over.wait(20.0)
-            return {"status": "success"}
-
-        site.toy.get_features = features  # type: ignore[method-assign]
-        with connect(name="other") as fleet, ThreadPoolExecutor(1) as pool:
-            waiting = pool.submit(fleet["arm-1"].features)
-            try:
-                assert asked.wait(10.0)
-                fleet.close()
-                with pytest.raises(errors.NoAnswerError, match="the fleet was closed"):
-                    waiting.result(3.0)
-            finally:
-                over.set()
 
     def test_locked_robot_refuses_motion(self, site: Site) -> None:
         site.arm.status()
