@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from strands_robots.safety import sighting_file
+from strands_robots.safety import sighting_file, sightings
 from strands_robots.safety.ed25519 import encode
 from strands_robots.safety.identity import EnrolledKeys, Exemption
 from strands_robots.safety.network_key import DEVICE_CONNECT, MESH, NetworkKey
@@ -203,7 +203,11 @@ def test_a_roster_that_cannot_be_read_says_so(store: Sightings, enrolled: Enroll
     assert "sightings.db" in problems[0] and "enrolled" in problems[1]
 
 
-def test_made_up_names_displace_no_row_of_a_bounded_list(store: Sightings, enrolled: EnrolledKeys) -> None:
+def test_made_up_names_displace_no_row_of_a_bounded_list(
+    store: Sightings, enrolled: EnrolledKeys, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Ten thousand rows are read when a busy machine lets them.
+    monkeypatch.setattr(sightings, "READ_S", 20.0)
     enrolled.enroll({"arm-1": ARM}, network=HERE)
     store.note(HERE, "heard-first", stoppable=True)
     store.flush(5.0)

@@ -42,19 +42,24 @@ def site(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Ite
 
 def test_healthy_robots_of_a_killed_holder_halt_in_time_beside_forty_that_hang(site: Site) -> None:
     assert site.holder.ask("move", site.names, TTL_S) == ["success"] * len(site.names)
+    due = leases_end(site.robots)
     site.robots.ask("hang")
     site.holder.kill()
-    late = lateness(site.robots)
+    late = lateness(site.robots, due)
     assert all(0.0 <= each <= LATE_S for each in late.values()), late
 
 
-def lateness(robots: Child) -> dict[str, float]:
+def leases_end(robots: Child) -> dict[str, float]:
+    """Return when the leases end that robots know of now."""
+    return {name: at for name, at in robots.ask("due").items() if at is not None}
+
+
+def lateness(robots: Child, due: dict[str, float]) -> dict[str, float]:
     """Return by healthy robot the seconds from the end of its lease to its standstill."""
-    due: dict[str, float] = {}
 
     def halted() -> dict[str, float]:
         # A renewal that was under way at the kill may still arrive.
-        due.update({name: at for name, at in robots.ask("due").items() if at is not None})
+        due.update(leases_end(robots))
         still = robots.ask("still")
         return {name: still[name] - due[name] for name in HEALTHY} if all(still[name] for name in HEALTHY) else {}
 
