@@ -223,8 +223,9 @@ def adapt(robot: Any, joints: JointReader | None = None) -> TaskRobot:
     if isinstance(robot, TaskRobot):
         return robot
     missing = [verb for verb in _TASK_VERBS if not callable(getattr(robot, verb, None))]
-    # What a robot with verbs of its own lacks is bridged: it may have no tasks at all.
-    if missing and not declared_verbs(robot):
+    # What a robot with verbs of its own lacks is bridged: it may have no tasks at all, and none that no stop ends.
+    endless = "start_task" not in missing and not stops_motions(robot)
+    if missing and (endless or not declared_verbs(robot)):
         shapes = "; ".join(f"{verb}{_TASK_VERBS[verb]}" for verb in missing)
         raise ValidationError(
             f"robot must have {', '.join(_TASK_VERBS)}, or verbs of its own declared by @verb; {shown(robot)} lacks "
@@ -423,19 +424,16 @@ class AdaptedRobot:
     def halt_here(self, reason: str, deadline: float) -> StopVerdict | PendingVerdict:
         """Ask everything to stop, and leave the answers and the status to be read."""
         self.gate.revoke()
-        if not stops_motions(self.wrapped):
-            # Its verbs return when their permits are void; the stop executor waits for them.
-            return StopVerdict()
         with self._shared.calling():
             own = getattr(self.wrapped, "halt", None)
             if callable(own):
                 answers = {self.tool_name_str: _answer(lambda: own(reason))}
             else:
-                answers = {"task": _answer(self.wrapped.stop_task)}
-                teleop = getattr(self.wrapped, "stop_teleoperate", None)
-                if callable(teleop):
-                    answers["teleoperation"] = _answer(teleop)
-        return _StatusAfter(self, answers)
+                parts = {"task": "stop_task", "teleoperation": "stop_teleoperate"}
+                stops = {name: getattr(self.wrapped, verb, None) for name, verb in parts.items()}
+                answers = {name: _answer(stop) for name, stop in stops.items() if callable(stop)}
+        # Where there is none, its verbs return when their permits are void, which the stop executor waits for.
+        return _StatusAfter(self, answers) if answers else StopVerdict()
 
     def _refresh(self, status: str) -> str:
         """Read the joints unless a call is disturbed; else return the reason."""

@@ -24,6 +24,9 @@ DISTRIBUTION = "strands-robots-edge"
 DURATION_MAX_S = 3600.0
 """Longest task, drive, goal or teleoperation, in seconds."""
 
+START_S = 10.0
+"""Seconds in which a robot has to have started a motion; after that what it may still start is void."""
+
 WAIT_S = 25.0
 """Longest time for which an answer waits for the end of a motion; the networks wait for 30 s."""
 

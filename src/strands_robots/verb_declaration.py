@@ -36,15 +36,12 @@ from typing import Any, TypeVar, get_type_hints, overload
 
 from strands_robots.safety.gate import Permit
 from strands_robots.safety.kept_gates import gate_of
-from strands_robots.utils import DURATION_MAX_S, ValidationError, flag, number, plain_text, shown, text
+from strands_robots.utils import DURATION_MAX_S, START_S, ValidationError, flag, number, plain_text, shown, text
 from strands_robots.verb_parameters import Domain, VerbParameter, is_permit, parameter_of
 
 __all__ = ["DeclaredVerb", "Domain", "Permit", "declared_verbs", "verb"]
 
 F = TypeVar("F", bound=Callable[..., Any])
-
-START_S = 10.0
-"""Seconds that every motion has to return; a lasting one has its own besides."""
 
 NAME_MAX = 64
 SUMMARY_MAX = 600

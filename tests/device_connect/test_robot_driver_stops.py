@@ -62,7 +62,7 @@ async def test_a_stop_is_answered_while_motion_and_reads_block(robot: ToyRobot) 
 
 
 async def test_a_motion_that_is_not_started_in_time_is_void(robot: ToyRobot, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(base_driver, "START_DEADLINE_S", 0.1)
+    monkeypatch.setattr(base_driver, "START_S", 0.1)
     let_go = threading.Event()
     robot.before["start_task"] = let_go.wait
     async with DriverBench(drive(robot)) as bench:
@@ -77,7 +77,7 @@ async def test_a_motion_that_is_not_started_in_time_is_void(robot: ToyRobot, mon
 async def test_a_motion_that_is_not_started_in_time_takes_nothing_else_with_it(
     robot: ToyRobot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(base_driver, "START_DEADLINE_S", 0.1)
+    monkeypatch.setattr(base_driver, "START_S", 0.1)
     let_go, moving = threading.Event(), robot.gate.permit("a local motion")
     robot.before["start_task"] = let_go.wait
     async with DriverBench(drive(robot)) as bench:

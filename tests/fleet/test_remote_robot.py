@@ -21,7 +21,9 @@ from strands_robots.envelope import error, success
 from strands_robots.errors import RefusalError
 from strands_robots.fleet import event_feed
 from strands_robots.fleet.adapter import FoundRobot, RobotEvent
+from strands_robots.fleet.description import python_name
 from strands_robots.fleet.remote_robot import RemoteRobot
+from strands_robots.serving.own_verbs import MEMBERS, STOPS
 from strands_robots.utils import WAIT_S, ValidationError
 
 
@@ -370,3 +372,8 @@ class TestEventsAndPictures:
         network.answers["getPicture"] = lambda arguments: success("", jpeg=jpeg)
         with pytest.raises(errors.RobotError, match="no picture"):
             arm.picture()
+
+
+def test_no_verb_of_a_robots_own_has_the_name_of_a_member() -> None:
+    members = {name for name in dir(RemoteRobot) if not name.startswith("_")}
+    assert members <= {python_name(name) for name in MEMBERS | STOPS}

@@ -15,8 +15,10 @@ from strands_robots import Permit, verb
 from strands_robots.contract import adapt
 from strands_robots.hardware import HardwareRobot
 from strands_robots.safety.gate import MotionGate, MotionRefused
+from strands_robots.safety.halted_verbs import void_calls
 from strands_robots.safety.stop_executor import stop_executor
 from strands_robots.safety.stopping import PendingVerdict, StopVerdict
+from strands_robots.utils import ValidationError
 
 
 class Waving(HardwareRobot):
@@ -288,3 +290,38 @@ def test_verb_of_an_arm_that_halts_it_does_not_wait_for_itself() -> None:
         felt = arm.feel()
     assert felt["stopped"] is True
     assert felt["took_s"] < 20.0
+
+
+def test_robot_whose_tasks_no_stop_would_end_is_refused_though_it_has_verbs() -> None:
+    class Endless(Barista):
+        def start_task(self, instruction: str, **options: Any) -> dict[str, Any]:
+            return {"status": "success"}
+
+    with pytest.raises(ValidationError, match="lacks stop_task"):
+        adapt(Endless())
+
+
+def test_teleoperation_of_a_robot_without_tasks_is_stopped_as_well(patient_halts: None) -> None:
+    class Led(Barista):
+        def stop_teleoperate(self) -> dict[str, Any]:
+            return {"status": "error", "reason": "the leader hangs"}
+
+    verdict = stop_executor().halt(adapt(Led()), "led", "stop")
+    assert verdict.stopped is False
+    assert "the leader hangs" in verdict.not_stopped["teleoperation"]
+
+
+def test_no_attribute_of_a_robot_is_asked_before_its_halt() -> None:
+    asked: list[str] = []
+
+    class Watched(Holds):
+        gate = MotionGate()
+
+        def __getattribute__(self, name: str) -> Any:
+            asked.append(name)
+            return super().__getattribute__(name)
+
+    robot = Watched()
+    asked.clear()
+    assert void_calls(robot) == ()
+    assert asked == []

@@ -52,14 +52,11 @@ from strands_robots.serving.verb_schema import described, labels_of, text_of
 from strands_robots.serving.verbs import REQUIRED, Arguments, Kind, Verb
 from strands_robots.serving.workers import ShareFullError, called, loop_future
 from strands_robots.serving.world_stops import stop_within
-from strands_robots.utils import WAIT_S, ValidationError, shown, text
+from strands_robots.utils import START_S, WAIT_S, ValidationError, shown, text
 
 logger = stop_logger(__name__)
 
 T = TypeVar("T")
-
-START_DEADLINE_S = 10.0
-"""Seconds in which a robot has to have started a motion; after that the motion is void."""
 
 READ_DEADLINE_S = 5.0
 """Seconds in which a robot has to have answered a read."""
@@ -223,9 +220,7 @@ class RobotDriver(CollectedOnce):
         try:
             self.pipeline.share(verb).submit(partial(self.pipeline.serve, command, hand_over))
             # Not wait_for: in Python 3.11 it forgets a cancellation that comes together with the answer.
-            within_s = (START_DEADLINE_S if moves else READ_DEADLINE_S) + (
-                verb.lasts_s or WAIT_S if verb.lasts else 0.0
-            )
+            within_s = (START_S if moves else READ_DEADLINE_S) + (verb.lasts_s or WAIT_S if verb.lasts else 0.0)
             async with asyncio.timeout(within_s):
                 result: Result = await answered
         except ShareFullError:

@@ -27,16 +27,13 @@ from strands_robots.fleet.side_by_side import side_by_side
 from strands_robots.safety.stopping import StopVerdict, graded
 from strands_robots.serving.advertised import AdvertisedVerb, RobotDescription
 from strands_robots.serving.verbs import LEASE_ID
-from strands_robots.utils import DURATION_MAX_S, WAIT_S, near, number, optional_module, plain_text, text
+from strands_robots.utils import DURATION_MAX_S, START_S, WAIT_S, near, number, optional_module, plain_text, text
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
 logger = logging.getLogger(__name__)
-
-CALL_S = 10.0
-"""Seconds in which a robot has to have started a motion or answered a read; it gives up itself by then."""
 
 PIXELS_MAX = 4096 * 4096
 HALTED_MAX = 64
@@ -522,11 +519,11 @@ def _stopped(robot: str, network: NetworkAdapter, robot_name: str = "") -> objec
 def _patience(verb: AdvertisedVerb | None, arguments: Mapping[str, Any]) -> float:
     """Return the seconds in which a verb has to answer."""
     if verb is None:
-        return CALL_S
+        return START_S
     lasts, duration, waits = verb.lasts_s, arguments.get("duration"), verb.name == "wait" or "wait" in verb.by_name
     if lasts and isinstance(duration, int | float) and 0 < duration <= DURATION_MAX_S:
         lasts = max(lasts, float(duration))
-    return CALL_S + (WAIT_S if waits else 0.0) + lasts
+    return START_S + (WAIT_S if waits else 0.0) + lasts
 
 
 def _named(verb: str, positional: Sequence[str], values: Sequence[Any], arguments: Mapping[str, Any]) -> dict[str, Any]:

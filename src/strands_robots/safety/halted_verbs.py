@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import replace
+from typing import cast
 
 from strands_robots.safety.gate import MotionGate
 from strands_robots.safety.kept_gates import kept_gate
@@ -75,12 +76,13 @@ def under_way_of(target: object) -> VerbsUnderWay | None:
 
     No code of the robot's own is run: it may hang, and a stop follows.
     """
-    robot = target.stopped_robot() if isinstance(target, StopOfRobot) else target
+    # By its type: isinstance may ask a robot for its __class__.
+    robot = cast(StopOfRobot, target).stopped_robot() if issubclass(type(target), StopOfRobot) else target
     try:
         gate = object.__getattribute__(robot, "__dict__").get("gate")
     except AttributeError:
         gate = None
-    known = gate if isinstance(gate, MotionGate) else kept_gate(robot)
+    known = cast(MotionGate, gate) if issubclass(type(gate), MotionGate) else kept_gate(robot)
     return None if known is None else known.under_way
 
 

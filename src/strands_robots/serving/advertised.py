@@ -18,6 +18,7 @@ from types import MappingProxyType
 from typing import Any, Literal, TypeAlias, TypeVar
 
 from strands_robots.errors import StrandsRobotsError
+from strands_robots.serving.known_verbs import STOPS
 from strands_robots.serving.verbs import LEASE_NAMES
 from strands_robots.utils import DURATION_MAX_S, ValidationError, number, plain_text, shown, whole
 from strands_robots.verb_parameters import JSON_TYPES, UNIT_MAX
@@ -42,7 +43,6 @@ NODE = 8
 WHOLE_MAX = 2**63
 """Bound of a whole number; Python takes the square of the digits' number to write one."""
 
-STOPS = ("stop", "stopMotion")
 
 T = TypeVar("T")
 Scalar: TypeAlias = str | int | float | bool
