@@ -7,8 +7,10 @@ types. Booleans are not numbers, and NaN is not a number.
 
 from __future__ import annotations
 
+import getpass
 import ipaddress
 import math
+import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from importlib import import_module
@@ -339,3 +341,11 @@ def _domain(kind: str, low: float | None, high: float | None, above: float | Non
     if low is not None:
         return f"{kind} of at least {low:g}"
     return f"{kind} of at most {high:g}" if high is not None else kind
+
+
+def operator() -> str:
+    """Return the login name of the operator at this machine."""
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):
+        return f"uid {os.getuid()}"

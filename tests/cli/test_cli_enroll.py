@@ -12,13 +12,14 @@ from tests.cli.test_cli_safety_controller import FakeController, drawn
 
 from strands_robots.audit import read_audit_log
 from strands_robots.cli.output import Exit
-from strands_robots.cli.resume import LockoutReport, operator
-from strands_robots.cli.safety_controller import FleetScreen, StopButton
+from strands_robots.cli.safety_controller import FleetScreen
 from strands_robots.cli.stop_report import exit_code, report_rows, style_of, summary
 from strands_robots.device_connect.backends import loopback_config
 from strands_robots.device_connect.client import Peer
 from strands_robots.device_connect.enrollment import network_of
 from strands_robots.envelope import Envelope, success
+from strands_robots.fleet.lockout_report import LockoutReport
+from strands_robots.fleet.stop_button import StopButton
 from strands_robots.safety import statements
 from strands_robots.safety.answers import Answer
 from strands_robots.safety.consoles import enrolled_consoles
@@ -26,6 +27,7 @@ from strands_robots.safety.controller import StopReport
 from strands_robots.safety.ed25519 import keygen
 from strands_robots.safety.identity import ROBOTS, EnrolledKeys, KeyFile, SigningIdentity, fingerprint
 from strands_robots.safety.statements import Proof, Purpose, signed
+from strands_robots.utils import operator
 
 STRONG = "Plenty of 4 different words"
 EPOCH = "a" * 32

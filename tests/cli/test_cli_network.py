@@ -6,8 +6,9 @@ import pytest
 from fixtures.waiting import free_port
 from tests.cli.conftest import Run
 
-from strands_robots.cli.network import Network, describe
+from strands_robots.cli.network import Network
 from strands_robots.cli.output import CliError, Exit
+from strands_robots.fleet.link_flags import described
 from strands_robots.utils import MissingExtraError
 
 
@@ -16,7 +17,7 @@ def test_without_flags_everything_stays_on_this_machine(monkeypatch: pytest.Monk
     link = Network().link()
     assert link.loopback_only
     assert link.meet_port == 7555
-    assert "127.0.0.1:7555" in describe(link)
+    assert "127.0.0.1:7555" in described(link)
 
 
 def test_flag_outranks_the_network_of_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,10 +12,12 @@ from fixtures.waiting import eventually
 from rich.console import Console
 
 from strands_robots.cli import safety_controller
-from strands_robots.cli.lockout_report import LockoutReport
-from strands_robots.cli.safety_controller import FleetScreen, StopButton
+from strands_robots.cli.safety_controller import FleetScreen
 from strands_robots.cli.stop_report import style_of
 from strands_robots.device_connect.backends import loopback_config
+from strands_robots.fleet import stop_button, watched_robots
+from strands_robots.fleet.lockout_report import LockoutReport
+from strands_robots.fleet.stop_button import StopButton
 from strands_robots.safety.answers import Answer
 from strands_robots.safety.controller import Progress, StopReport
 from strands_robots.safety.lockout import Lockout
@@ -73,7 +75,7 @@ def test_press_stops_the_robots_known_at_that_moment(controller: FakeController)
 
 
 def test_key_held_down_is_one_stop(controller: FakeController, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(safety_controller, "KEY_REPEAT_S", 60.0)
+    monkeypatch.setattr(stop_button, "KEY_REPEAT_S", 60.0)
     button = made(controller)
     controller.answer.clear()
     for _ in range(50):
@@ -87,7 +89,7 @@ def test_key_held_down_is_one_stop(controller: FakeController, monkeypatch: pyte
 
 
 def test_later_press_is_a_stop_of_its_own(controller: FakeController, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(safety_controller, "KEY_REPEAT_S", 0.0)
+    monkeypatch.setattr(stop_button, "KEY_REPEAT_S", 0.0)
     button = made(controller)
     controller.answer.clear()
     button.press()
@@ -189,7 +191,7 @@ def test_screen_shows_lockouts_check_ins_and_gone_robots(monkeypatch: pytest.Mon
 
 
 def test_robots_that_beat_are_asked_in_turn_and_all_others_at_each_look(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(safety_controller, "ASKED_MOST", 3)
+    monkeypatch.setattr(watched_robots, "ASKED_MOST", 3)
     fake: Any = FakeController()
     fleet, now = FleetScreen(fake, loopback_config(), None), time.monotonic()
     names = [f"arm-{number}" for number in range(10)]
@@ -217,7 +219,8 @@ def calm_fleet(monkeypatch: pytest.MonkeyPatch, robots: int) -> tuple[FleetScree
     """Return a screen of robots that have answered, beat, and are asked three at a look."""
     clock, fake = Turning(), FakeController()
     monkeypatch.setattr(safety_controller, "time", clock)
-    monkeypatch.setattr(safety_controller, "ASKED_MOST", 3)
+    monkeypatch.setattr(watched_robots, "time", clock)
+    monkeypatch.setattr(watched_robots, "ASKED_MOST", 3)
     names = [f"arm-{number}" for number in range(robots)]
     fleet = FleetScreen(fake, loopback_config(), None)  # type: ignore[arg-type]
     fleet.take_beats(dict.fromkeys(names, 1e9))

@@ -9,10 +9,11 @@ import pytest
 from fixtures.waiting import eventually
 from tests.cli.conftest import Run
 
-from strands_robots.cli.lockout_report import LockoutReport
 from strands_robots.cli.output import Exit
-from strands_robots.cli.safety_controller import FleetScreen, StopButton, StopButtons
+from strands_robots.cli.safety_controller import FleetScreen
 from strands_robots.cli.stop_report import exit_code
+from strands_robots.fleet.lockout_report import LockoutReport
+from strands_robots.fleet.stop_button import StopButton, StopButtons
 from strands_robots.safety.answers import Answer
 from strands_robots.safety.controller import Progress, StopReport
 from strands_robots.safety.identity import EnrolledKeys

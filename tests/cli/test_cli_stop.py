@@ -17,7 +17,6 @@ from strands_robots import device_connect
 from strands_robots.audit import read_audit_log
 from strands_robots.cli.network import Network
 from strands_robots.cli.output import Exit, Screen
-from strands_robots.cli.running_stop import RunningStop
 from strands_robots.cli.stop import show_resume
 from strands_robots.cli.stop_report import exit_code, progress_rows, report_rows, summary
 from strands_robots.device_connect import safety_controller
@@ -25,11 +24,13 @@ from strands_robots.device_connect.backends import loopback_config
 from strands_robots.device_connect.discovery import Peer, RegistryError
 from strands_robots.device_connect.enrollment import network_of
 from strands_robots.envelope import Envelope, error, success
+from strands_robots.fleet.device_connect.stops import devices_on, network_key
+from strands_robots.fleet.emergency_stop import EmergencyStop
+from strands_robots.fleet.stop_answers import stop_outcome
 from strands_robots.safety.answers import Answer
 from strands_robots.safety.controller import Progress, StopReport
 from strands_robots.safety.sightings import sightings
 from strands_robots.safety.silence import Sending
-from strands_robots.tools.roster_verdict import stop_outcome
 
 
 def answer(name: str, stopped: bool | None = True, ms: float = 3.0, why: str = "") -> Answer:
@@ -398,7 +399,8 @@ def test_stop_that_raises_at_once_leaves_no_lookup_behind(monkeypatch: pytest.Mo
 
     lookup = Lookup()
     monkeypatch.setattr(device_connect, "FleetClient", lookup)
-    running = RunningStop(Broken(report()), [], "", 3.0, loopback_config())  # type: ignore[arg-type]
+    link = loopback_config()
+    running = EmergencyStop(Broken(report()), network_key(link), "", 3.0, devices=devices_on(link, 3.0))  # type: ignore[arg-type]
     with pytest.raises(OSError, match="Too many open files"):
         running.report.result(20)
     assert lookup.left.wait(20)

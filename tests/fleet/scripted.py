@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.errors import NoSuchRobotError, UnknownVerbError, UnreachableError
 from strands_robots.fleet.adapter import DEVICE_CONNECT, FIND_S, STOP_S, FoundRobot, OnEvent
+from strands_robots.fleet.lockout_report import LockoutReport, Resumed
+from strands_robots.fleet.stop_answers import measured
 from strands_robots.safety.identity import SigningIdentity
+from strands_robots.safety.lockout import Lockout
+from strands_robots.safety.network_key import NetworkKey
+from strands_robots.safety.scope import EVERY_ROBOT, Scope
+from strands_robots.safety.silence import Sending
 from strands_robots.safety.statements import Purpose, signed
+from strands_robots.safety.stop_roster import StopOutcome, StopRoster
 
 Answer = Callable[[Mapping[str, Any]], Envelope]
 
@@ -58,6 +65,9 @@ class ScriptedNetwork:
         self.joined = False
         self.sessions = 0
         self.enrolled: dict[str, bytes] = {}
+        self.estops: list[tuple[str, Scope, str]] = []
+        self.locked: dict[str, str] = {}
+        self.silent: list[str] = []
 
     def open(self) -> None:
         if self.unreachable:
@@ -110,8 +120,59 @@ class ScriptedNetwork:
             raise self.stops
         return self.stops
 
-    def stop_all(self, timeout: float = STOP_S) -> dict[str, Envelope]:
-        return {name: self.stop(name) or error("none") for name in self.robots}
+    @property
+    def key(self) -> NetworkKey:
+        return NetworkKey.of(self.name, ["scripted"])
+
+    @property
+    def reach(self) -> str:
+        return "They were looked for in a script."
+
+    @property
+    def stale(self) -> str:
+        return ""
+
+    def stop_all(self, timeout: float = STOP_S) -> tuple[dict[str, Envelope], StopOutcome]:
+        answers = {name: self.stop(name) or error("none") for name in self.robots}
+        return answers, measured(answers, self._roster(), Sending())
+
+    def emergency_stop(
+        self, reason: str, *, scope: Scope = EVERY_ROBOT, signing_key: Any = None, estop_id: str = ""
+    ) -> StopOutcome:
+        self.estops.append((reason, scope, estop_id))
+        if self.unreachable:
+            raise UnreachableError(self.unreachable)
+        answers = {name: self.stop(name) or error("none") for name in self.robots if scope.covers(name, frozenset())}
+        self.locked |= dict.fromkeys(answers, estop_id)
+        return measured(answers, self._roster(), Sending(), estop_id)
+
+    def _roster(self) -> StopRoster:
+        roster = StopRoster(self.key)
+        roster.find(dict.fromkeys((*self.robots, *self.silent), True))
+        roster.read()
+        return roster
+
+    def standing(self, signing_key: Any, known: Any) -> Any:
+        raise NotImplementedError
+
+    def beats(self, robots: Iterable[str]) -> Mapping[str, float | None]:
+        return dict.fromkeys(robots)
+
+    def lockable(self, timeout: float = FIND_S) -> list[str]:
+        if self.unreachable:
+            raise UnreachableError(self.unreachable)
+        return list(self.robots)
+
+    def lockouts(self, robots: Iterable[str], timeout: float, *, signed: bool = False) -> list[LockoutReport]:
+        return [
+            LockoutReport(name, (Lockout(self.locked[name], "desk", 1.0, ""),) if name in self.locked else ())
+            for name in robots
+        ]
+
+    def resume(self, reports: Sequence[LockoutReport], signer: Any, timeout: float) -> dict[str, Resumed]:
+        for each in reports:
+            self.locked.pop(each.name, None)
+        return {each.name: (True, "free") for each in reports}
 
     def subscribe(self, robot: str, on_event: OnEvent) -> Callable[[], None]:
         self.subscribers.append(on_event)

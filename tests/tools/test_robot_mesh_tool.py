@@ -15,6 +15,8 @@ from fixtures.waiting import eventually
 
 from strands_robots.device_connect.discovery import Peer
 from strands_robots.envelope import Envelope, error, success
+from strands_robots.fleet.mesh.standing import mesh_network
+from strands_robots.fleet.stop_answers import combined_verdict
 from strands_robots.mesh import init_mesh, safety
 from strands_robots.mesh.session import clear_peers
 from strands_robots.mesh.transport import zenoh_config
@@ -23,9 +25,7 @@ from strands_robots.safety import stop_roster
 from strands_robots.safety.roster import Roster
 from strands_robots.serving.advertised import AdvertisedVerb, find_verb
 from strands_robots.tools import networks, robot_mesh
-from strands_robots.tools.mesh_roster import mesh_network
 from strands_robots.tools.networks import DeviceConnect, NativeMesh, joined_mesh
-from strands_robots.tools.roster_verdict import combined_verdict
 
 
 class FakeNetwork:

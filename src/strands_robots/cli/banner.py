@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from strands_robots import settings
-from strands_robots.cli.network import SOURCE, describe
+from strands_robots.cli.network import SOURCE
 from strands_robots.cli.output import Screen
+from strands_robots.fleet.link_flags import described
 from strands_robots.safety.approval import listed
 from strands_robots.safety.authorization import motion_refusal
 from strands_robots.utils import redacted
@@ -51,7 +52,7 @@ def show_banner(screen: Screen, served: ServedRobot, lacking: Sequence[str]) -> 
     link = served.link
     for each in lacking:
         screen.say(f"NOT READY. {each}", "bold red")
-    screen.say(f"{served.peer_id}. {describe(link)}", "bold red" if lacking else "bold green")
+    screen.say(f"{served.peer_id}. {described(link)}", "bold red" if lacking else "bold green")
     if link.loopback_only and not link.authenticated:
         screen.say(EVERY_PROGRAM_HERE)
     named = {"Tenant": "" if link.tenant == "default" else link.tenant, "Cell": settings.raw("STRANDS_CELL")}

@@ -15,7 +15,8 @@ import typer
 
 from strands_robots.cli.network import Network
 from strands_robots.cli.output import CliError, Exit, Screen
-from strands_robots.utils import MissingExtraError, ValidationError, shown
+from strands_robots.errors import StrandsRobotsError
+from strands_robots.utils import ValidationError, shown
 
 Body = TypeVar("Body", bound=Callable[..., None])
 
@@ -150,10 +151,7 @@ def _exit_code(screen: Screen, body: Callable[[], None]) -> Exit:
     except ValidationError as refused:
         screen.fail(CliError(str(refused), Exit.USAGE))
         return Exit.USAGE
-    except (MissingExtraError, ConnectionError) as missing:
-        screen.fail(CliError(str(missing)))
-        return Exit.REFUSED
-    except OSError as failed:
+    except (StrandsRobotsError, OSError) as failed:
         screen.fail(CliError(str(failed)))
         return Exit.REFUSED
     except KeyboardInterrupt:

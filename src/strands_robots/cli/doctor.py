@@ -18,10 +18,11 @@ import typer
 
 from strands_robots import __version__, settings
 from strands_robots.cli.command import command
-from strands_robots.cli.network import Network, describe
+from strands_robots.cli.network import Network
 from strands_robots.cli.output import CliError, Screen, label, table
 from strands_robots.cli.owners import IMPORT_PACKAGE, other_owners, owner_remedy
 from strands_robots.cli.readiness import LOOPBACK, dial_problem, listen_problem, port_holder
+from strands_robots.fleet.link_flags import described
 from strands_robots.safety.approval import state_dir
 from strands_robots.safety.identity import robots_here
 from strands_robots.safety.orders import ALLOW, REQUIRE_SIGNED, StopRules
@@ -169,7 +170,7 @@ def _link_of(network: Network) -> tuple[LinkConfig | None, list[Finding]]:
         return None, [Finding("network", Mark.BROKEN, said, str(exc))]
     proven = link.authenticated or link.loopback_only
     remedy = "" if proven else "give certificates or credentials; without them everybody there can drive the robots"
-    return link, [Finding("network", Mark.OK if proven else Mark.WARN, describe(link), remedy)]
+    return link, [Finding("network", Mark.OK if proven else Mark.WARN, described(link), remedy)]
 
 
 def _dialled(link: LinkConfig) -> Iterator[Finding]:

@@ -2,29 +2,24 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from typing import Annotated, Any
 
 import typer
 
-from strands_robots.audit import log_safety_event
 from strands_robots.cli.output import CliError, Exit, Screen, label, plain, table
-from strands_robots.cli.resume import operator
+from strands_robots.errors import NoSuchRobotError
+from strands_robots.fleet.enrollment import FORGET, change_enrolment, enrolled_robots, served_here
 from strands_robots.safety.identity import (
     OFF,
     RETIRED,
-    EnrolledKeys,
     EnrolledRobot,
-    Exemption,
     KeyFileError,
     fingerprint,
-    local_name,
 )
 from strands_robots.safety.lockout import utc
-from strands_robots.safety.sightings import sightings
 from strands_robots.safety.silence import described
-from strands_robots.utils import shown, text
+from strands_robots.utils import operator, text
 
 REASON_MAX = 200
 
@@ -55,13 +50,13 @@ def change_of(*, retire: str, off: str, forget: str, reason: str) -> Change | No
     """
     stated = [
         Change(action, text(flag, name, longest=256), reason)
-        for action, flag, name in ((RETIRED, "--retire", retire), (OFF, "--off", off), ("forget", "--forget", forget))
+        for action, flag, name in ((RETIRED, "--retire", retire), (OFF, "--off", off), (FORGET, "--forget", forget))
         if name
     ]
     if len(stated) > 1:
         raise CliError("--retire, --off and --forget are one at a time.", Exit.USAGE)
     text("--reason", reason, longest=REASON_MAX, empty=True)
-    if reason and (not stated or stated[0].action == "forget"):
+    if reason and (not stated or stated[0].action == FORGET):
         raise CliError("--reason goes with --retire or --off.", Exit.USAGE)
     return stated[0] if stated else None
 
@@ -72,28 +67,19 @@ def apply(screen: Screen, change: Change, tenant: str) -> None:
     Raises:
         CliError: it is not enrolled, or the file cannot be used.
     """
-    file, who = EnrolledKeys(), operator()
+    who = operator()
     try:
-        known = file.robots()
-        own = local_name(tenant, change.name)
-        name = own if own in known else change.name
-        if name not in known:
-            there = f" Enrolled: {', '.join(sorted(known))}." if known else " No robot is enrolled."
-            raise CliError(plain(f"{shown(change.name)} is not enrolled.{there}", 2000), robots={})
-        if change.action == "forget":
-            file.forget(name)
-        else:
-            file.exempt(name, Exemption(change.action, who, change.reason, time.time()))
+        name = change_enrolment(change.name, change.action, change.reason, tenant=tenant)
+    except NoSuchRobotError as exc:
+        raise CliError(plain(str(exc), 2000), robots={}) from exc
     except (KeyFileError, OSError) as exc:
         raise CliError(f"Nothing was changed: {exc}") from exc
-    facts = {"who": who, "reason": change.reason, "fingerprint": fingerprint(known[name].key)}
-    log_safety_event(f"enrolment_{'forgotten' if change.action == 'forget' else change.action}", name, facts)
     screen.data({"status": "success", "robot": name, "action": change.action, "by": who, "reason": change.reason})
-    if change.action == "forget":
+    if change.action == FORGET:
         screen.say(f"{name} is not enrolled any more: its answers are not checked, and no stop waits for it by name.")
     else:
         screen.say(f"{name} is {change.action}: every stop prints that, and waits for it no more. {UNDONE}")
-        if any(each.alive and local_name(each.network.tenant, each.name) == name for each in sightings().read()[0]):
+        if served_here(name):
             screen.say(f"A process of this machine serves {name} now: until that ends, it must answer.", "yellow")
 
 
@@ -104,7 +90,7 @@ def show_enrolled(screen: Screen) -> None:
         CliError: the file cannot be used.
     """
     try:
-        robots = EnrolledKeys().robots()
+        robots = enrolled_robots()
     except (KeyFileError, OSError) as exc:
         raise CliError(f"The enrolled robots cannot be read: {exc}") from exc
     rows = ((name, _state(each), _networks(each), fingerprint(each.key)) for name, each in sorted(robots.items()))

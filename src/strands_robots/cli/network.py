@@ -20,6 +20,7 @@ from strands_robots.utils import ValidationError, near, port, redacted
 if TYPE_CHECKING:
     from strands_robots.device_connect import FleetClient
     from strands_robots.device_connect.backends import LinkConfig
+    from strands_robots.fleet.adapter import NetworkAdapter
     from strands_robots.mesh import Mesh
 
 NO_METHOD = -32601
@@ -97,6 +98,26 @@ class Network:
         except MessagingError as exc:
             raise CliError(f"The network does not carry this: {exc}", Exit.SILENT) from exc
 
+    @contextmanager
+    def joined(self, *, on_mesh: bool = False, source: str = SOURCE) -> Iterator[NetworkAdapter]:
+        """Join Device Connect, or the native mesh, for the length of the block.
+
+        Raises:
+            CliError: the network cannot be reached, fails in use, or takes no such flag.
+        """
+        with ExitStack() as stack:
+            if on_mesh:
+                from strands_robots.fleet.mesh.network import MeshNetwork  # noqa: PLC0415 - loaded when it is used
+
+                self.use_mesh()
+                mesh = stack.enter_context(mesh_peer(None, temporary_mesh_id("console"), "tool"))
+                network: NetworkAdapter = MeshNetwork.joined(mesh)
+            else:
+                from strands_robots.fleet.device_connect.network import DeviceConnectNetwork  # noqa: PLC0415 - as above
+
+                network = DeviceConnectNetwork.joined(stack.enter_context(self.fleet(source)))
+            yield network
+
     @property
     def stated_tenant(self) -> str:
         """The tenant of Device Connect, of the flag or the environment."""
@@ -125,19 +146,6 @@ class Network:
             raise CliError("--mesh takes no network flag but --port; docs/mesh.md has its settings.", Exit.USAGE)
         if self.port is not None:
             settings.put("STRANDS_MESH_PORT", str(port("--port", self.port)))
-
-
-def describe(link: LinkConfig) -> str:
-    """Describe in one sentence who can reach a robot over ``link``."""
-    proof = "both sides are authenticated" if link.authenticated else "neither side is authenticated"
-    if link.transport == "nats":
-        return f"NATS at {redacted(', '.join(link.connect)) or 'its default address'}; {proof}."
-    if link.meeting_point:
-        return f"This machine alone: {link.meeting_point}; nothing leaves 127.0.0.1."
-    ways = [f"connects to {', '.join(link.connect)}"] if link.connect else []
-    ways += [f"listens on {', '.join(link.listeners)}"] if link.listeners else []
-    ways += ["finds peers by multicast"] if link.uses_multicast else []
-    return f"Zenoh: {'; '.join(ways)}; {proof}."
 
 
 @contextmanager

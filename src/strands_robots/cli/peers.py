@@ -11,10 +11,11 @@ import typer
 from rich.text import Text
 
 from strands_robots.cli.command import OnMesh, Timeout, assignments, command
-from strands_robots.cli.network import SOURCE, Network, answering, call_device, describe
+from strands_robots.cli.network import SOURCE, Network, answering, call_device
 from strands_robots.cli.output import LATE_S, CliError, Exit, Screen, label, plain, readable, table
 from strands_robots.cli.readiness import other_user
 from strands_robots.envelope import is_error, text_of
+from strands_robots.fleet.link_flags import described
 from strands_robots.serving.known_verbs import QUICK, TEXTS, VERBS, WAITING
 from strands_robots.utils import WAIT_S, ValidationError, device_id, number
 
@@ -60,7 +61,7 @@ def peers(
         found = [peer for peer in found if peer.id == wanted]
     if not found:
         who = "No robot" if device is None else f"No {device!r}"
-        said = f"{who} answered. {describe(fleet.link)} {other_user(fleet.link)}".rstrip()
+        said = f"{who} answered. {described(fleet.link)} {other_user(fleet.link)}".rstrip()
         raise CliError(said, Exit.SILENT, peers=[], stale=fleet.stale)
     whose = other_user(fleet.link)
     screen.data({"status": "success", "peers": [_facts(peer) for peer in found], "stale": fleet.stale, "whose": whose})

@@ -19,12 +19,13 @@ import typer
 from strands_robots import settings
 from strands_robots.cli.banner import ServedRobot, show_banner
 from strands_robots.cli.command import OnMesh, assignments, command, parse_ports
-from strands_robots.cli.network import Network, describe, mesh_peer
+from strands_robots.cli.network import Network, mesh_peer
 from strands_robots.cli.output import CliError, Screen
 from strands_robots.cli.readiness import mesh_port_problem, mesh_problems, shortcomings
 from strands_robots.cli.record import record_robot
 from strands_robots.contract import adapt, put_away
 from strands_robots.envelope import text_of
+from strands_robots.fleet.link_flags import described
 from strands_robots.policies import warm_profiles
 from strands_robots.policies.base import SPEED_MAX
 from strands_robots.policies.profiles import load_profiles
@@ -281,7 +282,7 @@ def _announce(screen: Screen, peer_id: str, link: LinkConfig, driver: DeviceDriv
             "event": "serving",
             "peer_id": peer_id,
             "tenant": link.tenant,
-            "network": describe(link),
+            "network": described(link),
             "pid": os.getpid(),
             "functions": functions,
             "fingerprint": key,

@@ -13,10 +13,9 @@ import typer
 
 from strands_robots.cli.command import OnMesh, Timeout, command
 from strands_robots.cli.keys import PassphraseFile, operator_key, signing_key
-from strands_robots.cli.network import SOURCE, Network, describe, near_devices
+from strands_robots.cli.network import SOURCE, Network, near_devices
 from strands_robots.cli.output import POLL_S, CliError, Exit, Screen, captured_log, label, plain, table
 from strands_robots.cli.readiness import meeting_user
-from strands_robots.cli.running_stop import RunningStop
 from strands_robots.cli.stop_report import (
     LATE_MS,
     exit_code,
@@ -27,12 +26,18 @@ from strands_robots.cli.stop_report import (
     stop_table,
 )
 from strands_robots.envelope import Envelope, text_of
+from strands_robots.fleet.device_connect.stops import devices_on, network_key, silence_of, stop_found
+from strands_robots.fleet.emergency_stop import EmergencyStop
+from strands_robots.fleet.link_flags import described
+from strands_robots.fleet.stop_answers import OnOutcome, stop_outcome
 from strands_robots.safety.controller import DEADLINE_S, Progress
 from strands_robots.safety.stop_roster import StopOutcome
 from strands_robots.serving.stop_arguments import robot_of_world, stop_reason, stop_robot, stop_scope
-from strands_robots.tools.networks import NativeMesh, silence_of, stop_found
-from strands_robots.tools.roster_verdict import OnOutcome, stop_outcome
+from strands_robots.tools.networks import NativeMesh
 from strands_robots.utils import ValidationError, device_id, number
+
+LINK_WAIT_S = 2.0
+"""Longest wait for the connection, after which the deadline counts."""
 
 LOCKED = "They are locked until they are resumed:"
 LOCKED_THERE = "They are locked until they are resumed, at the machine of each robot:"
@@ -77,7 +82,7 @@ def stop(
     if device is None:
         with network.fleet() as fleet:
             answers, outcome = stop_found(fleet, seconds)
-        _report_all(screen, outcome, {"devices": _devices(answers, outcome)}, describe(fleet.link))
+        _report_all(screen, outcome, {"devices": _devices(answers, outcome)}, described(fleet.link))
         return
     with network.fleet() as fleet:
         stopped, said = stop_outcome(fleet.stop(device, seconds, name))
@@ -160,7 +165,16 @@ def estop(
 
     controller = safety_controller(source, link, signing_key=signer, require_signed=signer is not None)
     try:
-        running = RunningStop(controller, expected, reason, seconds, link, scope=scope)
+        running = EmergencyStop(
+            controller,
+            network_key(link),
+            reason,
+            seconds,
+            named=expected,
+            devices=None if expected else devices_on(link, seconds),
+            scope=scope,
+            link_wait_s=LINK_WAIT_S,
+        )
         if screen.live:
             outcome = _watch(screen, running)
         else:
@@ -179,7 +193,7 @@ def estop(
         screen.say(CLAIMED, "yellow")
     if report.link and report.silent and not (report.answered or outcome.others.answered):
         screen.say(KEPT_BY_NONE, "yellow")
-    _end(screen, outcome, _facts(outcome_envelope(outcome)), "" if report.link else describe(link))
+    _end(screen, outcome, _facts(outcome_envelope(outcome)), "" if report.link else described(link))
     if link.loopback_only:
         user = meeting_user(link)
         screen.say(LOCKED)
@@ -223,7 +237,7 @@ def show_resume(screen: Screen, key: Path | None, flags: str) -> None:
     screen.copyable(f"  strands-robots keys resume {shlex.quote(str(operator_key()))}")
 
 
-def _watch(screen: Screen, running: RunningStop) -> StopOutcome:
+def _watch(screen: Screen, running: EmergencyStop) -> StopOutcome:
     """Draw the answers as they come, and return the outcome."""
     from rich.live import Live  # noqa: PLC0415 - loaded when a screen is redrawn
 

@@ -18,6 +18,7 @@ from rich.text import Text
 from strands_robots.cli.command import Seconds, command
 from strands_robots.cli.network import Network, call_device
 from strands_robots.cli.output import LATE_S, CliError, Exit, Screen, label, plain
+from strands_robots.fleet.joint_features import Range, joint_limits
 from strands_robots.utils import number
 
 if TYPE_CHECKING:
@@ -46,7 +47,6 @@ JOINTS_MAX = 24
 NO_JOINTS = "It reports no joints: it has none, or sends them only while it moves."
 
 Frame = tuple[list["DeviceEvent"], float]
-Range = tuple[float, float]
 FULL_TURN: Range = (-math.pi, math.pi)
 """Range of the bar of a joint without limits, in radians."""
 
@@ -235,23 +235,6 @@ def print_changes(screen: Screen, device: str, now: str, events: Iterator[Device
         if task and task != last:
             screen.say(f"{event.device}: {task}")
             last = task
-
-
-def joint_limits(features: Mapping[str, Any]) -> dict[str, Range]:
-    """Return the joint limits in an answer to getFeatures; a world's first robot."""
-    robots = features.get("robots")
-    chosen: Any = features
-    if isinstance(robots, Mapping) and robots:
-        chosen = next(iter(robots.values()))
-    found: dict[str, Range] = {}
-    for key in ("joints", "ranges"):
-        joints = chosen.get(key) if isinstance(chosen, Mapping) else None
-        for name, limits in joints.items() if isinstance(joints, Mapping) else ():
-            pair = [value for value in limits if _finite(value)] if isinstance(limits, list | tuple) else []
-            if len(pair) == 2 and pair[0] < pair[1]:
-                # A real robot names the range of an action, such as pan.pos, and the position of the joint, pan.
-                found[str(name)] = found[str(name).removesuffix(".pos")] = (float(pair[0]), float(pair[1]))
-    return found
 
 
 def joint_bar(value: float, limits: Range = FULL_TURN) -> Text:

@@ -11,18 +11,22 @@ from typing import Any
 
 from device_connect_edge.messaging import MessagingError
 
-from strands_robots.cli.output import CliError
-from strands_robots.cli.resume import ask_robots, resume_robots, status_question, status_report
-from strands_robots.cli.watch import joint_limits
-from strands_robots.dashboard.feed import ASK_S, DEVICE_CONNECT, PARALLEL, LoopThread, joint_units, poll_interval
+from strands_robots.dashboard.feed import ASK_S, DEVICE_CONNECT, PARALLEL, LoopThread, poll_interval
 from strands_robots.dashboard.fleet_model import FleetModel, key_of
 from strands_robots.dashboard.verb_forms import forms_of
 from strands_robots.device_connect import FleetClient
 from strands_robots.device_connect.client import DeviceEvent
 from strands_robots.device_connect.discovery import Peer
-from strands_robots.device_connect.enrollment import enrolled_robots
 from strands_robots.device_connect.safety_controller import safety_controller, stand
 from strands_robots.envelope import Envelope, error, is_error
+from strands_robots.fleet.device_connect.lockouts import (
+    ask_robots,
+    enrolled_keys,
+    resume_robots,
+    status_question,
+    status_report,
+)
+from strands_robots.fleet.joint_features import joint_limits, joint_units
 from strands_robots.safety.identity import KeyFileError
 from strands_robots.utils import ValidationError
 
@@ -95,7 +99,7 @@ class DeviceConnectFeed:
         """Free robots with the operator's key; blocks, and returns each outcome."""
         try:
             return resume_robots(self._fleet, ask_robots(self._fleet, robots, seconds), signer, seconds)
-        except (CliError, MessagingError) as exc:
+        except (KeyFileError, MessagingError) as exc:
             return dict.fromkeys(robots, (False, str(exc)))
 
     def close(self) -> None:
@@ -204,11 +208,11 @@ class DeviceConnectFeed:
             return
         self._keys_at = now
         try:
-            self._keys, self._keys_usable = enrolled_robots(self._fleet.link), True
-        except (KeyFileError, OSError) as exc:
+            self._keys, self._keys_usable = enrolled_keys(self._fleet.link), True
+        except KeyFileError as exc:
             # Nothing can be proven, so no lockout state is shown as known.
             self._keys_usable = False
-            logger.critical("The enrolled keys cannot be used, so no answer counts as a robot's own: %s", exc)
+            logger.critical("No answer counts as a robot's own: %s", exc)
 
 
 def _task(facts: Mapping[str, Any]) -> dict[str, Any]:

@@ -6,16 +6,16 @@ import time
 from collections.abc import Callable, Collection, Iterable
 from typing import Any
 
-from strands_robots.cli.output import plain
-from strands_robots.cli.safety_controller import StopButton
 from strands_robots.dashboard.feed import FleetFeed
 from strands_robots.dashboard.fleet_model import FleetModel
+from strands_robots.fleet.stop_button import StopButton
 from strands_robots.safety.answers import Answer
 from strands_robots.safety.controller import UNCONFIRMED_S, Progress, StopReport
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.safety.statements import Proof
 from strands_robots.safety.stop_notes import stop_notes
 from strands_robots.safety.stop_roster import StopOutcome
+from strands_robots.utils import plain_text
 
 REASON = "STOP on the operator's page"
 NOTES_MAX = 16
@@ -193,7 +193,7 @@ def _roster(outcome: StopOutcome) -> dict[str, Any]:
     return {
         "ok": outcome.ok,
         "sentence": outcome.sentence,
-        "notes": [plain(each, 300) for each in stop_notes(outcome)[:NOTES_MAX]],
+        "notes": [plain_text(each, 300) for each in stop_notes(outcome)[:NOTES_MAX]],
     }
 
 

@@ -7,10 +7,8 @@ import threading
 from collections.abc import Mapping
 from typing import Any, Protocol
 
-from strands_robots.cli.mesh_controller import MeshController
-from strands_robots.dashboard.fleet_model import JOINTS_MAX
 from strands_robots.envelope import Envelope
-from strands_robots.safety.controller import SafetyController
+from strands_robots.fleet.stop_button import StopSender
 
 DEVICE_CONNECT, MESH = "dc", "mesh"
 
@@ -32,7 +30,7 @@ class FleetFeed(Protocol):
     network: str
 
     @property
-    def controller(self) -> SafetyController | MeshController:
+    def controller(self) -> StopSender:
         """The sender of its emergency stops."""
 
     async def call(self, robot: str, verb: str, params: Mapping[str, Any], seconds: float) -> Envelope:
@@ -72,20 +70,6 @@ class LoopThread:
         self.loop.call_soon_threadsafe(self.loop.stop)
         self._thread.join(5.0)
         self.loop.close()
-
-
-def joint_units(features: Mapping[str, Any]) -> dict[str, str]:
-    """Return the unit of each joint in an answer to getFeatures.
-
-    Of a world these are the first robot's.
-    """
-    robots = features.get("robots")
-    chosen: Any = next(iter(robots.values())) if isinstance(robots, Mapping) and robots else features
-    units = chosen.get("joint_units") if isinstance(chosen, Mapping) else None
-    named = list(units.items())[:JOINTS_MAX] if isinstance(units, Mapping) else []
-    found = {str(name): str(unit)[:40] for name, unit in named}
-    # A real robot names the unit of an action, such as pan.pos, and the position of the joint, pan.
-    return {**{name.removesuffix(".pos"): unit for name, unit in found.items()}, **found}
 
 
 def poll_interval(robots: int) -> float:

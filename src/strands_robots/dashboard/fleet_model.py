@@ -15,11 +15,12 @@ from dataclasses import dataclass, field
 from itertools import chain
 from typing import Any
 
-from strands_robots.cli.lockout_report import LockoutReport
-from strands_robots.cli.output import plain
 from strands_robots.dashboard.history import OVERLAP_S, WINDOW_S, History, plain_values
 from strands_robots.device_connect.telemetry import numbers
+from strands_robots.envelope import jsonable
+from strands_robots.fleet.lockout_report import LockoutReport
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
+from strands_robots.utils import plain_text
 
 ROBOTS_MAX = 2000
 """Rows; further names are not taken, so that invented ones use no memory."""
@@ -470,8 +471,8 @@ def _cut(value: object) -> Any:
     if value is None or isinstance(value, bool | int):
         return value
     if isinstance(value, float):
-        return round(value, 6) if abs(value) < 1e15 else plain(repr(value), TEXT_MAX)
-    return plain(value, TEXT_MAX)
+        return round(value, 6) if abs(value) < 1e15 else repr(value)
+    return plain_text(value if isinstance(value, str) else json.dumps(jsonable(value)), TEXT_MAX)
 
 
 def _control(facts: object) -> dict[str, Any]:

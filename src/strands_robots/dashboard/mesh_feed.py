@@ -9,17 +9,17 @@ from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-from strands_robots.cli.mesh_controller import MeshController
-from strands_robots.cli.resume_mesh import ask_peers, lockable_peers, resume_peers
-from strands_robots.cli.watch import joint_limits
-from strands_robots.dashboard.feed import ASK_S, MESH, PARALLEL, joint_units, poll_interval
+from strands_robots.dashboard.feed import ASK_S, MESH, PARALLEL, poll_interval
 from strands_robots.dashboard.fleet_model import FleetModel
 from strands_robots.dashboard.verb_forms import peer_forms
 from strands_robots.device_connect.telemetry import numbers
 from strands_robots.envelope import Envelope, error, is_error
+from strands_robots.fleet.joint_features import joint_limits, joint_units
+from strands_robots.fleet.mesh.controller import MeshController
+from strands_robots.fleet.mesh.lockouts import ask_peers, lockable_peers, resume_peers
+from strands_robots.fleet.mesh.standing import stand_on_mesh
 from strands_robots.mesh import Mesh
 from strands_robots.safety.stopping import explain, grade
-from strands_robots.tools.mesh_roster import stand_on_mesh
 
 LOOK_S = 0.25
 STOP_S = 2.0
@@ -85,10 +85,7 @@ class MeshFeed:
 
     def resume(self, robots: list[str], signer: Any, seconds: float) -> dict[str, tuple[bool, str]]:
         """Free robots with the operator's key; blocks, and returns each outcome."""
-        answers = ask_peers(self._mesh, robots, seconds)
-        silent = {each.name: (False, each.problem) for each in answers if each.problem}
-        locked = {each.name: each.lockouts for each in answers if not each.problem}
-        return resume_peers(self._mesh, locked, signer, seconds) | silent
+        return resume_peers(self._mesh, ask_peers(self._mesh, robots, seconds), signer, seconds)
 
     def close(self) -> None:
         """Leave the network."""

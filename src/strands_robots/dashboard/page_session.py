@@ -15,7 +15,6 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from strands_robots.arm_mixin import WAIT_S
 from strands_robots.bounded_json import json_object
-from strands_robots.cli.output import plain
 from strands_robots.dashboard.access import OPERATOR
 from strands_robots.dashboard.driving import HandControl
 from strands_robots.dashboard.feed import FleetFeed
@@ -28,7 +27,7 @@ from strands_robots.recording.cameras import OVERVIEW
 from strands_robots.safety.stopping import grade
 from strands_robots.safety.unheard import Unheard, unheard_now
 from strands_robots.serving.known_verbs import STOPS
-from strands_robots.utils import ValidationError, shown, text
+from strands_robots.utils import ValidationError, plain_text, shown, text
 
 logger = logging.getLogger(__name__)
 
@@ -380,7 +379,7 @@ class PageSession:
         locked = [name for name, each in outcomes.items() if not each["free"]]
         told: Envelope = {"status": "error" if locked else "success", "robots": outcomes}
         said = f"Not resumed: {', '.join(locked)}." if locked else "Resumed. They move again when they are told to."
-        said = " ".join([said, *(plain(str(each), 2000) for each in unheard if each)])
+        said = " ".join([said, *(plain_text(str(each)) for each in unheard if each)])
         names = [name for each in unheard for name in each.names]
         return {**told, "unheard": names, "content": [{"text": said}], **({"reason": said} if locked else {})}
 

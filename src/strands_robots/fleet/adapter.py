@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 from strands_robots.envelope import Envelope
+from strands_robots.fleet.lockout_report import LockoutReport, Resumed
+from strands_robots.fleet.stop_button import StopSender
+from strands_robots.safety.network_key import NetworkKey
+from strands_robots.safety.scope import EVERY_ROBOT, Scope
+from strands_robots.safety.stop_roster import StopOutcome
 
 DEVICE_CONNECT, MESH = "device_connect", "mesh"
 
@@ -43,7 +49,7 @@ OnEvent = Callable[[RobotEvent], None]
 
 
 class NetworkAdapter(Protocol):
-    """Robots of one network: find, describe, call and stop them, follow their events.
+    """Robots of one network: find, describe, call, stop and resume them, follow their events.
 
     Attributes:
         name: :data:`DEVICE_CONNECT` or :data:`MESH`.
@@ -93,8 +99,67 @@ class NetworkAdapter(Protocol):
         ``robot_name`` stops one robot of a world alone. No answer in time is an envelope with ``stopped`` None.
         """
 
-    def stop_all(self, timeout: float = STOP_S) -> dict[str, Envelope]:
-        """Stop every robot in reach; return the answers by id."""
+    @property
+    def key(self) -> NetworkKey:
+        """The name of this network, under which its robots are remembered."""
+
+    @property
+    def reach(self) -> str:
+        """Where robots are looked for, in one sentence."""
+
+    @property
+    def stale(self) -> str:
+        """Why there may be more robots than the last search found; empty where there are none."""
+
+    def stop_all(self, timeout: float = STOP_S) -> tuple[dict[str, Envelope], StopOutcome]:
+        """Stop every robot in reach, without a lockout; return the answers by id, and the outcome by the roster."""
+
+    def emergency_stop(
+        self, reason: str, *, scope: Scope = EVERY_ROBOT, signing_key: Any = None, estop_id: str = ""
+    ) -> StopOutcome:
+        """Stop and lock every robot, or those of ``scope``; return the outcome, which is recorded.
+
+        It leaves on a connection of its own where the network has one.
+
+        Args:
+            reason: sent to the robots.
+            scope: the robots that it is for. Where none of them is there, every robot is stopped.
+            signing_key: an Ed25519 key that signs it.
+            estop_id: 32 hex digits, the epoch of the lockout; a fresh one by default.
+        """
+
+    def standing(self, signing_key: Any, known: Callable[[], Collection[str]]) -> AbstractContextManager[StopSender]:
+        """Return a controller that stands for the block: it reports whom it misses after the stops of others.
+
+        It needs no :meth:`open` where its stops leave on a connection of their own.
+
+        Args:
+            signing_key: signs its stops and check-ins, or None.
+            known: returns the robots that it shows besides its roster.
+        """
+
+    def beats(self, robots: Iterable[str]) -> Mapping[str, float | None]:
+        """Return when each robot's last beat came, in monotonic seconds; None where it has none."""
+
+    def lockable(self, timeout: float = FIND_S) -> list[str]:
+        """Return the robots in reach that can be locked and resumed."""
+
+    def lockouts(self, robots: Iterable[str], timeout: float, *, signed: bool = False) -> list[LockoutReport]:
+        """Ask each robot for its lockouts, many at once.
+
+        An enrolled robot whose answer is not its own has a ``problem``.
+
+        Args:
+            robots: their ids.
+            timeout: seconds in which each has to answer.
+            signed: ask every robot to sign its answer, so that its key is known.
+
+        Raises:
+            KeyFileError: the enrolled keys cannot be used.
+        """
+
+    def resume(self, reports: Sequence[LockoutReport], signer: Any, timeout: float) -> dict[str, Resumed]:
+        """Clear every lockout of these reports with the operator's key; return each robot's outcome."""
 
     def subscribe(self, robot: str, on_event: OnEvent) -> Callable[[], None]:
         """Receive the robot's events; return the function that ends it."""

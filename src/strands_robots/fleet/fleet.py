@@ -6,15 +6,23 @@ import logging
 from collections.abc import Iterator, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 from strands_robots._mesh_switch import mesh_env_request
 from strands_robots.errors import NoSuchRobotError, RefusalError, UnreachableError
 from strands_robots.fleet.adapter import DEVICE_CONNECT, FIND_S, MESH, STOP_S, FoundRobot, NetworkAdapter
+from strands_robots.fleet.enrollment import Enrolment, enroll
+from strands_robots.fleet.fleet_stop import FleetStop, NetworkStop
 from strands_robots.fleet.link_flags import LinkFlags
-from strands_robots.fleet.remote_robot import RemoteRobot, combined, verdict_of_answer
+from strands_robots.fleet.lockout_report import LockoutReport, Resumed
+from strands_robots.fleet.remote_robot import RemoteRobot
 from strands_robots.fleet.side_by_side import side_by_side
-from strands_robots.safety.stopping import StopVerdict
+from strands_robots.fleet.stop_answers import measured
+from strands_robots.safety.orders import new_epoch
+from strands_robots.safety.silence import Sending
+from strands_robots.safety.stop_roster import StopRoster
+from strands_robots.safety.unheard import unheard_now
+from strands_robots.serving.stop_arguments import stop_reason, stop_scope
 from strands_robots.utils import DURATION_MAX_S, ValidationError, device_id, near, number, plain_text, shown
 
 logger = logging.getLogger(__name__)
@@ -72,7 +80,7 @@ def connect(
     flags = LinkFlags(_items(nats), _items(connect), _items(listen), multicast, port, tenant, insecure, **paths)
     networks: list[NetworkAdapter] = []
     if flags != LinkFlags() or find_spec("device_connect_edge") is not None:
-        from strands_robots.fleet.device_connect import DeviceConnectNetwork  # noqa: PLC0415 - loaded when it is used
+        from strands_robots.fleet.device_connect.network import DeviceConnectNetwork  # noqa: PLC0415 - loaded when it is used
 
         networks.append(DeviceConnectNetwork(flags.link(), source))
     else:
@@ -80,7 +88,7 @@ def connect(
     if mesh is False or mesh_env_request() is False:
         absent[MESH] = "it is switched off"
     else:
-        from strands_robots.fleet.mesh import MeshNetwork  # noqa: PLC0415 - as above
+        from strands_robots.fleet.mesh.network import MeshNetwork  # noqa: PLC0415 - as above
 
         networks.append(MeshNetwork(source))
     return Fleet(networks, absent)
@@ -185,17 +193,144 @@ class Fleet:
             if (kind is None or kind in (each.type, each.model)) and (network is None or network == each.network)
         ]
 
-    def stop(self) -> dict[str, StopVerdict]:
+    def stop(self) -> FleetStop:
         """Halt every robot in reach, without a lockout; return the verdicts by id.
 
-        A robot is stopped as soon as it is found. Never raises for a verdict.
+        A robot is stopped as soon as it is found. The robots that this machine remembers of each network must answer.
+        Never raises for a verdict.
+
+        Raises:
+            UnreachableError: the fleet is not joined.
         """
-        answers = side_by_side(_all_stopped, self._joined)
-        verdicts: dict[str, list[StopVerdict]] = {name: [] for name in self._robots}
-        for each in answers:
-            for name, answer in each.items():
-                verdicts.setdefault(name, []).append(verdict_of_answer(answer, name))
-        return {name: combined(name, verdicts[name], 0.0) for name in sorted(verdicts)}
+        joined = self._joined
+        stops = side_by_side(_all_stopped, joined)
+        return FleetStop([*stops, *self._not_reached(joined)], known=tuple(self._robots))
+
+    def estop(
+        self, reason: str = "", *, only: Sequence[str] | str = (), cell: str = "", signing_key: Any = None
+    ) -> FleetStop:
+        """Stop every robot of every network and lock it, until the operator resumes it; return the verdicts by id.
+
+        It leaves on each network at once under one id. With ``only`` or ``cell`` it is for those robots; where none of
+        them is there, every robot is stopped. No argument refuses it: what cannot be read is left out, and every robot
+        is stopped. Never raises for a verdict.
+
+        Args:
+            reason: sent to the robots, at most 200 characters.
+            only: ids of the robots to stop; every robot without any.
+            cell: stop the robots of this cell, and those without one.
+            signing_key: an Ed25519 private key, for robots that act on signed stops only; then only enrolled robots can
+                confirm it.
+
+        Raises:
+            UnreachableError: the fleet is not joined.
+        """
+        joined, estop_id = self._joined, new_epoch()
+        why, cut = stop_reason(reason)
+        named = [only] if isinstance(only, str) else only
+        scope, unread = stop_scope(named or None, cell)
+        for note in filter(None, (cut, unread)):
+            logger.warning("Ignored: %s.", note)
+
+        def stopped(network: NetworkAdapter) -> NetworkStop:
+            try:
+                outcome = network.emergency_stop(why, scope=scope, signing_key=signing_key, estop_id=estop_id)
+            except Exception as exc:  # noqa: BLE001 - a network that fails must not hide the verdicts of the others
+                return _not_left(network, exc)
+            return NetworkStop(network.name, outcome)
+
+        stops = [*side_by_side(stopped, joined), *self._not_reached(joined)]
+        return FleetStop(stops, estop_id, tuple(self._robots) if scope.everything else ())
+
+    def lockouts(self, timeout: float = FIND_S) -> dict[str, LockoutReport]:
+        """Ask the robots in reach for their lockouts; return the reports by id.
+
+        A robot on both networks is asked on the first one. A network that does not answer is named in :attr:`absent`.
+
+        Args:
+            timeout: seconds in which each robot has to answer.
+        """
+        seconds = number("timeout", timeout, above=0, high=60)
+        return {each.name: each for _, reports in reversed(self._asked((), seconds)) for each in reports}
+
+    def resume(self, signing_key: Any, robots: Sequence[str] | str = (), *, timeout: float = 5.0) -> dict[str, Resumed]:
+        """Clear the lockouts of robots with the operator's key; return by id whether each is free, and what it said.
+
+        It starts no motion. A resume names the epochs that the robot holds now, so it never clears one of a later stop.
+
+        Args:
+            signing_key: the operator's Ed25519 private key.
+            robots: ids; every robot in reach without any.
+            timeout: seconds in which each robot has to answer.
+
+        Raises:
+            NoSuchRobotError: one of ``robots`` is on no network.
+            KeyFileError: the enrolled keys cannot be used.
+        """
+        seconds = number("timeout", timeout, above=0, high=60)
+        named = [robots] if isinstance(robots, str) else list(robots)
+        wanted = [device_id("robots", each) for each in named]
+        asked = self._asked(wanted, seconds)
+        for each in wanted:
+            if not any(each == report.name for _, reports in asked for report in reports):
+                raise NoSuchRobotError(f"No robot {each!r} that can be resumed is in reach")
+        for network, reports in asked:
+            if unheard := unheard_now(network.key, {each.name for each in reports if not each.problem}):
+                logger.warning("%s: %s", network.name, unheard)
+        outcomes: dict[str, Resumed] = {}
+        done = side_by_side(lambda one: one[0].resume(one[1], signing_key, seconds), asked)
+        for freed in reversed(done):
+            for name, (free, said) in freed.items():
+                # Locked on one of two networks is locked.
+                outcomes[name] = (free and outcomes.get(name, (True, ""))[0], said)
+        return outcomes
+
+    def enroll(self, *, replace: bool = False, timeout: float = FIND_S) -> dict[str, Enrolment]:
+        """Keep the public keys of the robots in reach: from then on only a signed answer counts.
+
+        Compare each fingerprint with the one that ``strands-robots doctor`` shows at the robot's own machine.
+
+        Args:
+            replace: accept another key than the enrolled one, or another network.
+            timeout: seconds in which each robot has to answer.
+
+        Raises:
+            KeyFileError, OSError: the file of enrolled keys cannot be used; nothing was enrolled.
+        """
+        seconds, outcomes = number("timeout", timeout, above=0, high=60), dict[str, Enrolment]()
+        for network, reports in reversed(self._asked((), seconds, signed=True)):
+            outcomes |= enroll(reports, network.key, replace=replace)
+        return outcomes
+
+    def _asked(
+        self, robots: Sequence[str], seconds: float, *, signed: bool = False
+    ) -> list[tuple[NetworkAdapter, list[LockoutReport]]]:
+        """Return the reports of the lockable robots, or of these where a network has them."""
+
+        def asked(network: NetworkAdapter) -> list[LockoutReport] | str:
+            try:
+                there = network.lockable(seconds)
+                wanted = [each for each in there if not robots or each in robots]
+                return network.lockouts(wanted, seconds, signed=signed)
+            except UnreachableError as exc:
+                return exc.why
+
+        joined, found = self._joined, list[tuple[NetworkAdapter, list[LockoutReport]]]()
+        for network, reports in zip(joined, side_by_side(asked, joined), strict=True):
+            self.absent.pop(network.name, None)
+            if isinstance(reports, str):
+                self.absent[network.name] = reports
+            else:
+                found.append((network, reports))
+        if not found:
+            raise UnreachableError(self._absences)
+        return found
+
+    def _not_reached(self, joined: Sequence[NetworkAdapter]) -> list[NetworkStop]:
+        """Return the networks that were to be joined and are not, with the robots that must answer there."""
+        absent = [each for each in self._stated if each not in joined]
+        stops = [_not_left(each, self.absent.get(each.name, "it is not joined")) for each in absent]
+        return [each for each in stops if each.outcome is not None and each.outcome.size]
 
     def __getitem__(self, robot: str) -> RemoteRobot:
         """Return the robot of this id, looked for where it is not known yet.
@@ -271,8 +406,22 @@ def _found(network: NetworkAdapter, timeout: float) -> list[FoundRobot] | str:
         return plain_text(f"{type(exc).__name__}: {exc}")
 
 
-def _all_stopped(network: NetworkAdapter) -> Mapping[str, object]:
+def _all_stopped(network: NetworkAdapter) -> NetworkStop:
     try:
-        return network.stop_all(STOP_S)
+        answers, outcome = network.stop_all(STOP_S)
     except Exception as exc:  # noqa: BLE001 - a stop that fails is a verdict, whatever it raised
-        return {f"the robots on {network.name}": exc}
+        return _not_left(network, exc)
+    return NetworkStop(network.name, outcome, answers)
+
+
+def _not_left(network: NetworkAdapter, why: object) -> NetworkStop:
+    """Return a stop that did not leave on a network, with the robots that must answer there."""
+    said = plain_text(str(why)) or type(why).__name__
+    try:
+        roster = StopRoster(network.key)
+        roster.read()
+        outcome = measured({}, roster, Sending(left=False))
+    except Exception as exc:  # noqa: BLE001 - the roster's disk must not hide the verdicts of other networks
+        logger.warning("The roster of %s cannot be read: %s", network.name, exc)
+        return NetworkStop(network.name, absent=said)
+    return NetworkStop(network.name, outcome, absent=said)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from strands_robots import settings
-from strands_robots.utils import ValidationError, missing_extra
+from strands_robots.utils import ValidationError, missing_extra, redacted
 
 if TYPE_CHECKING:
     from strands_robots.device_connect.backends import LinkConfig
@@ -137,3 +137,16 @@ def _endpoints(values: Sequence[str] | None) -> tuple[str, ...]:
     from strands_robots.device_connect.backends.config import endpoints  # noqa: PLC0415 - as above
 
     return endpoints(_urls(values))
+
+
+def described(link: LinkConfig) -> str:
+    """Describe in one sentence who can reach a robot over ``link``."""
+    proof = "both sides are authenticated" if link.authenticated else "neither side is authenticated"
+    if link.transport == "nats":
+        return f"NATS at {redacted(', '.join(link.connect)) or 'its default address'}; {proof}."
+    if link.meeting_point:
+        return f"This machine alone: {link.meeting_point}; nothing leaves 127.0.0.1."
+    ways = [f"connects to {', '.join(link.connect)}"] if link.connect else []
+    ways += [f"listens on {', '.join(link.listeners)}"] if link.listeners else []
+    ways += ["finds peers by multicast"] if link.uses_multicast else []
+    return f"Zenoh: {'; '.join(ways)}; {proof}."

@@ -20,14 +20,15 @@ from strands_robots.errors import AmbiguousRobotError, NoSuchRobotError, Refusal
 from strands_robots.fleet.adapter import STOP_S, FoundRobot, NetworkAdapter
 from strands_robots.fleet.description import docstring, python_name, signature
 from strands_robots.fleet.event_feed import EventFeed
+from strands_robots.fleet.fleet_stop import combined, verdict_of_answer
 from strands_robots.fleet.lease import HeldLease, SharedLease
 from strands_robots.fleet.refusals import refusal_of
 from strands_robots.fleet.shared_id import SharedId
 from strands_robots.fleet.side_by_side import side_by_side
-from strands_robots.safety.stopping import StopVerdict, graded
+from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.advertised import AdvertisedVerb, RobotDescription
 from strands_robots.serving.verbs import LEASE_ID
-from strands_robots.utils import DURATION_MAX_S, START_S, WAIT_S, near, number, optional_module, plain_text, text
+from strands_robots.utils import DURATION_MAX_S, START_S, WAIT_S, near, number, optional_module, text
 
 if TYPE_CHECKING:
     import numpy as np
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 PIXELS_MAX = 4096 * 4096
-HALTED_MAX = 64
 ROBOTS_MAX = 1000
 
 ROBOT_NAME = "robot_name"
@@ -478,33 +478,6 @@ def _of_one(verb: AdvertisedVerb) -> AdvertisedVerb | None:
 
 _RESERVED = frozenset(dir(RemoteRobot))
 """Names of members, which no verb of a robot takes."""
-
-
-def verdict_of_answer(answer: object, name: str) -> StopVerdict:
-    """Return the answer to a stop of a remote robot as a verdict on ``name``."""
-    verdict = graded(answer, name)
-    if verdict.stopped and isinstance(answer, Mapping):
-        listed = answer.get("halted", answer.get("stopped"))
-        halted = [plain_text(each, 100) for each in listed[:HALTED_MAX]] if isinstance(listed, list) else [name]
-        return StopVerdict(tuple(filter(None, halted)), settling=answer.get("settling") is True)
-    return StopVerdict(
-        verdict.halted,
-        {each: plain_text(why, 500) for each, why in verdict.not_stopped.items()},
-        {each: plain_text(why, 500) for each, why in verdict.unknown.items()},
-    )
-
-
-def combined(robot: str, verdicts: Sequence[StopVerdict], elapsed_ms: float) -> StopVerdict:
-    """Return the verdicts of all bearers of an id as one; unknown without any."""
-    if not verdicts:
-        return StopVerdict(unknown={robot: "it did not answer, or has no stop"}, elapsed_ms=elapsed_ms)
-    return StopVerdict(
-        tuple(name for each in verdicts for name in each.halted),
-        {name: why for each in verdicts for name, why in each.not_stopped.items()},
-        {name: why for each in verdicts for name, why in each.unknown.items()},
-        elapsed_ms,
-        any(each.settling for each in verdicts),
-    )
 
 
 def _stopped(robot: str, network: NetworkAdapter, robot_name: str = "") -> object:

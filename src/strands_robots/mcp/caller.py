@@ -19,12 +19,12 @@ from strands_robots.device_connect import FleetClient
 from strands_robots.device_connect.client import CallRefusedError, DeviceTimeoutError, NoSuchDeviceError
 from strands_robots.device_connect.discovery import Peer
 from strands_robots.envelope import Envelope, error, is_error, success, text_of
+from strands_robots.fleet.device_connect.stops import stop_and_lock, stop_everything
 from strands_robots.mcp.queries import NoTurnError, Queries
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.safety.stopping import Outcome, grade
 from strands_robots.serving.advertised import AdvertisedVerb, find_verb
 from strands_robots.serving.verbs import LEASE_ID, LEASE_NAMES, LEASE_TTL_S, TTL_MAX_S, TTL_MIN_S
-from strands_robots.tools.networks import stop_and_lock, stop_everything
 from strands_robots.utils import ValidationError, number
 
 ANSWER_S = 10.0

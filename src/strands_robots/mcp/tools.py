@@ -18,9 +18,9 @@ from mcp.server.mcpserver import Context, MCPServer
 from mcp.types import InputRequiredResult, ToolAnnotations
 from pydantic import Field
 
-from strands_robots.cli.resume import ask_robots, lockable_robots
 from strands_robots.device_connect.discovery import Peer
 from strands_robots.envelope import Envelope, error, is_error, success
+from strands_robots.fleet.device_connect.lockouts import ask_robots, lockable_robots
 from strands_robots.mcp.access import AccessOf
 from strands_robots.mcp.approval import Approvals, Wish
 from strands_robots.mcp.caller import acquire_arguments, move_arguments

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
 from typing import Protocol
 
 from strands_robots.safety.answers import Answer
@@ -13,11 +14,23 @@ from strands_robots.safety.roster_report import RosterReport
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stop_roster import StopRoster
+from strands_robots.utils import plain_text
 
 logger = stop_logger(__name__)
 
 
-LookUp = Callable[[], Mapping[str, tuple[bool, str | None]]]
+@dataclass(frozen=True, slots=True)
+class FoundDevices:
+    """Devices in reach: whether each has a stop, and its cell, None where it states none.
+
+    ``problem`` says why there may be more; empty where there are none.
+    """
+
+    devices: Mapping[str, tuple[bool, str | None]]
+    problem: str = ""
+
+
+LookUp = Callable[[], FoundDevices]
 
 
 class Expecting(Protocol):
@@ -34,8 +47,7 @@ class RosterSearch:
         controller: that sends the stop.
         estop_id: of the stop.
         network: whose roster it is.
-        look_up: finds devices, whether each has a stop, and its cell or None, on a thread of its own; the stop goes on
-            until then.
+        look_up: finds devices, on a thread of its own; the stop goes on until then.
         scope: the robots that the stop is for.
         named: robots that must answer besides the roster.
     """
@@ -56,6 +68,13 @@ class RosterSearch:
         self._answered: Mapping[str, Answer] = {}
         self._lock = threading.Lock()
         self._left = 1 if look_up is None else 2
+        self._problem = "" if look_up is None else "no list of them in time"
+
+    @property
+    def problem(self) -> str:
+        """Reason why robots may be missing that were to be found."""
+        with self._lock:
+            return self._problem
 
     def begin(self, progress: Progress) -> None:
         """Take the answers so far; start the search at the first call."""
@@ -65,6 +84,10 @@ class RosterSearch:
             self.roster.widen()
         if widened or self.roster.divided:
             self._expect(0)
+        self.start()
+
+    def start(self) -> None:
+        """Start the search; a second call does nothing."""
         if not self.begun:
             self.begun = True
             threading.Thread(target=self._read, name="stop roster", daemon=True).start()
@@ -83,19 +106,29 @@ class RosterSearch:
     def _find(self, look_up: LookUp) -> None:
         try:
             found = look_up()
-        except Exception as exc:  # noqa: BLE001 - the caller looks at it; the stop goes on to its deadline
+        except Exception as exc:  # noqa: BLE001 - said with the report; the stop goes on to its deadline
             logger.warning("The search for robots failed: %s", exc)
+            self.failed(exc)
             return
         self.roster.find(
-            {name: stops for name, (stops, _) in found.items()}, {name: cell for name, (_, cell) in found.items()}
+            {name: stops for name, (stops, _) in found.devices.items()},
+            {name: cell for name, (_, cell) in found.devices.items()},
         )
-        self._expect(1)
+        self._expect(1, found.problem.rstrip("."))
 
-    def _expect(self, done: int) -> None:
+    def failed(self, exc: Exception) -> None:
+        """Note why devices in reach could not be looked up."""
+        with self._lock:
+            self._problem = plain_text(str(exc), 300).rstrip(".") or type(exc).__name__
+
+    def _expect(self, done: int, problem: str | None = None) -> None:
+        # The report of a stop that this completes is read after what this says.
         with self._lock:
             self._left -= done
             more = self._left > 0 or self.roster.incomplete(self._answered)
-            self._controller.expect(self.estop_id, self.roster.awaited(self._answered), more=more)
+            goes_on = self._controller.expect(self.estop_id, self.roster.awaited(self._answered), more=more)
+            if goes_on and problem is not None:
+                self._problem = problem
 
 
 def stop_and_search(

@@ -6,36 +6,22 @@ Each verb answers with an envelope and never raises.
 from __future__ import annotations
 
 import importlib.util
-import math
-import threading
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from strands_robots import settings
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.errors import StrandsRobotsError
-from strands_robots.safety.orders import new_epoch
-from strands_robots.safety.peer_answers import enrolled_peers, stop_distrust
-from strands_robots.safety.roster_search import RosterSearch, stop_and_search
+from strands_robots.fleet.device_connect.stops import stop_and_lock, stop_everything
+from strands_robots.fleet.mesh.discovery import discover, in_reach
+from strands_robots.fleet.mesh.stops import lock_peers, stop_answer, stop_peers
+from strands_robots.fleet.stop_answers import OnOutcome, combined_verdict, roster_verdict
+from strands_robots.safety.peer_answers import enrolled_peers
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
-from strands_robots.safety.silence import Sending
-from strands_robots.safety.statements import ALARM
-from strands_robots.safety.stop_roster import READ_WITHIN_S, StopOutcome, StopRoster, robots_known_at
-from strands_robots.safety.stopping import explain, grade
-from strands_robots.tools.mesh_roster import MeshReports, mesh_network
-from strands_robots.tools.roster_verdict import (
-    OnOutcome,
-    combined_verdict,
-    measured,
-    roster_verdict,
-    unanswered,
-    with_plain_stops,
-    with_reasons,
-)
+from strands_robots.safety.stop_roster import StopOutcome
 from strands_robots.utils import MissingExtraError, ValidationError, finite, near
 
 if TYPE_CHECKING:
@@ -48,11 +34,6 @@ SOURCE = "robot-mesh-tool"
 
 ANSWER_S = 10.0
 STOP_S = 5.0
-ESTOP_S = 1.5
-"""Seconds in which robots answer an emergency stop; it is repeated until then."""
-
-AGAIN_S, LOOK_S = 1.0, 0.05
-
 DESCRIBE_S = 2.0
 """Seconds in which a peer of the mesh has to describe a verb of its own before that is called."""
 
@@ -166,12 +147,9 @@ class NativeMesh:
             command = {"action": "stop", **({"robot_name": robot_name} if robot_name else {})}
             if target:
                 return combined_verdict(
-                    {target: _stop_answer(target, _reply(mesh, target, command, STOP_S), enrolled_peers())}
+                    {target: stop_answer(target, _reply(mesh, target, command, STOP_S), enrolled_peers())}
                 )
-            roster = StopRoster(mesh_network())
-            answers = _stop_all(mesh, lambda: mesh.broadcast(command, ESTOP_S), roster)
-            outcome = measured(answers, roster, Sending())
-            outcome.record(mesh.peer_id)
+            answers, outcome = stop_peers(mesh)
             on_outcome(outcome)
             return roster_verdict(answers, outcome)
 
@@ -188,34 +166,11 @@ class NativeMesh:
             scope: the robots that it is for. Where none of them is there, every robot is stopped.
             on_outcome: takes the outcome.
         """
-        estop_id = new_epoch()
 
         def stopped(mesh: Mesh) -> Envelope:
-            reports = MeshReports(mesh)
-            roster = StopRoster(mesh_network(), scope=scope)
-            reports.inbox.open(estop_id, roster.take)
-            listening: list[threading.Thread] = []
-
-            def left(replies: list[dict[str, Any]]) -> None:
-                if not listening:
-                    listening.append(threading.Thread(target=reports.begin, name="missed rosters", daemon=True))
-                    listening[0].start()
-
-            def send() -> list[dict[str, Any]]:
-                some: dict[str, Any] = {}
-                if not roster.scope.everything:
-                    known = robots_known_at(mesh_network)
-                    some = {"scope": roster.scope, "remembers": known, "on_widened": roster.widen}
-                return mesh.emergency_stop(signing_key, estop_id=estop_id, on_answers=left, **some)
-
-            try:
-                answers = _stop_all(mesh, send, roster)
-            finally:
-                reports.close()
-            outcome = measured(answers, roster, Sending(signed=signing_key is not None), estop_id)
-            outcome.record(mesh.peer_id)
+            answers, outcome = lock_peers(mesh, signing_key, scope)
             on_outcome(outcome)
-            return {**roster_verdict(answers, outcome), "estop_id": estop_id, **scope.field()}
+            return {**roster_verdict(answers, outcome), "estop_id": outcome.report.estop_id, **scope.field()}
 
         return _on_mesh(stopped, stopped=None)
 
@@ -281,7 +236,7 @@ def _seen(mesh: Mesh, target: str) -> bool:
 
 
 def _absent(mesh: Mesh, target: str) -> str:
-    return f"No peer {target!r} is on the mesh.{near(target, _in_reach(mesh))}"
+    return f"No peer {target!r} is on the mesh.{near(target, in_reach(mesh))}"
 
 
 def _own_verb(mesh: Mesh, target: str, action: str) -> AdvertisedVerb | None:
@@ -335,98 +290,6 @@ def _verbs_of_kind(row: Mapping[str, Any]) -> dict[str, Any]:
     from strands_robots.serving.peer_verbs import KINDS  # noqa: PLC0415 - as above
 
     return {"functions": [*KINDS.get(str(row.get("robot_kind")), ()), *own_names(row.get("own_verbs"))]}
-
-
-def _stop_all(mesh: Mesh, stop: Callable[[], list[dict[str, Any]]], roster: StopRoster) -> dict[str, Envelope]:
-    """Send a stop, and again while a peer in reach has not confirmed it.
-
-    Args:
-        roster: read once it has left, and given the peers in reach.
-    """
-    seen: set[str] = set()
-    replies: dict[str, dict[str, Any]] = {}
-    answers: dict[str, Envelope] = {}
-    keys: list[Mapping[str, bytes] | None] = []
-    sent = time.monotonic()
-
-    def read() -> None:
-        try:
-            keys.append(enrolled_peers())
-        finally:
-            roster.read()
-
-    def send() -> None:
-        nonlocal sent
-        sent = time.monotonic()
-        replies.update({each["responder_id"]: each for each in stop() if each["responder_id"] != mesh.peer_id})
-
-    def graded() -> dict[str, Envelope]:
-        while keys and replies:
-            name, reply = replies.popitem()
-            answers[name] = _stop_answer(name, reply, keys[0], locks=roster.scope.only)
-        return answers
-
-    def unconfirmed() -> bool:
-        seen.update(name for name in _in_reach(mesh) if roster.scope.covers(name, _cells(mesh, name)))
-        return any(not graded().get(name, {}).get("stopped") for name in seen)
-
-    send()
-    # On a thread: a disk that hangs delays no further sending.
-    reading = threading.Thread(target=read, name="stop roster", daemon=True)
-    reading.start()
-    discover(mesh, lambda: send() if unconfirmed() and time.monotonic() - sent >= AGAIN_S else None)
-    if unconfirmed():
-        send()
-    reading.join(READ_WITHIN_S)
-    keys.append(None)  # not read in time: no answer counts as proven
-    roster.find(dict.fromkeys(seen, True), {name: next(iter(_cells(mesh, name)), "") for name in seen})
-    return {name: unanswered(name) for name in seen} | graded()
-
-
-def _cells(mesh: Mesh, peer: str) -> frozenset[str]:
-    cell = next((row.get("cell") for row in mesh.peers if row["peer_id"] == peer), None)
-    return frozenset({cell} if isinstance(cell, str) and cell else ())
-
-
-def _stop_answer(
-    target: str, reply: dict[str, Any], keys: Mapping[str, bytes] | None, *, locks: Collection[str] = ()
-) -> Envelope:
-    """Return a reply as an envelope; one of ``locks`` has to say that it is locked."""
-    if reply.get("status") in ("timeout", "error"):
-        return unanswered(target)
-    result = reply.get("result")
-    if grade(result).stopped:
-        why = stop_distrust(reply, keys)
-        if not why:
-            free = target in locks and not (isinstance(result, Mapping) and result.get("locked") is True)
-            return success(
-                "stopped, and NOT LOCKED: its release knows no lock by command" if free else "stopped", stopped=True
-            )
-        return error(why, stopped=False if why.startswith(ALARM) else None)
-    return error(explain(result) if result is not None else str(reply.get("error", "")), stopped=False)
-
-
-def _in_reach(mesh: Mesh) -> list[str]:
-    return [row["peer_id"] for row in mesh.peers if row["reachable"]]
-
-
-def discover(mesh: Mesh, meanwhile: Callable[[], object] = lambda: None) -> None:
-    """Wait until the peers in reach are known, calling ``meanwhile`` repeatedly.
-
-    A link to a stated endpoint that failed is retried with back-off, so such a peer may be silent for up to 8 s.
-    """
-    from strands_robots.mesh.transport.zenoh_config import DISCOVERY_S, LINK_DISCOVERY_S  # noqa: PLC0415 - loaded when it is used
-
-    began, found = time.monotonic(), math.inf
-    listens, connects = settings.items("ZENOH_LISTEN"), settings.items("ZENOH_CONNECT")
-    while (now := time.monotonic()) < began + LINK_DISCOVERY_S:
-        if _in_reach(mesh):
-            found = min(found, now)
-        known = now >= found + DISCOVERY_S if connects else now >= began + DISCOVERY_S
-        if known and not listens:
-            return
-        meanwhile()
-        time.sleep(LOOK_S)
 
 
 def _reply(mesh: Mesh, target: str, command: dict[str, Any], seconds: float) -> dict[str, Any]:
@@ -518,70 +381,6 @@ class DeviceConnect:
             scope: the robots that it is for. Where none of them is there, every robot is stopped.
         """
         return _on_fleet(lambda fleet: stop_and_lock(fleet, reason, scope), stopped=None)
-
-
-def stop_everything(fleet: FleetClient) -> Envelope:
-    """Stop each device that is found; answers by name, measured by the roster."""
-    answers, outcome = stop_found(fleet, STOP_S)
-    return roster_verdict(answers, outcome)
-
-
-def stop_found(fleet: FleetClient, seconds: float) -> tuple[dict[str, Envelope], StopOutcome]:
-    """Stop each device when it is found; return answers and outcome."""
-    from strands_robots.device_connect.enrollment import network_of  # noqa: PLC0415 - the network is loaded when it is used
-
-    roster = StopRoster(network_of(fleet.link))
-    answers = fleet.stop_all(seconds)
-    # What was found has to answer, though nothing remembers it.
-    roster.find(dict.fromkeys(answers, True))
-    roster.read()
-    sending = Sending(tells=fleet.link.transport == "nats")
-    outcome = replace(measured(answers, roster, sending, problem=fleet.stale.rstrip(".")), unsigned=True)
-    outcome.record(fleet.source)
-    return answers, outcome
-
-
-def silence_of(fleet: FleetClient, device: str) -> str:
-    """Return why a robot of the roster may be silent; "" for another name."""
-    from strands_robots.device_connect.enrollment import network_of  # noqa: PLC0415 - the network is loaded when it is used
-
-    roster = StopRoster(network_of(fleet.link))
-    roster.read()
-    return measured({}, roster, Sending(tells=fleet.link.transport == "nats")).reasons.get(device, "")
-
-
-def stop_and_lock(fleet: FleetClient, reason: str, scope: Scope = EVERY_ROBOT) -> Envelope:
-    """Send an emergency stop under the client's name; answers by name.
-
-    A device of its scope that is in reach and did not answer it gets a plain ``stop`` as well. The roster must answer.
-    """
-    from strands_robots.device_connect.enrollment import network_of  # noqa: PLC0415 - the network is loaded when it is used
-    from strands_robots.device_connect.safety_controller import outcome_envelope, safety_controller  # noqa: PLC0415 - as above
-
-    estop_id = new_epoch()
-    controller = safety_controller(fleet.source, fleet.link)
-    with ThreadPoolExecutor(1) as pool:
-        try:
-            seen = pool.submit(fleet.peers)
-            found = lambda: {peer.id: (peer.stop_verb is not None, peer.cell) for peer in seen.result()}  # noqa: E731
-            search = RosterSearch(controller, estop_id, network_of(fleet.link), found, scope)
-            report = stop_and_search(controller, search, (), reason, ESTOP_S)
-            sending = replace(controller.sending, left=report.link)
-        finally:
-            controller.close()
-    heard = {**report.stopped, **report.not_stopped, **report.refused}
-    inside = EVERY_ROBOT if report.widened else scope
-    peers = [peer.id for peer in seen.result() if peer.stop_verb and inside.covers(peer.id, {peer.cell or ""} - {""})]
-    rest = [name for name in peers if name not in heard]
-    answers = fleet.stop_each(rest, STOP_S) if rest else {}
-    roster = search.roster
-    outcome = roster.outcome(report, sending)
-    if rest:
-        outcome = roster.outcome(with_plain_stops(report, outcome, answers), sending)
-        outcome = with_reasons(outcome, answers, plain=True)
-    outcome.record(fleet.source)
-    roster.remember(report)
-    return outcome_envelope(outcome, rest)
 
 
 def _peer_list(rows: list[dict[str, Any]], stale: str = "") -> Envelope:

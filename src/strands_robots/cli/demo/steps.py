@@ -19,8 +19,9 @@ from strands_robots.audit import verify_audit_integrity
 from strands_robots.cli.demo.output import DemoScreen
 from strands_robots.cli.demo.processes import Agent, AgentEvent, EventStream, RobotProcess
 from strands_robots.cli.output import CliError, first_line, label, plain, table
-from strands_robots.cli.watch import joint_limits, joints_table
+from strands_robots.cli.watch import joints_table
 from strands_robots.device_connect.telemetry import numbers
+from strands_robots.fleet.joint_features import joint_limits
 from strands_robots.safety.controller import SafetyController
 from strands_robots.safety.ed25519 import keygen, load_signing_key
 from strands_robots.safety.resume import sign

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from typing import TYPE_CHECKING, Any, Self
 
 from strands_robots.envelope import Envelope
 from strands_robots.errors import (
@@ -18,7 +18,15 @@ from strands_robots.errors import (
     UnreachableError,
 )
 from strands_robots.fleet.adapter import CLOSED, DEVICE_CONNECT, FIND_S, STOP_S, FoundRobot, OnEvent, RobotEvent
+from strands_robots.fleet.device_connect.lockouts import ask_robots, enrolled_keys, lockable_robots, resume_robots
+from strands_robots.fleet.device_connect.stops import network_key, stop_found, stopped_and_locked
+from strands_robots.fleet.link_flags import described
+from strands_robots.fleet.lockout_report import LockoutReport, Resumed
+from strands_robots.fleet.stop_button import StopSender
 from strands_robots.safety.identity import KeyFileError
+from strands_robots.safety.network_key import NetworkKey
+from strands_robots.safety.scope import EVERY_ROBOT, Scope
+from strands_robots.safety.stop_roster import StopOutcome
 from strands_robots.utils import ValidationError, plain_text
 
 if TYPE_CHECKING:
@@ -53,10 +61,19 @@ class DeviceConnectNetwork:
     def __init__(self, link: LinkConfig, source: str) -> None:
         from strands_robots.device_connect.client import FleetClient  # noqa: PLC0415 - loaded when it is used
 
-        self._client = FleetClient(link, source)
+        self._take(FleetClient(link, source), joined=False)
+
+    @classmethod
+    def joined(cls, client: FleetClient) -> Self:
+        """Return the network of a connected client, which is closed by whoever opened it."""
+        network = cls.__new__(cls)
+        network._take(client, joined=True)
+        return network
+
+    def _take(self, client: FleetClient, *, joined: bool) -> None:
+        self._client, self._open, self._given = client, joined, joined
         self._peers: dict[str, Peer] = {}
         self._discoveries = 0
-        self._open = False
 
     def open(self) -> None:
         """Connect; raise :class:`UnreachableError` where that fails."""
@@ -88,12 +105,10 @@ class DeviceConnectNetwork:
 
     def enrolled_key(self, robot: str) -> bytes | None:
         """Return the device's enrolled key."""
-        from strands_robots.device_connect.enrollment import enrolled_robots  # noqa: PLC0415 - loaded when it is used
-
         try:
-            return enrolled_robots(self._client.link).get(robot)
-        except (KeyFileError, OSError) as exc:
-            logger.warning("The enrolled keys cannot be used, so none counts: %s", exc)
+            return enrolled_keys(self._client.link).get(robot)
+        except KeyFileError as exc:
+            logger.warning("%s So none counts.", exc)
             return None
 
     def describe(self, robot: str, *, anew: bool = False) -> object:
@@ -128,10 +143,69 @@ class DeviceConnectNetwork:
         unknown = answer.get("status") == "error" and answer.get("stopped") is None
         return None if unknown and not self.bears(robot) else answer
 
-    def stop_all(self, timeout: float = STOP_S) -> dict[str, Envelope]:
+    @property
+    def key(self) -> NetworkKey:
+        """The name of the tenant's network."""
+        return network_key(self._client.link)
+
+    @property
+    def reach(self) -> str:
+        """The link in words."""
+        return described(self._client.link)
+
+    @property
+    def stale(self) -> str:
+        """What the registry did not list."""
+        return self._client.stale
+
+    def stop_all(self, timeout: float = STOP_S) -> tuple[dict[str, Envelope], StopOutcome]:
         """Stop each device when it is found."""
         with _carried():
-            return self._connected.stop_all(timeout)
+            return stop_found(self._connected, timeout)
+
+    def emergency_stop(
+        self, reason: str, *, scope: Scope = EVERY_ROBOT, signing_key: Any = None, estop_id: str = ""
+    ) -> StopOutcome:
+        """Stop and lock the robots of the tenant, on a connection of its own.
+
+        A device in reach that did not act on it gets a plain ``stop`` as well.
+        """
+        with _carried():
+            outcome, _ = stopped_and_locked(
+                self._connected, reason, scope=scope, signing_key=signing_key, estop_id=estop_id
+            )
+        return outcome
+
+    @contextmanager
+    def standing(self, signing_key: Any, known: Callable[[], Collection[str]]) -> Iterator[StopSender]:
+        """Make a controller with a connection of its own; the network need not be joined."""
+        from strands_robots.device_connect.safety_controller import safety_controller, stand  # noqa: PLC0415 - as above
+
+        link = self._client.link
+        controller = safety_controller(
+            self._client.source, link, signing_key=signing_key, require_signed=signing_key is not None, stands=True
+        )
+        with closing(controller), closing(stand(controller, link, known)):
+            yield controller
+
+    def beats(self, robots: Iterable[str]) -> Mapping[str, float | None]:
+        """Return the devices' last beats or heartbeats."""
+        return {name: self._connected.last_heartbeat(name) for name in robots}
+
+    def lockable(self, timeout: float = FIND_S) -> list[str]:
+        """Return the devices that have a ``resume``."""
+        with _carried():
+            return lockable_robots(self._connected, timeout)
+
+    def lockouts(self, robots: Iterable[str], timeout: float, *, signed: bool = False) -> list[LockoutReport]:
+        """Ask each device for its status."""
+        with _carried():
+            return ask_robots(self._connected, dict.fromkeys(robots), timeout, signed=signed)
+
+    def resume(self, reports: Sequence[LockoutReport], signer: Any, timeout: float) -> dict[str, Resumed]:
+        """Send each device a resume of each of its lockouts."""
+        with _carried():
+            return resume_robots(self._connected, reports, signer, timeout)
 
     def subscribe(self, robot: str, on_event: OnEvent) -> Callable[[], None]:
         """Receive the device's events."""
@@ -144,8 +218,9 @@ class DeviceConnectNetwork:
 
     def close(self) -> None:
         """Disconnect."""
-        self._open = False
-        self._client.close()
+        if not self._given:
+            self._open = False
+            self._client.close()
 
     @property
     def _connected(self) -> FleetClient:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
-from strands_robots.cli.lockout_report import LockoutReport
+from strands_robots.fleet.lockout_report import TOO_MANY, LockoutReport, Resumed
 from strands_robots.safety.lockout import OVERFLOW, Lockout
 from strands_robots.safety.orders import new_epoch
 from strands_robots.safety.peer_answers import enrolled_key, enrolled_peers, lockout_distrust, resume_distrust
@@ -42,13 +42,12 @@ def ask_peers(mesh: Mesh, names: Iterable[str], seconds: float) -> list[LockoutR
         return list(pool.map(lambda name: _ask(mesh, name, seconds, keys), wanted))
 
 
-def resume_peers(
-    mesh: Mesh, locked: Mapping[str, tuple[Lockout, ...]], signer: Any, seconds: float
-) -> dict[str, tuple[bool, str]]:
+def resume_peers(mesh: Mesh, found: Sequence[LockoutReport], signer: Any, seconds: float) -> dict[str, Resumed]:
     """Resume every epoch of these peers; return each one's outcome.
 
     A resume is sent to one of its targets, which relays it. A robot that is still locked then gets a resume of its own.
     """
+    locked = {each.name: each.lockouts for each in found if not each.problem}
     names: dict[str, list[str]] = {}
     for name, lockouts in locked.items():
         for each in lockouts:
@@ -67,7 +66,7 @@ def resume_peers(
     return {
         name: (name not in left, _outcome(lockouts, left.get(name), said.get(name, "")))
         for name, lockouts in locked.items()
-    }
+    } | {each.name: (False, each.problem) for each in found if each.problem}
 
 
 def _still_locked(
@@ -89,7 +88,7 @@ def _outcome(before: tuple[Lockout, ...], left: tuple[Lockout, ...] | None, said
     if left is None:
         return "free to move when told to" if before else "was not locked"
     if any(each.epoch == OVERFLOW for each in left):
-        return "more stops than it can keep apart; resume --local at its own machine"
+        return TOO_MANY
     return f"{said or 'it did not confirm'}: its own audit says why"
 
 

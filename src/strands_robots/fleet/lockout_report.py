@@ -9,6 +9,8 @@ from typing import Any
 
 from strands_robots.safety.lockout import Lockout
 
+TOO_MANY = "more stops than it can keep apart; resume --local at its own machine"
+
 
 @dataclass(frozen=True, slots=True)
 class LockoutReport:
@@ -23,3 +25,16 @@ class LockoutReport:
     facts: Mapping[str, Any] = field(default_factory=dict)
     round_trip_ms: float = 0.0
     at: float = field(default_factory=time.monotonic)
+
+
+Resumed = tuple[bool, str]
+"""Whether a robot is free now, and what it said."""
+
+
+def before_resume(robot: LockoutReport) -> Resumed:
+    """Return the outcome of a resume where none can be sent to a robot."""
+    if robot.problem:
+        return False, robot.problem
+    if not robot.lockouts:
+        return True, "was not locked"
+    return False, TOO_MANY

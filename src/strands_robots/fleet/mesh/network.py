@@ -8,19 +8,27 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from itertools import count
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 from strands_robots import settings
-from strands_robots.envelope import Envelope, error, is_error
+from strands_robots.envelope import Envelope
 from strands_robots.errors import ArgumentsError, NoAnswerError, NoSuchRobotError, UnreachableError
 from strands_robots.fleet.adapter import CLOSED, FIND_S, MESH, STOP_S, FoundRobot, OnEvent, RobotEvent
+from strands_robots.fleet.lockout_report import LockoutReport, Resumed
+from strands_robots.fleet.mesh.controller import MeshController
+from strands_robots.fleet.mesh.discovery import LOOK_S, discover
+from strands_robots.fleet.mesh.lockouts import ask_peers, lockable_peers, resume_peers
+from strands_robots.fleet.mesh.standing import mesh_network, stand_on_mesh
+from strands_robots.fleet.mesh.stops import lock_peers, stop_answer, stop_peers
 from strands_robots.fleet.refusals import refusal_of_text
-from strands_robots.fleet.side_by_side import side_by_side
-from strands_robots.safety.peer_answers import enrolled_peers, stop_distrust
-from strands_robots.safety.statements import ALARM
-from strands_robots.safety.stopping import explain, grade
+from strands_robots.fleet.stop_button import StopSender
+from strands_robots.safety.network_key import NetworkKey
+from strands_robots.safety.peer_answers import enrolled_peers
+from strands_robots.safety.scope import EVERY_ROBOT, Scope
+from strands_robots.safety.stop_roster import StopOutcome
 from strands_robots.serving.verb_schema import described
 from strands_robots.utils import MissingExtraError, ValidationError, finite, plain_text
 
@@ -30,7 +38,6 @@ if TYPE_CHECKING:
 DESCRIBE_S = 5.0
 """Seconds in which a peer has to describe its verbs."""
 
-LOOK_S = 0.05
 _ALIASES = {"getStatus": "status", "getState": "state", "getFeatures": "features"}
 """Reads of every robot by their names on Device Connect, which the mesh has always called otherwise."""
 
@@ -52,6 +59,14 @@ class MeshNetwork:
         self._joined = math.inf
         self._subscriptions = count()
         self._discoveries = 0
+        self._given = False
+
+    @classmethod
+    def joined(cls, mesh: Mesh) -> Self:
+        """Return the mesh that a peer has just joined, which is left by whoever joined."""
+        network = cls(mesh.peer_id)
+        network._mesh, network._joined, network._given = mesh, time.monotonic(), True
+        return network
 
     def open(self) -> None:
         """Join; raise :class:`UnreachableError` where there is no mesh."""
@@ -152,19 +167,61 @@ class MeshNetwork:
             return None
         one = {"robot_name": robot_name} if robot_name else {}
         reply = self._joined_mesh.send(robot, {"action": "stop", **one}, timeout)
-        return _stop_answer(robot, reply, enrolled_peers())
+        return stop_answer(robot, reply, enrolled_peers())
 
-    def stop_all(self, timeout: float = STOP_S) -> dict[str, Envelope]:
-        """Stop all robots in reach, and again each that has not confirmed it."""
+    @property
+    def key(self) -> NetworkKey:
+        """The name of the mesh that the settings name."""
+        return mesh_network()
+
+    @property
+    def reach(self) -> str:
+        """The mesh in words."""
+        return "They were looked for on the native mesh."
+
+    @property
+    def stale(self) -> str:
+        """Empty: each peer announces itself."""
+        return ""
+
+    def stop_all(self, timeout: float = STOP_S) -> tuple[dict[str, Envelope], StopOutcome]:
+        """Stop all peers in reach, and again while one has not confirmed it."""
+        del timeout  # the mesh's own deadlines count
+        return stop_peers(self._joined_mesh, self._joined)
+
+    def emergency_stop(
+        self, reason: str, *, scope: Scope = EVERY_ROBOT, signing_key: Any = None, estop_id: str = ""
+    ) -> StopOutcome:
+        """Stop and lock the peers; the mesh carries no reason."""
+        del reason
+        _, outcome = lock_peers(self._joined_mesh, signing_key, scope, estop_id=estop_id, since=self._joined)
+        return outcome
+
+    @contextmanager
+    def standing(self, signing_key: Any, known: Callable[[], Collection[str]]) -> Iterator[StopSender]:
+        """Make a controller that stops the peers under this peer's id."""
         mesh = self._joined_mesh
-        replies = mesh.broadcast({"action": "stop"}, min(timeout, FIND_S))
-        keys = enrolled_peers()
-        answers = {name: _stop_answer(name, each, keys) for each in replies if (name := str(each["responder_id"]))}
-        self._settle(0.0)
-        rest = [row["peer_id"] for row in self._rows() if is_error(answers.get(row["peer_id"], error("no answer")))]
-        for name, answer in zip(rest, side_by_side(lambda each: self.stop(each, timeout), rest), strict=True):
-            answers[name] = answer or error("It is gone.", stopped=None)
-        return {row["peer_id"]: answers[row["peer_id"]] for row in self._rows() if row["peer_id"] in answers}
+        with closing(stand_on_mesh(mesh, signing_key, known)):
+            yield MeshController(mesh, signing_key)
+
+    def beats(self, robots: Iterable[str]) -> Mapping[str, float | None]:
+        """Return none, so that each peer is asked at each look."""
+        return dict.fromkeys(robots)
+
+    def lockable(self, timeout: float = FIND_S) -> list[str]:
+        """Return the peers that have a robot, once those in reach are known."""
+        del timeout  # which is the mesh's own
+        discover(self._joined_mesh, since=self._joined)
+        return lockable_peers(self._joined_mesh)
+
+    def lockouts(self, robots: Iterable[str], timeout: float, *, signed: bool = False) -> list[LockoutReport]:
+        """Ask each peer for its status; a robot of ours signs in any case."""
+        del signed
+        return ask_peers(self._joined_mesh, robots, timeout)
+
+    def resume(self, reports: Sequence[LockoutReport], signer: Any, timeout: float) -> dict[str, Resumed]:
+        """Send the resumes of these peers, which relay them."""
+        return resume_peers(self._joined_mesh, reports, signer, timeout)
 
     def subscribe(self, robot: str, on_event: OnEvent) -> Callable[[], None]:
         """Receive the robot's policy steps and safety events."""
@@ -188,6 +245,8 @@ class MeshNetwork:
 
     def close(self) -> None:
         """Leave the mesh."""
+        if self._given:
+            return
         mesh, self._mesh = self._mesh, None
         if mesh is not None:
             mesh.close()
@@ -231,15 +290,3 @@ class MeshNetwork:
 
 def _has_robot(row: Mapping[str, Any]) -> bool:
     return "locked" in row or "tool_name" in row or "robot_kind" in row
-
-
-def _stop_answer(robot: str, reply: Mapping[str, Any], keys: Mapping[str, bytes] | None) -> Envelope:
-    if reply.get("type") not in ("response", "error"):
-        return error(f"{robot} did not answer.", stopped=None)
-    result = reply.get("result")
-    if not grade(result).stopped:
-        return error(explain(result) if result is not None else plain_text(reply.get("error")), stopped=False)
-    why = stop_distrust(reply, keys)
-    if why:
-        return error(why, stopped=False if why.startswith(ALARM) else None)
-    return dict(result) if isinstance(result, Mapping) else error("unknown answer", stopped=None)

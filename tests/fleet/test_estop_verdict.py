@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Collection
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,14 +12,14 @@ import pytest
 from strands_robots.device_connect import safety_controller
 from strands_robots.device_connect.backends import LinkConfig
 from strands_robots.envelope import Envelope, error, success, text_of
+from strands_robots.fleet.device_connect import stops
 from strands_robots.safety import stop_roster
 from strands_robots.safety.answers import Answer
-from strands_robots.safety.controller import StopReport
+from strands_robots.safety.controller import Progress, StopReport
 from strands_robots.safety.network_key import DEVICE_CONNECT, NetworkKey
 from strands_robots.safety.roster import Roster, RosterRow
 from strands_robots.safety.sightings import Known
 from strands_robots.safety.silence import Sending
-from strands_robots.tools import networks
 
 NETWORK = NetworkKey.of(DEVICE_CONNECT, ["tcp/127.0.0.1:7447"])
 STOPPED = success("stopped", stopped=True)
@@ -35,7 +36,7 @@ class PlainFleet:
     def __init__(self, plain: dict[str, Envelope]) -> None:
         self.plain, self.asked, self.measured = plain, list[str](), False
 
-    def peers(self) -> list[Any]:
+    def peers(self, timeout: float) -> list[Any]:
         return [SimpleNamespace(id=name, stop_verb="stop", cell="") for name in self.plain]
 
     def stop_each(self, devices: list[str], seconds: float) -> dict[str, Envelope]:
@@ -61,13 +62,27 @@ def press(monkeypatch: pytest.MonkeyPatch) -> Press:
         stopped = {each.device_id: each for each in answers if not each.claimed}
         claimed = {each.device_id: each for each in answers if each.claimed}
         report = StopReport("e" * 32, stopped, {}, {}, (), True, 12.0, claimed=claimed, alarms=alarms or {})
-        controller = SimpleNamespace(sending=Sending(), close=lambda: None)
-        monkeypatch.setattr(safety_controller, "safety_controller", lambda *_: controller)
+        left = threading.Event()
 
-        def searched(_controller: Any, search: Any, *_: Any) -> StopReport:
-            search.roster.read()
-            search.roster.find(dict.fromkeys(plain, True))
+        def sent(*_: Any, on_progress: Callable[[Progress], None], **__: Any) -> StopReport:
+            on_progress(Progress("e" * 32, {}, (), True, 1.0))
+            assert left.wait(20)
             return report
+
+        def expect(estop_id: str, names: Collection[str], *, more: bool = False) -> bool:
+            if not more:
+                left.set()
+            return True
+
+        controller = SimpleNamespace(
+            sending=Sending(),
+            close=lambda: None,
+            press=lambda _: None,
+            stop=sent,
+            expect=expect,
+            controller_id="tool",
+        )
+        monkeypatch.setattr(safety_controller, "safety_controller", lambda *_: controller)
 
         measure = stop_roster.StopRoster.outcome
 
@@ -75,9 +90,8 @@ def press(monkeypatch: pytest.MonkeyPatch) -> Press:
             fleet.measured = True
             return measure(self, *given)
 
-        monkeypatch.setattr(networks, "stop_and_search", searched)
         monkeypatch.setattr(stop_roster.StopRoster, "outcome", measured)
-        answer = networks.stop_and_lock(fleet, "test")  # type: ignore[arg-type]
+        answer = stops.stop_and_lock(fleet, "test")  # type: ignore[arg-type]
         assert fleet.asked == [name for name in plain if name not in stopped]
         return answer
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Collection
 from typing import TYPE_CHECKING, Any
 
-from strands_robots.cli.lockout_report import LockoutReport
-from strands_robots.cli.resume_mesh import ask_peers, lockable_peers
+from strands_robots.fleet.mesh.lockouts import lockable_peers
+from strands_robots.fleet.mesh.standing import MeshReports, mesh_network
+from strands_robots.fleet.stop_answers import stop_outcome
 from strands_robots.safety.answers import Answer
 from strands_robots.safety.controller import OnProgress, Press, Progress, StopReport
 from strands_robots.safety.orders import new_epoch
@@ -16,10 +18,8 @@ from strands_robots.safety.roster_inbox import OnReport
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.safety.silence import Sending
 from strands_robots.safety.statements import ALARM
-from strands_robots.safety.stop_roster import robots_known_at
+from strands_robots.safety.stop_roster import READ_WITHIN_S, robots_known_at
 from strands_robots.safety.stopping import explain
-from strands_robots.tools.mesh_roster import MeshReports, mesh_network
-from strands_robots.tools.roster_verdict import stop_outcome
 
 if TYPE_CHECKING:
     from strands_robots.mesh import Mesh
@@ -49,9 +49,11 @@ class MeshController:
         """True while this peer is on the mesh."""
         return self._mesh.alive
 
-    def press(self, estop_id: str) -> None:
+    def press(self, estop_id: str) -> Press:
         """Note the moment of a press, from which its answers are counted."""
-        self._press = (estop_id, Press(time.monotonic(), time.time()))
+        if self._press[0] != estop_id:
+            self._press = (estop_id, Press(time.monotonic(), time.time()))
+        return self._press[1]
 
     def check_in_every(self, interval_s: float) -> None:
         """Check in with the robots that need a live controller."""
@@ -74,9 +76,7 @@ class MeshController:
         """
         self._named = frozenset(expected) | scope.only
         epoch = estop_id or new_epoch()
-        if self._press[0] != epoch:
-            self.press(epoch)
-        pressed = self._press[1]
+        pressed = self.press(epoch)
         answers: dict[str, Answer] = {}
         alarms: dict[str, str] = {}
         widened: list[bool] = []
@@ -105,17 +105,22 @@ class MeshController:
 
         up = self.link_up
         self._reports.inbox.open(epoch, on_report)
-        note(
-            self._mesh.emergency_stop(
-                self._key,
-                estop_id=epoch,
-                on_answers=note,
-                scope=scope,
-                remembers=robots_known_at(mesh_network),
-                on_widened=lambda: widened.append(True),
-            )
+        # On a thread: a disk that hangs delays no sending.
+        reading = threading.Thread(target=self._load_keys, name="enrolled keys", daemon=True)
+        reading.start()
+        replies = self._mesh.emergency_stop(
+            self._key,
+            estop_id=epoch,
+            on_answers=note,
+            scope=scope,
+            remembers=robots_known_at(mesh_network),
+            on_widened=lambda: widened.append(True),
         )
         self._reports.inbox.close(epoch)
+        reading.join(READ_WITHIN_S)
+        # By the keys of now: a robot may have been enrolled since the last stop.
+        answers.clear()
+        note(replies)
         robots = {*self._named, *lockable_peers(self._mesh)}
         told = {name: each for name, each in answers.items() if name in robots}
         return StopReport(
@@ -137,14 +142,12 @@ class MeshController:
         self._named |= frozenset(names)
         return True
 
+    def _load_keys(self) -> None:
+        self._keys = enrolled_peers()
+
     def review(self, report: StopReport) -> StopReport:
         """Return the report as it is: a peer answers a stop once."""
         return report
-
-    def reports(self, known: Collection[str], seconds: float) -> list[LockoutReport]:
-        """Ask the robots in reach and those known for their lockouts."""
-        self._keys = enrolled_peers()
-        return ask_peers(self._mesh, sorted({*lockable_peers(self._mesh), *known}), seconds)
 
 
 def _answer(name: str, reply: dict[str, Any], latency_ms: float, *, claimed: bool) -> Answer:

@@ -1,0 +1,1 @@
+"""Device Connect for the calling side."""

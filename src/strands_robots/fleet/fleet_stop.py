@@ -1,0 +1,165 @@
+"""Outcome of a stop of all robots, on every network of a fleet."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from strands_robots.envelope import Envelope
+from strands_robots.safety.answers import Answer
+from strands_robots.safety.stop_notes import stop_notes
+from strands_robots.safety.stop_roster import StopOutcome
+from strands_robots.safety.stopping import StopVerdict, graded
+from strands_robots.utils import plain_text
+
+HALTED_MAX = 64
+
+
+@dataclass(frozen=True, slots=True)
+class NetworkStop:
+    """A stop on one network.
+
+    Attributes:
+        network: its name.
+        outcome: measured by the network's roster; None where nothing is known of the network.
+        answers: of the robots to a plain stop, by id.
+        absent: why it did not leave on this network; empty where it did.
+    """
+
+    network: str
+    outcome: StopOutcome | None = None
+    answers: Mapping[str, Envelope] | None = None
+    absent: str = ""
+
+    @property
+    def ok(self) -> bool:
+        """True when each robot of the roster stands still; a network without any is no failure."""
+        outcome = self.outcome
+        if outcome is None:
+            return not self.absent
+        return outcome.ok or not (outcome.size or outcome.problems or outcome.no_stop)
+
+    @property
+    def sentence(self) -> str:
+        """What came of it, in words."""
+        left = f"It did not leave on {self.network}: {self.absent.rstrip('.')}." if self.absent else ""
+        if self.outcome is None:
+            return left
+        return " ".join(filter(None, [left, self.outcome.sentence, *stop_notes(self.outcome)]))
+
+    def verdicts(self) -> dict[str, StopVerdict]:
+        """Return the verdict of each robot that answered or had to, and one for those of a network that failed."""
+        outcome = self.outcome
+        if self.absent and (outcome is None or not outcome.size):
+            all_of_them = f"the robots on {self.network}"
+            return {all_of_them: StopVerdict(unknown={all_of_them: self.absent})}
+        if outcome is None:
+            return {}
+        verdicts = dict[str, StopVerdict]()
+        for part in (outcome.others, outcome.report):
+            verdicts |= {name: _verdict(name, each) for name, each in part.answered.items()}
+            verdicts |= {name: StopVerdict(unknown={name: f"ALARM: {why}"}) for name, why in part.alarms.items()}
+        for name in outcome.report.silent:
+            verdicts[name] = StopVerdict(unknown={name: outcome.reasons.get(name, "no answer")})
+        for name in outcome.no_stop:
+            verdicts[name] = StopVerdict(unknown={name: "it has no stop"})
+        for name, answer in (self.answers or {}).items():
+            if name in verdicts and verdicts[name].stopped:
+                verdicts[name] = verdict_of_answer(answer, name)
+        return verdicts
+
+
+class FleetStop(Mapping[str, StopVerdict]):
+    """Verdicts of a stop of all robots, by id::
+
+        stop = fleet.estop("a hand in the cell")
+        if not stop.ok:
+            print(stop)          # how many stand still, and who is missing
+        stop["arm-1"].stopped    # True, False, or None where it is not known
+
+    A robot that must answer and did not is in it as well, with an unknown verdict.
+
+    Attributes:
+        networks: the stop on each network.
+        estop_id: the epoch of the lockout; empty for a stop without one.
+    """
+
+    def __init__(self, networks: Sequence[NetworkStop], estop_id: str = "", known: Sequence[str] = ()) -> None:
+        self.networks, self.estop_id = tuple(networks), estop_id
+        by_robot: dict[str, list[StopVerdict]] = {name: [] for name in known}
+        for each in self.networks:
+            for name, verdict in each.verdicts().items():
+                by_robot.setdefault(name, []).append(verdict)
+        self._verdicts = {name: combined(name, by_robot[name], 0.0) for name in sorted(by_robot)}
+
+    @property
+    def ok(self) -> bool:
+        """True when every robot that had to answer is known to stand still, and one did."""
+        stopped = any(each.stopped for each in self._verdicts.values())
+        return stopped and all(each.ok for each in self.networks) and not self.missing
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """Robots that are not known to stand still."""
+        return tuple(name for name, each in self._verdicts.items() if not each.stopped)
+
+    def __getitem__(self, robot: str) -> StopVerdict:
+        return self._verdicts[robot]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._verdicts)
+
+    def __len__(self) -> int:
+        return len(self._verdicts)
+
+    def __str__(self) -> str:
+        said = [f"{name} did not stop." for name, each in self._verdicts.items() if each.stopped is False]
+        said += [f"{name}: {why}." for name, each in self._verdicts.items() for why in each.unknown.values()]
+        return " ".join([*said, *filter(None, (each.sentence for each in self.networks))]) or "No robot is known."
+
+    def __repr__(self) -> str:
+        return f"<FleetStop of {len(self)} robots: {'ok' if self.ok else str(self)}>"
+
+
+def verdict_of_answer(answer: object, name: str) -> StopVerdict:
+    """Return the answer to a stop of a remote robot as a verdict on ``name``."""
+    verdict = graded(answer, name)
+    if verdict.stopped and isinstance(answer, Mapping):
+        return StopVerdict(_halted(answer, name), settling=answer.get("settling") is True)
+    return StopVerdict(
+        verdict.halted,
+        {each: plain_text(why, 500) for each, why in verdict.not_stopped.items()},
+        {each: plain_text(why, 500) for each, why in verdict.unknown.items()},
+    )
+
+
+def combined(robot: str, verdicts: Sequence[StopVerdict], elapsed_ms: float) -> StopVerdict:
+    """Return the verdicts of all bearers of an id as one; unknown without any."""
+    if not verdicts:
+        return StopVerdict(unknown={robot: "it did not answer, or has no stop"}, elapsed_ms=elapsed_ms)
+    return StopVerdict(
+        tuple(name for each in verdicts for name in each.halted),
+        {name: why for each in verdicts for name, why in each.not_stopped.items()},
+        {name: why for each in verdicts for name, why in each.unknown.items()},
+        elapsed_ms,
+        any(each.settling for each in verdicts),
+    )
+
+
+def _verdict(name: str, answer: Answer) -> StopVerdict:
+    """Return an answer to an emergency stop as a verdict; what is not proven is unknown."""
+    why = plain_text(answer.why, 500)
+    if answer.stopped is False:
+        return StopVerdict(not_stopped={name: why or "it did not stop"})
+    if answer.stopped is None or answer.refused:
+        return StopVerdict(unknown={name: why or "it does not know"})
+    if answer.claimed:
+        return StopVerdict(unknown={name: "it is claimed to have stopped; its key did not sign that"})
+    return StopVerdict(_halted(answer.facts, name), settling=answer.facts.get("settling") is True)
+
+
+def _halted(fields: Mapping[str, Any], name: str) -> tuple[str, ...]:
+    listed = fields.get("halted", fields.get("stopped"))
+    halted = [plain_text(each, 100) for each in listed[:HALTED_MAX]] if isinstance(listed, list) else [name]
+    return tuple(filter(None, halted))

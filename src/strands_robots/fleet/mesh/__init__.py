@@ -1,0 +1,1 @@
+"""The native mesh for the calling side."""

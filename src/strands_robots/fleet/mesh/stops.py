@@ -1,0 +1,171 @@
+"""Stops of all robots on the mesh, measured by the roster."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Collection, Mapping
+from typing import TYPE_CHECKING, Any
+
+from strands_robots.envelope import Envelope, error, success
+from strands_robots.fleet.mesh.discovery import discover, in_reach
+from strands_robots.fleet.mesh.standing import MeshReports, mesh_network
+from strands_robots.fleet.stop_answers import measured, unanswered
+from strands_robots.safety.orders import new_epoch
+from strands_robots.safety.peer_answers import enrolled_peers, stop_distrust
+from strands_robots.safety.scope import EVERY_ROBOT, Scope
+from strands_robots.safety.silence import Sending
+from strands_robots.safety.statements import ALARM
+from strands_robots.safety.stop_roster import READ_WITHIN_S, StopOutcome, StopRoster, robots_known_at
+from strands_robots.safety.stopping import explain, grade
+from strands_robots.utils import plain_text
+
+if TYPE_CHECKING:
+    from strands_robots.mesh import Mesh
+
+ESTOP_S = 1.5
+"""Seconds in which peers answer a stop; it is repeated until then."""
+
+AGAIN_S = 1.0
+"""Seconds between two sendings of a stop that a peer in reach has not confirmed."""
+
+
+def stop_peers(mesh: Mesh, since: float | None = None) -> tuple[dict[str, Envelope], StopOutcome]:
+    """Stop every peer in reach; return answers and outcome.
+
+    Args:
+        mesh: the peer that stops them.
+        since: when it joined, in monotonic seconds; just now by default, so that the others are waited for.
+    """
+    roster = StopRoster(mesh_network())
+    answers = _stop_all(mesh, lambda: mesh.broadcast({"action": "stop"}, ESTOP_S), roster, since)
+    outcome = measured(answers, roster, Sending())
+    outcome.record(mesh.peer_id)
+    return answers, outcome
+
+
+def lock_peers(
+    mesh: Mesh,
+    signing_key: Any = None,
+    scope: Scope = EVERY_ROBOT,
+    *,
+    estop_id: str = "",
+    since: float | None = None,
+) -> tuple[dict[str, Envelope], StopOutcome]:
+    """Send the mesh's emergency stop, again while a peer has not confirmed it.
+
+    A peer that was seen and did not answer is named. Every repetition is the same stop.
+
+    Args:
+        mesh: the peer that sends it.
+        signing_key: signs it.
+        scope: the robots that it is for. Where none of them is there, every robot is stopped.
+        estop_id: 32 hex digits; a fresh one by default.
+        since: as in :func:`stop_peers`.
+    """
+    epoch = estop_id or new_epoch()
+    reports = MeshReports(mesh)
+    roster = StopRoster(mesh_network(), scope=scope)
+    reports.inbox.open(epoch, roster.take)
+    listening: list[threading.Thread] = []
+
+    def left(replies: list[dict[str, Any]]) -> None:
+        if not listening:
+            listening.append(threading.Thread(target=reports.begin, name="missed rosters", daemon=True))
+            listening[0].start()
+
+    def send() -> list[dict[str, Any]]:
+        some: dict[str, Any] = {}
+        if not roster.scope.everything:
+            known = robots_known_at(mesh_network)
+            some = {"scope": roster.scope, "remembers": known, "on_widened": roster.widen}
+        return mesh.emergency_stop(signing_key, estop_id=epoch, on_answers=left, **some)
+
+    try:
+        answers = _stop_all(mesh, send, roster, since)
+    finally:
+        reports.close()
+    outcome = measured(answers, roster, Sending(signed=signing_key is not None), epoch)
+    outcome.record(mesh.peer_id)
+    return answers, outcome
+
+
+def stop_answer(
+    target: str, reply: Mapping[str, Any], keys: Mapping[str, bytes] | None, *, locks: Collection[str] = ()
+) -> Envelope:
+    """Return a reply to a stop as an envelope; *stopped* counts only where an enrolled robot has signed it.
+
+    Args:
+        target: the peer's id.
+        reply: as the mesh returns it.
+        keys: enrolled keys by peer; None where they could not be read.
+        locks: robots that an emergency stop was for, each of which has to say that it is locked.
+    """
+    if reply.get("type") not in ("response", "error"):
+        return unanswered(target)
+    result = reply.get("result")
+    if not grade(result).stopped:
+        return error(explain(result) if result is not None else plain_text(reply.get("error")), stopped=False)
+    why = stop_distrust(reply, keys)
+    if why:
+        return error(why, stopped=False if why.startswith(ALARM) else None)
+    fields = result if isinstance(result, Mapping) else {}
+    free = target in locks and fields.get("locked") is not True
+    said = "stopped, and NOT LOCKED: its release knows no lock by command" if free else "stopped"
+    return {**fields, **success(said, stopped=True)}
+
+
+def _stop_all(
+    mesh: Mesh, stop: Callable[[], list[dict[str, Any]]], roster: StopRoster, since: float | None
+) -> dict[str, Envelope]:
+    """Send a stop, and again while a peer in reach has not confirmed it.
+
+    Args:
+        mesh: the peer that stops them.
+        stop: sends it once; returns the replies.
+        roster: read once it has left, and given the peers in reach.
+        since: when this peer joined, in monotonic seconds; just now for None.
+    """
+    seen: set[str] = set()
+    replies: dict[str, dict[str, Any]] = {}
+    answers: dict[str, Envelope] = {}
+    keys: list[Mapping[str, bytes] | None] = []
+    sent = time.monotonic()
+
+    def read() -> None:
+        try:
+            keys.append(enrolled_peers())
+        finally:
+            roster.read()
+
+    def send() -> None:
+        nonlocal sent
+        sent = time.monotonic()
+        replies.update({each["responder_id"]: each for each in stop() if each["responder_id"] != mesh.peer_id})
+
+    def graded() -> dict[str, Envelope]:
+        while keys and replies:
+            name, reply = replies.popitem()
+            answers[name] = stop_answer(name, reply, keys[0], locks=roster.scope.only)
+        return answers
+
+    def unconfirmed() -> bool:
+        seen.update(name for name in in_reach(mesh) if roster.scope.covers(name, _cells(mesh, name)))
+        return any(not graded().get(name, {}).get("stopped") for name in seen)
+
+    send()
+    # On a thread: a disk that hangs delays no further sending.
+    reading = threading.Thread(target=read, name="stop roster", daemon=True)
+    reading.start()
+    discover(mesh, lambda: send() if unconfirmed() and time.monotonic() - sent >= AGAIN_S else None, since=since)
+    if unconfirmed():
+        send()
+    reading.join(READ_WITHIN_S)
+    keys.append(None)  # not read in time: no answer counts as proven
+    roster.find(dict.fromkeys(seen, True), {name: next(iter(_cells(mesh, name)), "") for name in seen})
+    return {name: unanswered(name) for name in seen} | graded()
+
+
+def _cells(mesh: Mesh, peer: str) -> frozenset[str]:
+    cell = next((row.get("cell") for row in mesh.peers if row["peer_id"] == peer), None)
+    return frozenset({cell} if isinstance(cell, str) and cell else ())
