@@ -183,6 +183,7 @@ def test_screen_shows_lockouts_check_ins_and_gone_robots(monkeypatch: pytest.Mon
     assert "arm-9" not in output
     assert "SPACE stops everything" in output and "ERROR something" in output
     monkeypatch.setattr(safety_controller, "GONE_S", 0.0)
+    monkeypatch.setattr(watched_robots, "GONE_S", 0.0)
     fleet.update([LockoutReport("arm-1", problem="no answer")])
     assert "GONE" in drawn(fleet, button)
     assert set(fleet.expected()) == {"arm-1", "arm-2"}

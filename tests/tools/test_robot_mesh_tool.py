@@ -15,6 +15,7 @@ from fixtures.waiting import eventually
 
 from strands_robots.device_connect.discovery import Peer
 from strands_robots.envelope import Envelope, error, success
+from strands_robots.fleet.mesh import discovery, stops
 from strands_robots.fleet.mesh.standing import mesh_network
 from strands_robots.fleet.stop_answers import combined_verdict
 from strands_robots.mesh import init_mesh, safety
@@ -347,7 +348,8 @@ def timed_mesh(monkeypatch: pytest.MonkeyPatch) -> Callable[..., TimedMesh]:
     def make(arrivals: dict[str, float], **options: Any) -> TimedMesh:
         made = TimedMesh(arrivals, **options)
         monkeypatch.setattr("strands_robots.mesh.init_mesh", lambda *_: made)
-        monkeypatch.setattr(networks, "time", made)
+        monkeypatch.setattr(stops, "time", made)
+        monkeypatch.setattr(discovery, "time", made)
         return made
 
     return make
@@ -371,7 +373,7 @@ def test_hung_disk_delays_no_further_sending(
         waited.append(ended.wait(10.0))
         return {} if hangs == "keys" else Roster(mesh_network())
 
-    where, name = {"roster": (stop_roster.Roster, "of"), "keys": (networks, "enrolled_peers")}[hangs]
+    where, name = {"roster": (stop_roster.Roster, "of"), "keys": (stops, "enrolled_peers")}[hangs]
     monkeypatch.setattr(where, name, hang)
     try:
         verdict = NativeMesh().emergency_stop("")
@@ -389,7 +391,7 @@ def test_robot_that_connects_late_to_a_listener_is_stopped(
     mesh = timed_mesh({"arm-1": 0.4, "arm-2": 5.0, "arm-3": 8.5})
     assert NativeMesh().emergency_stop("")["robots"] == dict.fromkeys(("arm-1", "arm-2", "arm-3"), "stopped")
     for arrival in mesh.arrivals.values():
-        assert any(0 <= at - arrival <= networks.AGAIN_S + networks.LOOK_S for at in mesh.stops), mesh.stops
+        assert any(0 <= at - arrival <= stops.AGAIN_S + discovery.LOOK_S for at in mesh.stops), mesh.stops
     assert len(mesh.stops) == 4
 
 

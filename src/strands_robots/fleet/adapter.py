@@ -49,7 +49,7 @@ OnEvent = Callable[[RobotEvent], None]
 
 
 class NetworkAdapter(Protocol):
-    """Robots of one network: find, describe, call, stop and resume them, follow their events.
+    """Robots of one network, as the calling side finds, calls and stops them.
 
     Attributes:
         name: :data:`DEVICE_CONNECT` or :data:`MESH`.
@@ -105,21 +105,25 @@ class NetworkAdapter(Protocol):
 
     @property
     def reach(self) -> str:
-        """Where robots are looked for, in one sentence."""
+        """One sentence on the place where robots are looked for."""
 
     @property
     def stale(self) -> str:
-        """Why there may be more robots than the last search found; empty where there are none."""
+        """Reason why the last search may have missed robots, or ""."""
 
     def stop_all(self, timeout: float = STOP_S) -> tuple[dict[str, Envelope], StopOutcome]:
-        """Stop every robot in reach, without a lockout; return the answers by id, and the outcome by the roster."""
+        """Stop every robot in reach, without a lockout.
+
+        Returns:
+            The answers by id, and the outcome measured by the roster.
+        """
 
     def emergency_stop(
         self, reason: str, *, scope: Scope = EVERY_ROBOT, signing_key: Any = None, estop_id: str = ""
     ) -> StopOutcome:
-        """Stop and lock every robot, or those of ``scope``; return the outcome, which is recorded.
+        """Stop and lock every robot, or those of ``scope``; return the outcome.
 
-        It leaves on a connection of its own where the network has one.
+        The outcome is recorded. It leaves on a connection of its own where the network has one.
 
         Args:
             reason: sent to the robots.
@@ -129,9 +133,10 @@ class NetworkAdapter(Protocol):
         """
 
     def standing(self, signing_key: Any, known: Callable[[], Collection[str]]) -> AbstractContextManager[StopSender]:
-        """Return a controller that stands for the block: it reports whom it misses after the stops of others.
+        """Return a controller that stands for the length of the block.
 
-        It needs no :meth:`open` where its stops leave on a connection of their own.
+        It reports whom it misses after the stops of others. It needs no :meth:`open` where its stops leave on a
+        connection of their own.
 
         Args:
             signing_key: signs its stops and check-ins, or None.
@@ -139,7 +144,7 @@ class NetworkAdapter(Protocol):
         """
 
     def beats(self, robots: Iterable[str]) -> Mapping[str, float | None]:
-        """Return when each robot's last beat came, in monotonic seconds; None where it has none."""
+        """Return the monotonic time of each robot's last beat, None without one."""
 
     def lockable(self, timeout: float = FIND_S) -> list[str]:
         """Return the robots in reach that can be locked and resumed."""
@@ -159,7 +164,13 @@ class NetworkAdapter(Protocol):
         """
 
     def resume(self, reports: Sequence[LockoutReport], signer: Any, timeout: float) -> dict[str, Resumed]:
-        """Clear every lockout of these reports with the operator's key; return each robot's outcome."""
+        """Clear every lockout of these reports; return each robot's outcome.
+
+        Args:
+            reports: as :meth:`lockouts` gives them.
+            signer: the operator's Ed25519 key.
+            timeout: seconds in which each robot has to answer.
+        """
 
     def subscribe(self, robot: str, on_event: OnEvent) -> Callable[[], None]:
         """Receive the robot's events; return the function that ends it."""

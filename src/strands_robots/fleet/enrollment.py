@@ -1,4 +1,4 @@
-"""Enrolment of robots: their public keys, so that only signed answers count, and exemptions."""
+"""Enrolment of robots: their public keys, and exemptions from answering."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Enrolment:
 
 
 def enroll(reports: Sequence[LockoutReport], network: NetworkKey, *, replace: bool = False) -> dict[str, Enrolment]:
-    """Keep the keys that robots signed their reports with; return each robot's outcome.
+    """Keep the keys that robots signed with; return each robot's outcome.
 
     A robot that was exempt and shows its key must answer again.
 
@@ -90,7 +90,7 @@ def enrolled_robots() -> dict[str, EnrolledRobot]:
 
 
 def change_enrolment(robot: str, action: str, reason: str = "", *, tenant: str = "") -> str:
-    """Exempt an enrolled robot from answering, or undo its enrolment; return its name.
+    """Exempt an enrolled robot, or undo its enrolment; return its name.
 
     The change is recorded in the audit under the operator's name.
 
@@ -121,7 +121,7 @@ def change_enrolment(robot: str, action: str, reason: str = "", *, tenant: str =
 
 
 def served_here(robot: str) -> bool:
-    """Return whether a living process of this machine serves a robot of this local name."""
+    """Return whether a living process of this machine serves this robot."""
     return any(each.alive and local_name(each.network.tenant, each.name) == robot for each in sightings().read()[0])
 
 

@@ -12,7 +12,7 @@ from strands_robots._mesh_switch import mesh_env_request
 from strands_robots.errors import NoSuchRobotError, RefusalError, UnreachableError
 from strands_robots.fleet.adapter import DEVICE_CONNECT, FIND_S, MESH, STOP_S, FoundRobot, NetworkAdapter
 from strands_robots.fleet.enrollment import Enrolment, enroll
-from strands_robots.fleet.fleet_stop import FleetStop, NetworkStop
+from strands_robots.fleet.fleet_verdict import FleetVerdict, NetworkVerdict
 from strands_robots.fleet.link_flags import LinkFlags
 from strands_robots.fleet.lockout_report import LockoutReport, Resumed
 from strands_robots.fleet.remote_robot import RemoteRobot
@@ -193,7 +193,7 @@ class Fleet:
             if (kind is None or kind in (each.type, each.model)) and (network is None or network == each.network)
         ]
 
-    def stop(self) -> FleetStop:
+    def stop(self) -> FleetVerdict:
         """Halt every robot in reach, without a lockout; return the verdicts by id.
 
         A robot is stopped as soon as it is found. The robots that this machine remembers of each network must answer.
@@ -204,16 +204,16 @@ class Fleet:
         """
         joined = self._joined
         stops = side_by_side(_all_stopped, joined)
-        return FleetStop([*stops, *self._not_reached(joined)], known=tuple(self._robots))
+        return FleetVerdict([*stops, *self._not_reached(joined)], known=tuple(self._robots))
 
     def estop(
         self, reason: str = "", *, only: Sequence[str] | str = (), cell: str = "", signing_key: Any = None
-    ) -> FleetStop:
-        """Stop every robot of every network and lock it, until the operator resumes it; return the verdicts by id.
+    ) -> FleetVerdict:
+        """Stop and lock every robot of every network; return the verdicts by id.
 
-        It leaves on each network at once under one id. With ``only`` or ``cell`` it is for those robots; where none of
-        them is there, every robot is stopped. No argument refuses it: what cannot be read is left out, and every robot
-        is stopped. Never raises for a verdict.
+        A robot stays locked until the operator resumes it. The stop leaves on each network at once, under one id. With
+        ``only`` or ``cell`` it is for those robots; where none of them is there, every robot is stopped. No argument
+        refuses it: what cannot be read is left out, and every robot is stopped. Never raises for a verdict.
 
         Args:
             reason: sent to the robots, at most 200 characters.
@@ -232,15 +232,15 @@ class Fleet:
         for note in filter(None, (cut, unread)):
             logger.warning("Ignored: %s.", note)
 
-        def stopped(network: NetworkAdapter) -> NetworkStop:
+        def stopped(network: NetworkAdapter) -> NetworkVerdict:
             try:
                 outcome = network.emergency_stop(why, scope=scope, signing_key=signing_key, estop_id=estop_id)
             except Exception as exc:  # noqa: BLE001 - a network that fails must not hide the verdicts of the others
                 return _not_left(network, exc)
-            return NetworkStop(network.name, outcome)
+            return NetworkVerdict(network.name, outcome)
 
         stops = [*side_by_side(stopped, joined), *self._not_reached(joined)]
-        return FleetStop(stops, estop_id, tuple(self._robots) if scope.everything else ())
+        return FleetVerdict(stops, estop_id, tuple(self._robots) if scope.everything else ())
 
     def lockouts(self, timeout: float = FIND_S) -> dict[str, LockoutReport]:
         """Ask the robots in reach for their lockouts; return the reports by id.
@@ -254,9 +254,10 @@ class Fleet:
         return {each.name: each for _, reports in reversed(self._asked((), seconds)) for each in reports}
 
     def resume(self, signing_key: Any, robots: Sequence[str] | str = (), *, timeout: float = 5.0) -> dict[str, Resumed]:
-        """Clear the lockouts of robots with the operator's key; return by id whether each is free, and what it said.
+        """Clear the lockouts of robots; return by id whether each is free.
 
-        It starts no motion. A resume names the epochs that the robot holds now, so it never clears one of a later stop.
+        What each said comes with it. It starts no motion. A resume names the epochs that the robot holds now, so it
+        never clears one of a later stop.
 
         Args:
             signing_key: the operator's Ed25519 private key.
@@ -286,9 +287,10 @@ class Fleet:
         return outcomes
 
     def enroll(self, *, replace: bool = False, timeout: float = FIND_S) -> dict[str, Enrolment]:
-        """Keep the public keys of the robots in reach: from then on only a signed answer counts.
+        """Keep the public keys of the robots in reach.
 
-        Compare each fingerprint with the one that ``strands-robots doctor`` shows at the robot's own machine.
+        From then on only a signed answer counts. Compare each fingerprint with the one that ``strands-robots doctor``
+        shows at the robot's own machine.
 
         Args:
             replace: accept another key than the enrolled one, or another network.
@@ -305,7 +307,7 @@ class Fleet:
     def _asked(
         self, robots: Sequence[str], seconds: float, *, signed: bool = False
     ) -> list[tuple[NetworkAdapter, list[LockoutReport]]]:
-        """Return the reports of the lockable robots, or of these where a network has them."""
+        """Return the reports of the lockable robots by network."""
 
         def asked(network: NetworkAdapter) -> list[LockoutReport] | str:
             try:
@@ -326,8 +328,8 @@ class Fleet:
             raise UnreachableError(self._absences)
         return found
 
-    def _not_reached(self, joined: Sequence[NetworkAdapter]) -> list[NetworkStop]:
-        """Return the networks that were to be joined and are not, with the robots that must answer there."""
+    def _not_reached(self, joined: Sequence[NetworkAdapter]) -> list[NetworkVerdict]:
+        """Return networks that are not joined, and have robots that must answer."""
         absent = [each for each in self._stated if each not in joined]
         stops = [_not_left(each, self.absent.get(each.name, "it is not joined")) for each in absent]
         return [each for each in stops if each.outcome is not None and each.outcome.size]
@@ -406,16 +408,16 @@ def _found(network: NetworkAdapter, timeout: float) -> list[FoundRobot] | str:
         return plain_text(f"{type(exc).__name__}: {exc}")
 
 
-def _all_stopped(network: NetworkAdapter) -> NetworkStop:
+def _all_stopped(network: NetworkAdapter) -> NetworkVerdict:
     try:
         answers, outcome = network.stop_all(STOP_S)
     except Exception as exc:  # noqa: BLE001 - a stop that fails is a verdict, whatever it raised
         return _not_left(network, exc)
-    return NetworkStop(network.name, outcome, answers)
+    return NetworkVerdict(network.name, outcome, answers)
 
 
-def _not_left(network: NetworkAdapter, why: object) -> NetworkStop:
-    """Return a stop that did not leave on a network, with the robots that must answer there."""
+def _not_left(network: NetworkAdapter, why: object) -> NetworkVerdict:
+    """Return the verdict of a network that a stop did not reach."""
     said = plain_text(str(why)) or type(why).__name__
     try:
         roster = StopRoster(network.key)
@@ -423,5 +425,5 @@ def _not_left(network: NetworkAdapter, why: object) -> NetworkStop:
         outcome = measured({}, roster, Sending(left=False))
     except Exception as exc:  # noqa: BLE001 - the roster's disk must not hide the verdicts of other networks
         logger.warning("The roster of %s cannot be read: %s", network.name, exc)
-        return NetworkStop(network.name, absent=said)
-    return NetworkStop(network.name, outcome, absent=said)
+        return NetworkVerdict(network.name, absent=said)
+    return NetworkVerdict(network.name, outcome, absent=said)

@@ -1,4 +1,4 @@
-"""Limits and units of joints in a robot's answer to ``getFeatures``, within bounds."""
+"""Limits and units of joints, as a robot's ``getFeatures`` states them."""
 
 from __future__ import annotations
 

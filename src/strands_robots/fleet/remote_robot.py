@@ -20,7 +20,7 @@ from strands_robots.errors import AmbiguousRobotError, NoSuchRobotError, Refusal
 from strands_robots.fleet.adapter import STOP_S, FoundRobot, NetworkAdapter
 from strands_robots.fleet.description import docstring, python_name, signature
 from strands_robots.fleet.event_feed import EventFeed
-from strands_robots.fleet.fleet_stop import combined, verdict_of_answer
+from strands_robots.fleet.fleet_verdict import combined, verdict_of_answer
 from strands_robots.fleet.lease import HeldLease, SharedLease
 from strands_robots.fleet.refusals import refusal_of
 from strands_robots.fleet.shared_id import SharedId

@@ -22,7 +22,7 @@ KEY_REPEAT_S = 1.0
 
 
 class StopSender(Protocol):
-    """Sender of emergency stops and check-ins on one network, such as a ``SafetyController``."""
+    """Sender of emergency stops on one network, such as a ``SafetyController``."""
 
     @property
     def controller_id(self) -> str:

@@ -29,7 +29,7 @@ Join = Callable[[], NetworkAdapter]
 
 
 class WatchedRobots:
-    """Robots that were seen and not forgotten, polled on a thread and a connection of its own.
+    """Robots that were seen and not forgotten, polled on a thread of its own.
 
     Args:
         join: joins the network.

@@ -21,9 +21,9 @@ logger = stop_logger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class FoundDevices:
-    """Devices in reach: whether each has a stop, and its cell, None where it states none.
+    """Devices in reach, each with its cell and whether it has a stop.
 
-    ``problem`` says why there may be more; empty where there are none.
+    The cell is None where it states none. ``problem`` says why there may be more; empty where there are none.
     """
 
     devices: Mapping[str, tuple[bool, str | None]]

@@ -1,4 +1,4 @@
-"""Lockouts of robots on Device Connect: asked for, and cleared with the operator's key."""
+"""Lockouts of robots on Device Connect, asked for and cleared."""
 
 from __future__ import annotations
 

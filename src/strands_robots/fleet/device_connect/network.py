@@ -155,7 +155,7 @@ class DeviceConnectNetwork:
 
     @property
     def stale(self) -> str:
-        """What the registry did not list."""
+        """Reason why the registry's list may lack devices, or ""."""
         return self._client.stale
 
     def stop_all(self, timeout: float = STOP_S) -> tuple[dict[str, Envelope], StopOutcome]:

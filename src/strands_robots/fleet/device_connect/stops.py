@@ -72,7 +72,7 @@ def stop_and_lock(fleet: FleetClient, reason: str, scope: Scope = EVERY_ROBOT) -
 def stopped_and_locked(
     fleet: FleetClient, reason: str, *, scope: Scope = EVERY_ROBOT, signing_key: Any = None, estop_id: str = ""
 ) -> tuple[StopOutcome, list[str]]:
-    """Do as :func:`stop_and_lock`; return the outcome, and the devices that were not locked.
+    """Do as :func:`stop_and_lock`; return outcome and devices that are not locked.
 
     Args:
         fleet: a connected client.

@@ -181,7 +181,7 @@ class MeshNetwork:
 
     @property
     def stale(self) -> str:
-        """Empty: each peer announces itself."""
+        """Nothing: each peer announces itself."""
         return ""
 
     def stop_all(self, timeout: float = STOP_S) -> tuple[dict[str, Envelope], StopOutcome]:

@@ -93,7 +93,9 @@ def lock_peers(
 def stop_answer(
     target: str, reply: Mapping[str, Any], keys: Mapping[str, bytes] | None, *, locks: Collection[str] = ()
 ) -> Envelope:
-    """Return a reply to a stop as an envelope; *stopped* counts only where an enrolled robot has signed it.
+    """Return a reply to a stop as an envelope.
+
+    *Stopped* counts only where an enrolled robot has signed it.
 
     Args:
         target: the peer's id.
@@ -101,7 +103,7 @@ def stop_answer(
         keys: enrolled keys by peer; None where they could not be read.
         locks: robots that an emergency stop was for, each of which has to say that it is locked.
     """
-    if reply.get("type") not in ("response", "error"):
+    if "result" not in reply and reply.get("type") != "error":
         return unanswered(target)
     result = reply.get("result")
     if not grade(result).stopped:

@@ -17,7 +17,7 @@ HALTED_MAX = 64
 
 
 @dataclass(frozen=True, slots=True)
-class NetworkStop:
+class NetworkVerdict:
     """A stop on one network.
 
     Attributes:
@@ -34,7 +34,7 @@ class NetworkStop:
 
     @property
     def ok(self) -> bool:
-        """True when each robot of the roster stands still; a network without any is no failure."""
+        """True when each robot of the roster stands still, or it has none."""
         outcome = self.outcome
         if outcome is None:
             return not self.absent
@@ -42,14 +42,17 @@ class NetworkStop:
 
     @property
     def sentence(self) -> str:
-        """What came of it, in words."""
+        """Outcome in words."""
         left = f"It did not leave on {self.network}: {self.absent.rstrip('.')}." if self.absent else ""
         if self.outcome is None:
             return left
         return " ".join(filter(None, [left, self.outcome.sentence, *stop_notes(self.outcome)]))
 
     def verdicts(self) -> dict[str, StopVerdict]:
-        """Return the verdict of each robot that answered or had to, and one for those of a network that failed."""
+        """Return the verdict of each robot that answered or had to.
+
+        A network that failed, and of which no robot is known, has one verdict for all its robots.
+        """
         outcome = self.outcome
         if self.absent and (outcome is None or not outcome.size):
             all_of_them = f"the robots on {self.network}"
@@ -70,7 +73,7 @@ class NetworkStop:
         return verdicts
 
 
-class FleetStop(Mapping[str, StopVerdict]):
+class FleetVerdict(Mapping[str, StopVerdict]):
     """Verdicts of a stop of all robots, by id::
 
         stop = fleet.estop("a hand in the cell")
@@ -85,7 +88,7 @@ class FleetStop(Mapping[str, StopVerdict]):
         estop_id: the epoch of the lockout; empty for a stop without one.
     """
 
-    def __init__(self, networks: Sequence[NetworkStop], estop_id: str = "", known: Sequence[str] = ()) -> None:
+    def __init__(self, networks: Sequence[NetworkVerdict], estop_id: str = "", known: Sequence[str] = ()) -> None:
         self.networks, self.estop_id = tuple(networks), estop_id
         by_robot: dict[str, list[StopVerdict]] = {name: [] for name in known}
         for each in self.networks:
@@ -119,7 +122,7 @@ class FleetStop(Mapping[str, StopVerdict]):
         return " ".join([*said, *filter(None, (each.sentence for each in self.networks))]) or "No robot is known."
 
     def __repr__(self) -> str:
-        return f"<FleetStop of {len(self)} robots: {'ok' if self.ok else str(self)}>"
+        return f"<FleetVerdict of {len(self)} robots: {'ok' if self.ok else str(self)}>"
 
 
 def verdict_of_answer(answer: object, name: str) -> StopVerdict:
@@ -148,7 +151,10 @@ def combined(robot: str, verdicts: Sequence[StopVerdict], elapsed_ms: float) -> 
 
 
 def _verdict(name: str, answer: Answer) -> StopVerdict:
-    """Return an answer to an emergency stop as a verdict; what is not proven is unknown."""
+    """Return an answer to an emergency stop as a verdict.
+
+    What is not proven is unknown.
+    """
     why = plain_text(answer.why, 500)
     if answer.stopped is False:
         return StopVerdict(not_stopped={name: why or "it did not stop"})
