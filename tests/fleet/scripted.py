@@ -13,7 +13,7 @@ from strands_robots.fleet.stop_answers import measured
 from strands_robots.safety.identity import SigningIdentity
 from strands_robots.safety.lockout import Lockout
 from strands_robots.safety.network_key import NetworkKey
-from strands_robots.safety.scope import EVERY_ROBOT, Scope
+from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope
 from strands_robots.safety.silence import Sending
 from strands_robots.safety.statements import Purpose, signed
 from strands_robots.safety.stop_roster import StopOutcome, StopRoster
@@ -68,6 +68,7 @@ class ScriptedNetwork:
         self.estops: list[tuple[str, Scope, str]] = []
         self.locked: dict[str, str] = {}
         self.silent: list[str] = []
+        self.remembered = False
 
     def open(self) -> None:
         if self.unreachable:
@@ -137,18 +138,26 @@ class ScriptedNetwork:
         return answers, measured(answers, self._roster(), Sending())
 
     def emergency_stop(
-        self, reason: str, *, scope: Scope = EVERY_ROBOT, signing_key: Any = None, estop_id: str = ""
+        self,
+        reason: str,
+        *,
+        scope: Scope = EVERY_ROBOT,
+        signing_key: Any = None,
+        estop_id: str = "",
+        remembers: Remembers | None = None,
     ) -> StopOutcome:
         self.estops.append((reason, scope, estop_id))
+        self.remembered = remembers is not None and remembers(scope)
         if self.unreachable:
             raise UnreachableError(self.unreachable)
         answers = {name: self.stop(name) or error("none") for name in self.robots if scope.covers(name, frozenset())}
         self.locked |= dict.fromkeys(answers, estop_id)
-        return measured(answers, self._roster(), Sending(), estop_id)
+        return measured(answers, self._roster(scope), Sending(), estop_id)
 
-    def _roster(self) -> StopRoster:
-        roster = StopRoster(self.key)
-        roster.find(dict.fromkeys((*self.robots, *self.silent), True))
+    def _roster(self, scope: Scope = EVERY_ROBOT) -> StopRoster:
+        roster = StopRoster(self.key, scope=scope)
+        inside = [name for name in (*self.robots, *self.silent) if scope.covers(name, frozenset())]
+        roster.find(dict.fromkeys(inside, True))
         roster.read()
         return roster
 

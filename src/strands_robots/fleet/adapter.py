@@ -11,7 +11,7 @@ from strands_robots.envelope import Envelope
 from strands_robots.fleet.lockout_report import LockoutReport, Resumed
 from strands_robots.fleet.stop_button import StopSender
 from strands_robots.safety.network_key import NetworkKey
-from strands_robots.safety.scope import EVERY_ROBOT, Scope
+from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope
 from strands_robots.safety.stop_roster import StopOutcome
 
 DEVICE_CONNECT, MESH = "device_connect", "mesh"
@@ -119,7 +119,13 @@ class NetworkAdapter(Protocol):
         """
 
     def emergency_stop(
-        self, reason: str, *, scope: Scope = EVERY_ROBOT, signing_key: Any = None, estop_id: str = ""
+        self,
+        reason: str,
+        *,
+        scope: Scope = EVERY_ROBOT,
+        signing_key: Any = None,
+        estop_id: str = "",
+        remembers: Remembers | None = None,
     ) -> StopOutcome:
         """Stop and lock every robot, or those of ``scope``; return the outcome.
 
@@ -130,6 +136,7 @@ class NetworkAdapter(Protocol):
             scope: the robots that it is for. Where none of them is there, every robot is stopped.
             signing_key: an Ed25519 key that signs it.
             estop_id: 32 hex digits, the epoch of the lockout; a fresh one by default.
+            remembers: says whether a robot of ``scope`` is known; by default by this network's roster.
         """
 
     def standing(self, signing_key: Any, known: Callable[[], Collection[str]]) -> AbstractContextManager[StopSender]:

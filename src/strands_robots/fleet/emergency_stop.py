@@ -83,14 +83,15 @@ class EmergencyStop:
         It waits for the search; where that failed there are none, and the outcome has its problem.
         """
         try:
-            devices = self._found.result().devices
+            found = self._found.result()
         except Exception:  # noqa: BLE001 - logged by the search, and told by the outcome
             return []
+        self._search.complete(found)
         answered = {*report.stopped, *report.not_stopped, *report.refused}
         scope = EVERY_ROBOT if report.widened else self._search.scope
         return [
             name
-            for name, (stops, cell) in devices.items()
+            for name, (stops, cell) in found.devices.items()
             if stops and name not in answered and scope.covers(name, {cell or ""} - {""})
         ]
 

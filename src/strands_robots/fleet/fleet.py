@@ -19,8 +19,9 @@ from strands_robots.fleet.remote_robot import RemoteRobot
 from strands_robots.fleet.side_by_side import side_by_side
 from strands_robots.fleet.stop_answers import measured
 from strands_robots.safety.orders import new_epoch
+from strands_robots.safety.scope import Scope
 from strands_robots.safety.silence import Sending
-from strands_robots.safety.stop_roster import StopRoster
+from strands_robots.safety.stop_roster import StopRoster, robots_known_at
 from strands_robots.safety.unheard import unheard_now
 from strands_robots.serving.stop_arguments import stop_reason, stop_scope
 from strands_robots.utils import DURATION_MAX_S, ValidationError, device_id, near, number, plain_text, shown
@@ -232,15 +233,24 @@ class Fleet:
         for note in filter(None, (cut, unread)):
             logger.warning("Ignored: %s.", note)
 
+        def remembers(meant: Scope) -> bool:
+            # Of the robots that a stop means none need be on each network; only where none is on any all are stopped.
+            if any(each.bears(name) for each in joined for name in meant.only):
+                return True
+            return any(robots_known_at(lambda each=each: each.key)(meant) for each in joined)  # type: ignore[misc]
+
         def stopped(network: NetworkAdapter) -> NetworkVerdict:
             try:
-                outcome = network.emergency_stop(why, scope=scope, signing_key=signing_key, estop_id=estop_id)
+                outcome = network.emergency_stop(
+                    why, scope=scope, signing_key=signing_key, estop_id=estop_id, remembers=remembers
+                )
             except Exception as exc:  # noqa: BLE001 - a network that fails must not hide the verdicts of the others
                 return _not_left(network, exc)
-            return NetworkVerdict(network.name, outcome)
+            absent = frozenset(name for name in scope.only if not network.bears(name))
+            return NetworkVerdict(network.name, outcome, not_here=absent)
 
         stops = [*side_by_side(stopped, joined), *self._not_reached(joined)]
-        return FleetVerdict(stops, estop_id, tuple(self._robots) if scope.everything else ())
+        return FleetVerdict(stops, estop_id, tuple(self._robots) if scope.everything else tuple(scope.only))
 
     def lockouts(self, timeout: float = FIND_S) -> dict[str, LockoutReport]:
         """Ask the robots in reach for their lockouts; return the reports by id.
@@ -281,9 +291,9 @@ class Fleet:
         outcomes: dict[str, Resumed] = {}
         done = side_by_side(lambda one: one[0].resume(one[1], signing_key, seconds), asked)
         for freed in reversed(done):
-            for name, (free, said) in freed.items():
+            for name, outcome in freed.items():
                 # Locked on one of two networks is locked.
-                outcomes[name] = (free and outcomes.get(name, (True, ""))[0], said)
+                outcomes[name] = min(outcomes.get(name, outcome), outcome, key=lambda each: each[0])
         return outcomes
 
     def enroll(self, *, replace: bool = False, timeout: float = FIND_S) -> dict[str, Enrolment]:

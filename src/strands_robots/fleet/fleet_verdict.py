@@ -25,20 +25,27 @@ class NetworkVerdict:
         outcome: measured by the network's roster; None where nothing is known of the network.
         answers: of the robots to a plain stop, by id.
         absent: why it did not leave on this network; empty where it did.
+        not_here: robots that the stop named and this network does not have, whose silence says nothing.
     """
 
     network: str
     outcome: StopOutcome | None = None
     answers: Mapping[str, Envelope] | None = None
     absent: str = ""
+    not_here: frozenset[str] = frozenset()
 
     @property
-    def ok(self) -> bool:
-        """True when each robot of the roster stands still, or it has none."""
-        outcome = self.outcome
-        if outcome is None:
-            return not self.absent
-        return outcome.ok or not (outcome.size or outcome.problems or outcome.no_stop)
+    def problems(self) -> Sequence[str]:
+        """Reasons why there may be more robots than the verdicts name."""
+        return self.outcome.problems if self.outcome is not None else ()
+
+    @property
+    def counted(self) -> frozenset[str]:
+        """Robots that had to answer; a name that was only heard need not where robots are enrolled."""
+        if self.outcome is None or not self.outcome.size:
+            return frozenset(self.verdicts())
+        report = self.outcome.report
+        return frozenset({*report.answered, *report.silent, *report.alarms} - self.not_here | {*report.answered})
 
     @property
     def sentence(self) -> str:
@@ -63,10 +70,10 @@ class NetworkVerdict:
         for part in (outcome.others, outcome.report):
             verdicts |= {name: _verdict(name, each) for name, each in part.answered.items()}
             verdicts |= {name: StopVerdict(unknown={name: f"ALARM: {why}"}) for name, why in part.alarms.items()}
-        for name in outcome.report.silent:
+        for name in {*outcome.report.silent} - self.not_here:
             verdicts[name] = StopVerdict(unknown={name: outcome.reasons.get(name, "no answer")})
         for name in outcome.no_stop:
-            verdicts[name] = StopVerdict(unknown={name: "it has no stop"})
+            verdicts.setdefault(name, StopVerdict(unknown={name: "it has no stop"}))
         for name, answer in (self.answers or {}).items():
             if name in verdicts and verdicts[name].stopped:
                 verdicts[name] = verdict_of_answer(answer, name)
@@ -95,17 +102,18 @@ class FleetVerdict(Mapping[str, StopVerdict]):
             for name, verdict in each.verdicts().items():
                 by_robot.setdefault(name, []).append(verdict)
         self._verdicts = {name: combined(name, by_robot[name], 0.0) for name in sorted(by_robot)}
+        self._counted = frozenset(known).union(*(each.counted for each in self.networks))
 
     @property
     def ok(self) -> bool:
         """True when every robot that had to answer is known to stand still, and one did."""
         stopped = any(each.stopped for each in self._verdicts.values())
-        return stopped and all(each.ok for each in self.networks) and not self.missing
+        return stopped and not self.missing and not any(each.problems for each in self.networks)
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """Robots that are not known to stand still."""
-        return tuple(name for name, each in self._verdicts.items() if not each.stopped)
+        """Robots that had to answer, and are not known to stand still."""
+        return tuple(name for name, each in self._verdicts.items() if name in self._counted and not each.stopped)
 
     def __getitem__(self, robot: str) -> StopVerdict:
         return self._verdicts[robot]

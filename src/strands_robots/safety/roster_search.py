@@ -116,6 +116,11 @@ class RosterSearch:
         )
         self._expect(1, found.problem.rstrip("."))
 
+    def complete(self, found: FoundDevices) -> None:
+        """Note that these are all devices in reach, also where the stop is over."""
+        with self._lock:
+            self._problem = found.problem.rstrip(".")
+
     def failed(self, exc: Exception) -> None:
         """Note why devices in reach could not be looked up."""
         with self._lock:

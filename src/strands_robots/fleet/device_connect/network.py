@@ -25,7 +25,7 @@ from strands_robots.fleet.lockout_report import LockoutReport, Resumed
 from strands_robots.fleet.stop_button import StopSender
 from strands_robots.safety.identity import KeyFileError
 from strands_robots.safety.network_key import NetworkKey
-from strands_robots.safety.scope import EVERY_ROBOT, Scope
+from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope
 from strands_robots.safety.stop_roster import StopOutcome
 from strands_robots.utils import ValidationError, plain_text
 
@@ -164,7 +164,13 @@ class DeviceConnectNetwork:
             return stop_found(self._connected, timeout)
 
     def emergency_stop(
-        self, reason: str, *, scope: Scope = EVERY_ROBOT, signing_key: Any = None, estop_id: str = ""
+        self,
+        reason: str,
+        *,
+        scope: Scope = EVERY_ROBOT,
+        signing_key: Any = None,
+        estop_id: str = "",
+        remembers: Remembers | None = None,
     ) -> StopOutcome:
         """Stop and lock the robots of the tenant, on a connection of its own.
 
@@ -172,7 +178,12 @@ class DeviceConnectNetwork:
         """
         with _carried():
             outcome, _ = stopped_and_locked(
-                self._connected, reason, scope=scope, signing_key=signing_key, estop_id=estop_id
+                self._connected,
+                reason,
+                scope=scope,
+                signing_key=signing_key,
+                estop_id=estop_id,
+                remembers=remembers,
             )
         return outcome
 

@@ -10,7 +10,7 @@ from strands_robots.envelope import Envelope
 from strands_robots.fleet.emergency_stop import Devices, EmergencyStop
 from strands_robots.fleet.stop_answers import measured, roster_verdict, with_plain_stops, with_reasons
 from strands_robots.safety.roster_search import FoundDevices
-from strands_robots.safety.scope import EVERY_ROBOT, Scope
+from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope
 from strands_robots.safety.silence import Sending
 from strands_robots.safety.stop_roster import StopOutcome, StopRoster
 
@@ -70,7 +70,13 @@ def stop_and_lock(fleet: FleetClient, reason: str, scope: Scope = EVERY_ROBOT) -
 
 
 def stopped_and_locked(
-    fleet: FleetClient, reason: str, *, scope: Scope = EVERY_ROBOT, signing_key: Any = None, estop_id: str = ""
+    fleet: FleetClient,
+    reason: str,
+    *,
+    scope: Scope = EVERY_ROBOT,
+    signing_key: Any = None,
+    estop_id: str = "",
+    remembers: Remembers | None = None,
 ) -> tuple[StopOutcome, list[str]]:
     """Do as :func:`stop_and_lock`; return outcome and devices that are not locked.
 
@@ -80,11 +86,13 @@ def stopped_and_locked(
         scope: the robots that it is for.
         signing_key: signs it; then only enrolled robots can confirm it.
         estop_id: 32 hex digits; a fresh one by default.
+        remembers: says whether a robot of ``scope`` is known; by default by this machine's roster.
     """
     from strands_robots.device_connect.safety_controller import safety_controller  # noqa: PLC0415 - the network is loaded when it is used
 
-    signed: dict[str, Any] = {} if signing_key is None else {"signing_key": signing_key, "require_signed": True}
-    controller = safety_controller(fleet.source, fleet.link, **signed)
+    options: dict[str, Any] = {} if signing_key is None else {"signing_key": signing_key, "require_signed": True}
+    options |= {} if remembers is None else {"remembers": remembers}
+    controller = safety_controller(fleet.source, fleet.link, **options)
     devices = lambda begun: _in_reach(fleet)  # noqa: E731 - the client is connected, so it searches at once
     try:
         stop = EmergencyStop(

@@ -27,7 +27,7 @@ from strands_robots.fleet.refusals import refusal_of_text
 from strands_robots.fleet.stop_button import StopSender
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.peer_answers import enrolled_peers
-from strands_robots.safety.scope import EVERY_ROBOT, Scope
+from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope
 from strands_robots.safety.stop_roster import StopOutcome
 from strands_robots.serving.verb_schema import described
 from strands_robots.utils import MissingExtraError, ValidationError, finite, plain_text
@@ -190,11 +190,19 @@ class MeshNetwork:
         return stop_peers(self._joined_mesh, self._joined)
 
     def emergency_stop(
-        self, reason: str, *, scope: Scope = EVERY_ROBOT, signing_key: Any = None, estop_id: str = ""
+        self,
+        reason: str,
+        *,
+        scope: Scope = EVERY_ROBOT,
+        signing_key: Any = None,
+        estop_id: str = "",
+        remembers: Remembers | None = None,
     ) -> StopOutcome:
         """Stop and lock the peers; the mesh carries no reason."""
         del reason
-        _, outcome = lock_peers(self._joined_mesh, signing_key, scope, estop_id=estop_id, since=self._joined)
+        _, outcome = lock_peers(
+            self._joined_mesh, signing_key, scope, estop_id=estop_id, since=self._joined, remembers=remembers
+        )
         return outcome
 
     @contextmanager

@@ -13,7 +13,7 @@ from strands_robots.fleet.mesh.standing import MeshReports, mesh_network
 from strands_robots.fleet.stop_answers import measured, unanswered
 from strands_robots.safety.orders import new_epoch
 from strands_robots.safety.peer_answers import enrolled_peers, stop_distrust
-from strands_robots.safety.scope import EVERY_ROBOT, Scope
+from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope
 from strands_robots.safety.silence import Sending
 from strands_robots.safety.statements import ALARM
 from strands_robots.safety.stop_roster import READ_WITHIN_S, StopOutcome, StopRoster, robots_known_at
@@ -51,6 +51,7 @@ def lock_peers(
     *,
     estop_id: str = "",
     since: float | None = None,
+    remembers: Remembers | None = None,
 ) -> tuple[dict[str, Envelope], StopOutcome]:
     """Send the mesh's emergency stop, again while a peer has not confirmed it.
 
@@ -62,6 +63,7 @@ def lock_peers(
         scope: the robots that it is for. Where none of them is there, every robot is stopped.
         estop_id: 32 hex digits; a fresh one by default.
         since: as in :func:`stop_peers`.
+        remembers: says whether a robot of ``scope`` is known; by default by this machine's roster.
     """
     epoch = estop_id or new_epoch()
     reports = MeshReports(mesh)
@@ -77,7 +79,7 @@ def lock_peers(
     def send() -> list[dict[str, Any]]:
         some: dict[str, Any] = {}
         if not roster.scope.everything:
-            known = robots_known_at(mesh_network)
+            known = remembers or robots_known_at(mesh_network)
             some = {"scope": roster.scope, "remembers": known, "on_widened": roster.widen}
         return mesh.emergency_stop(signing_key, estop_id=epoch, on_answers=left, **some)
 

@@ -1,0 +1,178 @@
+"""Stop, emergency stop and resume of all robots of a fleet: verdicts by name, and networks that fail."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from tests.fleet.scripted import ScriptedNetwork
+
+from strands_robots import errors
+from strands_robots.envelope import error, success
+from strands_robots.fleet import Fleet
+from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
+from strands_robots.safety.scope import EVERY_ROBOT, Scope
+
+
+@pytest.fixture
+def near() -> ScriptedNetwork:
+    return ScriptedNetwork(DEVICE_CONNECT, {"arm-1": (), "both": ()})
+
+
+@pytest.fixture
+def far() -> ScriptedNetwork:
+    return ScriptedNetwork(MESH, {"arm-2": (), "both": ()})
+
+
+@pytest.fixture
+def fleet(near: ScriptedNetwork, far: ScriptedNetwork) -> Iterator[Fleet]:
+    with Fleet([near, far]) as joined:
+        yield joined
+
+
+def test_one_press_is_one_stop_on_every_network(fleet: Fleet, near: ScriptedNetwork, far: ScriptedNetwork) -> None:
+    stop = fleet.estop("a hand")
+    assert near.estops == far.estops == [("a hand", EVERY_ROBOT, stop.estop_id)]
+    assert {name: verdict.stopped for name, verdict in stop.items()} == {"arm-1": True, "arm-2": True, "both": True}
+    assert stop.ok
+    assert fleet.estop().estop_id != stop.estop_id
+
+
+def test_robot_of_the_roster_that_gives_no_answer_is_named(fleet: Fleet, far: ScriptedNetwork) -> None:
+    far.silent.append("arm-9")
+    for stop in (fleet.stop(), fleet.estop()):
+        assert stop["arm-9"].stopped is None
+        assert stop.missing == ("arm-9",)
+        assert not stop.ok
+        assert "arm-9" in str(stop)
+        assert "arm-9" in repr(stop)
+
+
+def test_robot_that_was_found_and_is_gone_is_named(fleet: Fleet, near: ScriptedNetwork) -> None:
+    fleet.robots()
+    del near.robots["arm-1"]
+    for stop in (fleet.stop(), fleet.estop()):
+        assert stop["arm-1"].stopped is None
+        assert stop.missing == ("arm-1",)
+
+
+def test_robot_that_moves_on_one_of_two_networks_moves(
+    fleet: Fleet, far: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    far.stops = error("bus", stopped=False)
+    stop = fleet.estop()
+    assert stop["both"].stopped is False
+    assert stop.missing == ("arm-2", "both")
+    assert "both did not stop" in str(stop)
+
+
+@pytest.mark.parametrize("verb", ["stop", "estop"])
+def test_network_that_fails_hides_no_verdict_of_another(
+    fleet: Fleet, far: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch, verb: str
+) -> None:
+    def lost(*_: object, **__: object) -> Any:
+        raise OSError("cable")
+
+    monkeypatch.setattr(far, "stop_all", lost)
+    monkeypatch.setattr(far, "emergency_stop", lost)
+    stop = getattr(fleet, verb)()
+    assert stop["arm-1"].stopped is True
+    assert stop["the robots on mesh"].unknown == {"the robots on mesh": "cable"}
+    assert not stop.ok
+    assert "It did not leave on mesh: cable." in str(stop)
+
+
+def test_network_without_robots_is_no_failure(near: ScriptedNetwork) -> None:
+    with Fleet([near, ScriptedNetwork(MESH, {})]) as fleet:
+        assert fleet.stop().ok
+        assert fleet.estop().ok
+
+
+def test_fleet_without_any_robot_has_stopped_none() -> None:
+    with Fleet([ScriptedNetwork(MESH, {})]) as fleet:
+        stop = fleet.estop()
+        assert (dict(stop), stop.ok) == ({}, False)
+
+
+def test_stop_of_a_robot_of_one_network_does_not_become_one_of_all_on_another(
+    fleet: Fleet, near: ScriptedNetwork, far: ScriptedNetwork
+) -> None:
+    stop = fleet.estop(only="arm-1")
+    assert near.estops[0][1] == far.estops[0][1] == Scope.named(["arm-1"])
+    assert (near.remembered, far.remembered) == (True, True)
+    assert {name: verdict.stopped for name, verdict in stop.items()} == {"arm-1": True}
+    assert stop.ok
+    fleet.estop(only=["nowhere"])
+    assert (near.remembered, far.remembered) == (False, False)
+
+
+def test_named_robot_that_is_nowhere_is_missing(fleet: Fleet) -> None:
+    stop = fleet.estop(only=["arm-1", "nowhere"])
+    assert stop["arm-1"].stopped is True
+    assert stop.missing == ("nowhere",)
+
+
+@pytest.mark.parametrize("given", [{"only": 7}, {"only": "arm-1", "cell": "cell-1"}, {"cell": "no cell/"}])
+def test_argument_that_cannot_be_read_stops_every_robot(
+    fleet: Fleet, near: ScriptedNetwork, caplog: pytest.LogCaptureFixture, given: dict[str, Any]
+) -> None:
+    with caplog.at_level(logging.WARNING):
+        assert fleet.estop(**given).ok
+    assert near.estops[0][1] == EVERY_ROBOT
+    assert "Ignored: " in caplog.text
+
+
+def test_lockouts_are_read_and_resumed_by_robot(fleet: Fleet, near: ScriptedNetwork) -> None:
+    stop = fleet.estop()
+    assert {name: [each.epoch for each in report.lockouts] for name, report in fleet.lockouts().items()} == {
+        name: [stop.estop_id] for name in ("arm-1", "arm-2", "both")
+    }
+    assert fleet.resume("key", "arm-1") == {"arm-1": (True, "free")}
+    assert sorted(near.locked) == ["both"]
+    assert {name: free for name, (free, _) in fleet.resume("key").items()} == dict.fromkeys(
+        ("arm-1", "arm-2", "both"), True
+    )
+
+
+def test_robot_that_stays_locked_on_one_network_is_not_free(
+    fleet: Fleet, far: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(far, "resume", lambda reports, *_: {each.name: (False, "no") for each in reports})
+    outcome = fleet.resume("key")
+    assert outcome["arm-1"][0] is True
+    assert outcome["both"] == (False, "no")
+
+
+def test_resume_of_an_absent_robot_is_refused_and_frees_none(fleet: Fleet, near: ScriptedNetwork) -> None:
+    fleet.estop()
+    with pytest.raises(errors.NoSuchRobotError, match="nowhere"):
+        fleet.resume("key", ["arm-1", "nowhere"])
+    assert "arm-1" in near.locked
+
+
+def test_robots_that_are_not_heard_are_named_before_others_are_freed(
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    from strands_robots.fleet import fleet as module  # noqa: PLC0415 - this test alone
+    from strands_robots.safety.unheard import Unheard  # noqa: PLC0415 - as above
+
+    monkeypatch.setattr(module, "unheard_now", lambda *_: Unheard(("arm-7",)))
+    with caplog.at_level(logging.WARNING):
+        fleet.resume("key")
+    assert "NOT HEARD: arm-7" in caplog.text
+
+
+def test_network_that_cannot_be_asked_is_absent(fleet: Fleet, far: ScriptedNetwork) -> None:
+    far.unreachable = "cable"
+    assert sorted(fleet.lockouts()) == ["arm-1", "both"]
+    assert fleet.absent == {MESH: "cable"}
+    far.unreachable = ""
+    assert len(fleet.lockouts()) == 3
+    assert fleet.absent == {}
+
+
+def test_verdict_says_what_was_halted(fleet: Fleet, near: ScriptedNetwork) -> None:
+    near.stops = success("stopped", stopped=True, halted=["policy", "teleop"])
+    assert fleet.stop()["arm-1"].halted == ("policy", "teleop")
