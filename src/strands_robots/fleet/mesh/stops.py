@@ -116,7 +116,9 @@ def stop_answer(
     fields = result if isinstance(result, Mapping) else {}
     free = target in locks and fields.get("locked") is not True
     said = "stopped, and NOT LOCKED: its release knows no lock by command" if free else "stopped"
-    return {**fields, **success(said, stopped=True)}
+    # The mesh lists under `stopped` what was halted.
+    halted = fields.get("halted", fields.get("stopped"))
+    return {**fields, "halted": halted, **success(said, stopped=True)}
 
 
 def _stop_all(
