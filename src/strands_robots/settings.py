@@ -205,6 +205,16 @@ _declare(
         0.05,
         60,
     ),
+    Setting("STRANDS_TAGS", "list", "", "Tags of the robots of this process, by which callers choose robots."),
+    # The calling side.
+    Setting("STRANDS_FLEET", "text", "", "Connection profile where no network is stated: a name or a .toml file."),
+    Setting(
+        "STRANDS_FLEETS_DIR",
+        "path",
+        "",
+        "Folder of connection profiles. Unset: strands-robots/fleets in XDG_CONFIG_HOME.",
+    ),
+    Setting("XDG_CONFIG_HOME", "path", "", "Folder of this user's configuration. Unset: ~/.config."),
     Setting(
         "STRANDS_ESTOP_TORQUE",
         "text",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Self
@@ -25,6 +25,7 @@ from strands_robots.safety.stop_roster import StopRoster, robots_known_at
 from strands_robots.safety.unheard import unheard_now
 from strands_robots.serving.stop_arguments import stop_reason, stop_scope
 from strands_robots.utils import DURATION_MAX_S, ValidationError, device_id, near, number, plain_text, shown
+from strands_robots.tags import own_tags
 
 logger = logging.getLogger(__name__)
 
@@ -58,6 +59,11 @@ def connect(
 
     Args:
         nats: NATS servers, such as ``nats://host:4222``; one or a list, as the next two.
+    A connection profile has them in a file, for both networks::
+
+        with connect("lab") as fleet:
+            print(fleet.where(kind="so100", tags="mobile"))
+
         connect: Zenoh endpoints to connect to, such as ``tls/host:7447``.
         listen: Zenoh endpoints to listen on.
         multicast: find peers on the local network by multicast.
@@ -181,8 +187,10 @@ class Fleet:
                 known.rediscovered(each, network)
         return [self._robots[name] for name in sorted(found)]
 
-    def where(self, *, kind: str | None = None, network: str | None = None) -> list[RemoteRobot]:
-        """Look for robots of a kind or a network.
+    def where(
+        self, *, kind: str | None = None, network: str | None = None, tags: Collection[str] | str | None = None
+    ) -> list[RemoteRobot]:
+        """Look for robots of a kind, of a network, or with tags.
 
         Args:
             kind: a type or a model, as :attr:`RemoteRobot.type` and :attr:`RemoteRobot.model` have it.
@@ -191,7 +199,9 @@ class Fleet:
         return [
             each
             for each in self.robots()
-            if (kind is None or kind in (each.type, each.model)) and (network is None or network == each.network)
+            if (kind is None or kind in (each.type, each.model))
+            and (network is None or network == each.network)
+            and wanted <= set(each.tags)
         ]
 
     def stop(self) -> FleetVerdict:
@@ -347,7 +357,12 @@ class Fleet:
     def __getitem__(self, robot: str) -> RemoteRobot:
         """Return the robot of this id, looked for where it is not known yet.
 
+            tags: one or several, all of which a robot has to have.
+
         Raises:
+            ValidationError: what no robot can have as a tag.
+        Raises:
+        wanted = set(own_tags(() if tags is None else tags))
             NoSuchRobotError: no robot in reach has it; the message names similar ones and absent networks.
             UnreachableError: no network answers, or the fleet is not joined.
         """

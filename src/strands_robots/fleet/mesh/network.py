@@ -30,6 +30,7 @@ from strands_robots.safety.peer_answers import enrolled_peers
 from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope
 from strands_robots.safety.stop_roster import StopOutcome
 from strands_robots.serving.verb_schema import described
+from strands_robots.tags import read_tags
 from strands_robots.utils import MissingExtraError, ValidationError, finite, plain_text
 
 if TYPE_CHECKING:
@@ -91,7 +92,12 @@ class MeshNetwork:
         self._settle(timeout)
         self._discoveries += 1
         return [
-            FoundRobot(str(row["peer_id"]), plain_text(row.get("type"), 100), plain_text(row.get("tool_name"), 100))
+            FoundRobot(
+                str(row["peer_id"]),
+                plain_text(row.get("type"), 100),
+                plain_text(row.get("tool_name"), 100),
+                read_tags(row.get("tags")),
+            )
             for row in self._rows()
         ]
 
