@@ -248,8 +248,8 @@ def _on_mesh(screen: Screen, network: Network, body: Any, peer_id: str | None, m
         screen.data({"event": "serving", **facts})
         for each in lacking:
             screen.say(f"NOT READY. {each}", "bold red")
-        port = f" --port {network.port}" if network.port else ""
-        screen.say(f"{mesh.peer_id} is on the mesh. From another terminal: strands-robots peers --mesh{port}", "green")
+        others = f"strands-robots peers --mesh{network.flags}"
+        screen.say(f"{mesh.peer_id} is on the mesh. From another terminal: {others}", "green")
         screen.say("Ctrl-C stops the robot, then takes it off the mesh.")
         yield mesh.peer_id
 
