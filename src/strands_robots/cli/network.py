@@ -82,6 +82,8 @@ class Network:
             link = stated.link(as_flag)
         except ValidationError as exc:
             raise CliError(str(exc), Exit.USAGE) from exc
+        if profile is not None and not profile.reaches_devices(self._given):
+            raise CliError(f"The connection profile {profile.label} has a mesh alone: give --mesh.", Exit.USAGE)
         if stated.credentials:
             # For the processes that a command starts, and for what it prints.
             settings.put("MESSAGING_CREDENTIALS_FILE", str(stated.credentials))
@@ -114,7 +116,7 @@ class Network:
     @property
     def _given(self) -> dict[str, Any]:
         """Return the flags that were given, without the profile's name."""
-        given = {each.name: getattr(self, each.name) for each in fields(LinkFlags)}
+        given = {each.name: getattr(self, each.name) for each in fields(self) if each.name != "profile"}
         return {name: value for name, value in given.items() if value is not None and value not in (False, [])}
 
     @property

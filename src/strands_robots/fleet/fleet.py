@@ -98,13 +98,15 @@ def connect(
         "insecure": insecure,
         **{each: None if file is None else Path(file).expanduser() for each, file in files.items()},
     }
-    given = {each: value for each, value in arguments.items() if value is not None}
+    given = {each: value for each, value in arguments.items() if value is not None and value != []}
     profile = profile_for(fleet, given)
     flags = LinkFlags(**given) if profile is None else profile.flags(given)
     source = device_id("name", name if name is not None else (profile and profile.name) or SOURCE)
     absent: dict[str, str] = {}
     networks: list[NetworkAdapter] = []
-    if flags != LinkFlags() or find_spec("device_connect_edge") is not None:
+    if profile is not None and not profile.reaches_devices(given):
+        absent[DEVICE_CONNECT] = f"the connection profile {profile.label} has none of its networks"
+    elif given or (profile is not None and profile.network) or find_spec("device_connect_edge") is not None:
         from strands_robots.fleet.device_connect.network import DeviceConnectNetwork  # noqa: PLC0415 - loaded when it is used
 
         networks.append(DeviceConnectNetwork(flags.link(), source))

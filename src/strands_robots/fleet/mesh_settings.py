@@ -38,7 +38,10 @@ class MeshSettings:
                 raise UnreachableError("this process is on the mesh of another connection profile")
             if not self._joined:
                 before = {name: settings.verbatim(name) for name in self._stated}
-                if any(settings.raw(name) != value for name, value in self._stated.items()) and alive():
+                if (
+                    any(settings.raw(name) != (value or settings.default(name)) for name, value in self._stated.items())
+                    and alive()
+                ):
                     raise UnreachableError("this process is on a mesh already, with other settings than the profile's")
                 self._before.update(before)
                 put_settings(self._stated)

@@ -1,7 +1,8 @@
 """Connection profiles: one TOML file a fleet, with its network and certificates.
 
 A profile decides which authority is trusted and which robots a stop reaches. So a file that others can write is
-refused, an unknown key is never skipped, and a network that the file names is joined as it stands there or not at all.
+refused, an unknown key is never skipped, and the file says all: the environment's networks, tenant and certificates do
+not count besides.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ class FleetProfile:
     Attributes:
         label: the name or the path by which it was asked for.
         file: where it stands.
-        network: the fields of :class:`LinkFlags` that it states.
+        network: the fields of :class:`LinkFlags` that it states. No variable that names a network counts besides.
         stated_name: the caller's name, None for none; or why it cannot be used.
         stated_mesh: the mesh's settings by variable, None where the mesh is left out; or why they cannot be used.
     """
@@ -84,7 +85,11 @@ class FleetProfile:
         if any(given.get(way) for way in WAYS):
             # Consent to an unauthenticated network is for the one that the file names.
             own = {key: value for key, value in own.items() if key not in {*WAYS, "insecure"}}
-        return LinkFlags(**{**own, **given})
+        return LinkFlags(**{**own, **given, "alone": True})
+
+    def reaches_devices(self, given: Mapping[str, Any]) -> bool:
+        """Return False for a fleet that is on the mesh alone."""
+        return bool(self.network) or self.stated_mesh is None or any(given.get(way) for way in WAYS)
 
 
 def profile_for(fleet: str | Path | None, given: Mapping[str, Any]) -> FleetProfile | None:
@@ -211,18 +216,24 @@ def _mesh(value: object, file: Path) -> Mapping[str, str] | None:
     stated = {key: check(f"mesh.{key} in {file}", value[key], file) for key, check in _MESH.items() if key in value}
     if not stated.pop("enabled", True):
         return None
-    insecure = stated.pop("insecure", None)
+    insecure = stated.pop("insecure", False)
     named = {_VARIABLES[key]: each if isinstance(each, str) else _spelled(each) for key, each in stated.items()}
-    if insecure is not None:
-        named["STRANDS_MESH_AUTH_MODE"] = "none" if insecure else "mtls"
-        named["STRANDS_MESH_I_KNOW_THIS_IS_INSECURE"] = _spelled(insecure)
-        named["STRANDS_MESH_LOCAL_DEV"] = "false"
-    # A file that says where the mesh is says it in full.
-    return {**(mesh_at() if any(way in stated for way in WAYS) else {}), **named}
+    return {
+        **dict.fromkeys(_OF_NO_MESH, ""),
+        **mesh_at(),
+        "STRANDS_MESH_AUTH_MODE": "none" if insecure else "mtls",
+        "STRANDS_MESH_I_KNOW_THIS_IS_INSECURE": _spelled(insecure),
+        "STRANDS_MESH_LOCAL_DEV": "false",
+        **named,
+    }
 
 
 def mesh_at(port_number: int | None = None) -> dict[str, str]:
-    """Return the settings of a mesh that meets at a loopback port, and nowhere else."""
+    """Return the settings of a mesh that meets on this machine, and nowhere else.
+
+    Args:
+        port_number: the loopback port of its hub; that of the environment by default.
+    """
     at = {} if port_number is None else {"STRANDS_MESH_PORT": str(port_number)}
     return {
         "STRANDS_MESH_BACKEND": "zenoh",
@@ -290,6 +301,9 @@ _MESH: dict[str, Check] = {
 }
 
 _VARIABLES = {key: f"STRANDS_MESH_{key.upper()}" for key in _MESH}
+
+_OF_NO_MESH = tuple(_VARIABLES[key] for key in ("namespace", "tls_ca", "tls_cert", "tls_key", "acl_file"))
+"""Variables that are empty where the file does not state them."""
 
 _KEYS = (*_NETWORK, "name", "mesh")
 
