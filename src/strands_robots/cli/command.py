@@ -77,10 +77,11 @@ def command(app: typer.Typer, name: str, *, network: bool = False) -> Callable[[
 def _use_profile(name: str, arguments: dict[str, Any]) -> None:
     """Refuse an unusable connection profile; take the caller's name from it.
 
-    A stop is not refused for what it does not need of the profile, and the doctor reports it.
+    A stop is not refused for what it does not need of the profile, the doctor reports it, and the default profile is
+    looked at only by what uses a network.
     """
     network: Network = arguments["network"]
-    if name not in WITHOUT_CHECK:
+    if network.profile is not None and name not in WITHOUT_CHECK:
         network.check()
     if arguments.get("source") == SOURCE:
         arguments["source"] = network.caller()

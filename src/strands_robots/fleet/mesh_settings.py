@@ -24,8 +24,10 @@ class MeshSettings:
     def __init__(self, stated: Mapping[str, str]) -> None:
         self._stated = dict(stated)
 
-    def take(self, *, alive: Callable[[], bool]) -> None:
+    def take(self, *, alive: Callable[[], bool]) -> bool:
         """Put the settings, until as many fleets of them have given them back.
+
+        True where the process is on another mesh than before.
 
         Args:
             alive: returns whether this process has a session already.
@@ -46,14 +48,17 @@ class MeshSettings:
                 self._before.update(before)
                 put_settings(self._stated)
             self._joined.append(self._stated)
+            return bool(self._stated) and len(self._joined) == 1
 
-    def give_back(self) -> None:
-        """Restore what was before, with the last fleet of these settings."""
+    def give_back(self) -> bool:
+        """Restore what was before, with the last fleet of these settings; True where that is another mesh."""
         with self._lock:
             self._joined.pop()
-            if not self._joined:
-                put_settings(self._before)
-                self._before.clear()
+            if self._joined:
+                return False
+            put_settings(self._before)
+            self._before.clear()
+            return bool(self._stated)
 
 
 def put_settings(stated: Mapping[str, str]) -> None:

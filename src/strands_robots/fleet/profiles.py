@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 
 from strands_robots import settings
 from strands_robots.fleet.link_flags import LinkFlags
+from strands_robots.safety.state_files import WRITABLE
 from strands_robots.utils import ValidationError, device_id, flag, identifier, near, port, shown, text
 
 BYTES_MAX = 64 * 1024
@@ -24,8 +25,6 @@ SUFFIX = ".toml"
 
 WAYS = ("nats", "connect", "listen", "multicast", "port")
 """Flags that say where a network is. One that is given replaces all of a profile's, and its ``insecure``."""
-
-_WRITABLE = 0o022
 
 Check = Callable[[str, object, Path], Any]
 Value = TypeVar("Value")
@@ -175,22 +174,28 @@ def _content(label: str, file: Path) -> bytes:
         raise ValidationError(f"There is no connection profile {shown(label)}: {file} is no file.{names}") from None
     except (OSError, ValueError) as exc:
         raise ValidationError(f"The connection profile {shown(label)} cannot be read: {exc}.") from exc
-    with os.fdopen(descriptor, "rb") as opened:
+    try:
         status = os.fstat(descriptor)
-        if not stat.S_ISREG(status.st_mode):
-            raise ValidationError(f"{file} is no plain file.")
-        if status.st_uid not in {0, os.getuid()}:
-            raise ValidationError(f"{file} belongs to uid {status.st_uid} and not to you (uid {os.getuid()}).")
-        mode = stat.S_IMODE(status.st_mode)
-        if mode & _WRITABLE:
-            raise ValidationError(f"{file} has mode {mode:04o}: others may write it; run chmod go-w on it.")
-        try:
+        _require_own(file, status)
+        with os.fdopen(os.dup(descriptor), "rb") as opened:
             content = opened.read(BYTES_MAX + 1)
-        except OSError as exc:
-            raise ValidationError(f"{file} cannot be read: {exc.strerror}.") from exc
+    except OSError as exc:
+        raise ValidationError(f"{file} cannot be read: {exc.strerror}.") from exc
+    finally:
+        os.close(descriptor)
     if len(content) > BYTES_MAX:
         raise ValidationError(f"{file} must have at most {BYTES_MAX} bytes, not {max(status.st_size, len(content))}.")
     return content
+
+
+def _require_own(file: Path, status: os.stat_result) -> None:
+    if not stat.S_ISREG(status.st_mode):
+        raise ValidationError(f"{file} is no plain file.")
+    if status.st_uid not in {0, os.getuid()}:
+        raise ValidationError(f"{file} belongs to uid {status.st_uid} and not to you (uid {os.getuid()}).")
+    mode = stat.S_IMODE(status.st_mode)
+    if mode & WRITABLE:
+        raise ValidationError(f"{file} has mode {mode:04o}: others may write it; run chmod go-w on it.")
 
 
 def _parsed(file: Path, content: bytes) -> dict[str, Any]:

@@ -75,7 +75,8 @@ class MeshNetwork:
         """Join; raise :class:`UnreachableError` where there is no mesh."""
         from strands_robots.mesh import session  # noqa: PLC0415 - the network is loaded when it is used
 
-        self._settings.take(alive=session.session_alive)
+        if self._settings.take(alive=session.session_alive):
+            _forget_peers()
         try:
             self._mesh = self._dialled()
         except BaseException:
@@ -277,7 +278,8 @@ class MeshNetwork:
         mesh, self._mesh = self._mesh, None
         if mesh is not None:
             mesh.close()
-            self._settings.give_back()
+            if self._settings.give_back():
+                _forget_peers()
 
     @property
     def _joined_mesh(self) -> Mesh:
@@ -317,6 +319,14 @@ class MeshNetwork:
                 return False
             time.sleep(LOOK_S)
         return True
+
+
+def _forget_peers() -> None:
+    """Forget the peers of the mesh that this process was on."""
+    from strands_robots.mesh import session  # noqa: PLC0415 - loaded when it is used
+
+    if not session.session_alive():
+        session.clear_peers()
 
 
 def _has_robot(row: Mapping[str, Any]) -> bool:
