@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -163,6 +164,17 @@ class TestKeys:
         assert read_profile("lab").flags({}).connect == ("tcp/a:1", "tcp/b:1")
 
 
+def test_profile_of_the_page_is_one(write: Write, tmp_path: Path) -> None:
+    page = Path(__file__).parents[2] / "docs" / "python.md"
+    (content,) = re.findall(r"```toml\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    write(content)
+    profile = read_profile("lab")
+    profile.check()
+    assert profile.name == "bench"
+    assert profile.network["credentials"] == tmp_path / "lab.creds.json"
+    assert (profile.mesh or {})["STRANDS_MESH_CONNECT"] == "tls/192.168.1.10:7447"
+
+
 class TestGivenBesides:
     def test_given_value_wins(self, write: Write) -> None:
         write('nats = "nats://a:1"\ntenant = "lab"\ntls_ca = "ca.pem"')
@@ -190,7 +202,7 @@ class TestGivenBesides:
     def test_caller_is_the_profiles_unless_it_is_given(self, write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
         named: list[str] = []
         monkeypatch.setattr(
-            "strands_robots.fleet.device_connect.DeviceConnectNetwork.__init__",
+            "strands_robots.fleet.device_connect.network.DeviceConnectNetwork.__init__",
             lambda self, link, source: named.append(source),
         )
         write('name = "bench"')

@@ -51,7 +51,10 @@ class MeshSettings:
             return bool(self._stated) and len(self._joined) == 1
 
     def give_back(self) -> bool:
-        """Restore what was before, with the last fleet of these settings; True where that is another mesh."""
+        """Restore what was before, with the last fleet of these settings.
+
+        True where that is another mesh.
+        """
         with self._lock:
             self._joined.pop()
             if self._joined:
