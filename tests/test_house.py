@@ -25,6 +25,7 @@ FLOORS: list[set[str]] = [
         "envelope",
         "errors",
         "settings",
+        "tags",
         "utils",
         "bounded_json",
         "identity_map",

@@ -6,7 +6,7 @@ import logging
 import re
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping
 from contextlib import nullcontext
 from functools import cache
 from pathlib import Path
@@ -17,6 +17,7 @@ from strands_robots.contract import adapt, put_away
 from strands_robots.envelope import is_error, text_of
 from strands_robots.safety.scope import own_cell
 from strands_robots.safety.stopping import StopVerdict
+from strands_robots.tags import own_tags
 from strands_robots.utils import ValidationError, choice, own_device_id, shown
 from strands_robots.utils import peer_id as valid_peer_id
 
@@ -41,9 +42,12 @@ class Networked:
     cell: str | None = None
     """The cell that the robot is in, for stops of one cell; None asks ``STRANDS_CELL``."""
 
+    tags: tuple[str, ...] | None = None
+    """Tags by which callers choose robots; None asks ``STRANDS_TAGS``."""
+
     def run(self, **options: Any) -> StopVerdict:
         """Serve this robot on Device Connect until SIGINT or SIGTERM; see :func:`run`."""
-        return run(self, **{"peer_id": self.peer_id, "cell": self.cell, **options})
+        return run(self, **{"peer_id": self.peer_id, "cell": self.cell, "tags": self.tags, **options})
 
     def cleanup(self) -> Any:
         """Leave the mesh, then halt the robot and free everything."""
@@ -61,6 +65,7 @@ def Robot(  # the factory reads as the class it stands for
     peer_id: str | None = None,
     mesh: bool | None = None,
     cell: str | None = None,
+    tags: Collection[str] | str | None = None,
     **options: Any,
 ) -> Any:
     """Make a running robot.
@@ -74,6 +79,7 @@ def Robot(  # the factory reads as the class it stands for
         peer_id: its id on the networks.
         mesh: True joins the native mesh now, False never; None asks ``STRANDS_MESH``.
         cell: the cell that it is in, for stops of one cell; None asks ``STRANDS_CELL``, "" is none.
+        tags: by which callers choose robots, such as ``("mobile", "lab-2")``; None asks ``STRANDS_TAGS``.
         options: ``sim``: arguments of ``Simulation`` (``timestep``, ``gravity``, ``realtime``), ``scene``
             (``tabletop``: a table with a red cube and a plate), and ``tip``, the site or body of the model that
             motions place. ``real``:
@@ -96,8 +102,9 @@ def Robot(  # the factory reads as the class it stands for
         valid_peer_id("peer_id", peer_id)
     if cell is not None:
         own_cell(cell)
+    stated = None if tags is None else own_tags(tags)
     robot = _simulated(name, tool_name, options) if kind == "sim" else _real(name, tool_name, options)
-    robot.peer_id, robot.cell = peer_id, cell
+    robot.peer_id, robot.cell, robot.tags = peer_id, cell, stated
     if mesh or (mesh is None and mesh_env_request()):
         try:
             robot.mesh = _join_mesh(robot, peer_id, "sim" if kind == "sim" else "robot")
@@ -126,8 +133,8 @@ def run(
         until: ends the serving as a signal does.
         mesh: True joins the native mesh besides, under the same id; None asks ``STRANDS_MESH``. A robot that
             :func:`Robot` has joined stays as it is.
-        network: other arguments of ``init_device_connect``, such as ``messaging_url``, ``cell`` and
-            ``allow_insecure``.
+        network: other arguments of ``init_device_connect``, such as ``messaging_url``, ``cell``, ``tags``
+            and ``allow_insecure``.
 
     Returns:
         The verdict of the halt.
@@ -149,7 +156,7 @@ def run(
         peer = None
         report(f"Serving {runtime.device_id}; Ctrl-C stops the robot first.")
         try:
-            peer = _join_mesh(robot, runtime.device_id, "robot") if joins else None
+            peer = _join_mesh(robot, runtime.device_id, "robot", network) if joins else None
             stop.wait()
         finally:
             free = put_away(body)
@@ -252,10 +259,11 @@ def _label(name: object) -> str:
     return re.sub(r"[^A-Za-z0-9_-]+", "-", stem)[:100].strip("-_") or "robot"
 
 
-def _join_mesh(robot: Any, peer_id: str | None, peer_type: str) -> Any:
+def _join_mesh(robot: Any, peer_id: str | None, peer_type: str, stated: Mapping[str, Any] | None = None) -> Any:
     from strands_robots.mesh import init_mesh  # noqa: PLC0415 - the mesh is loaded when it is used
 
-    mesh = init_mesh(robot, peer_id=peer_id, peer_type=peer_type, cell=getattr(robot, "cell", None))
+    facts = {name: (stated or {}).get(name, getattr(robot, name, None)) for name in ("cell", "tags")}
+    mesh = init_mesh(robot, peer_id=peer_id, peer_type=peer_type, **facts)
     if mesh is not None and hasattr(robot, "input_sink"):
         from strands_robots.mesh.input import MeshInputSink  # noqa: PLC0415 - as above
 

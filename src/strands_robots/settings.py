@@ -17,6 +17,9 @@ logger = logging.getLogger(__name__)
 TRUE_SPELLINGS = frozenset({"1", "true", "yes", "on"})
 FALSE_SPELLINGS = frozenset({"0", "false", "no", "off"})
 
+NO_ENDPOINT = "none"
+"""Value of ``STRANDS_MESH_CONNECT`` and ``STRANDS_MESH_LISTEN`` that names no endpoint."""
+
 
 @dataclass(frozen=True, slots=True)
 class Setting:
@@ -133,6 +136,18 @@ _declare(
     Setting("STRANDS_MESH", "text", "", "false: no mesh at all. true: a bare Robot() joins the mesh."),
     Setting("STRANDS_MESH_BACKEND", "text", "zenoh", "Transport of the mesh: zenoh, iot, bridge or memory."),
     Setting("STRANDS_MESH_PORT", "integer", "7447", "Loopback port of the mesh's hub.", 1, 65535),
+    Setting(
+        "STRANDS_MESH_CONNECT",
+        "list",
+        "",
+        "Zenoh endpoints that the mesh connects to; none for none. Unset: those of ZENOH_CONNECT.",
+    ),
+    Setting(
+        "STRANDS_MESH_LISTEN",
+        "list",
+        "",
+        "Zenoh endpoints that the mesh listens on; none for none. Unset: those of ZENOH_LISTEN.",
+    ),
     Setting("STRANDS_MESH_NAMESPACE", "text", "strands", "Zenoh namespace on top of the mesh's keys."),
     Setting("STRANDS_MESH_MULTICAST", "boolean", "false", "Find peers by multicast on the local network."),
     Setting("STRANDS_MESH_MAX_SESSIONS", "integer", "256", "Zenoh sessions a hub accepts.", 1, 65535),
@@ -190,6 +205,16 @@ _declare(
     Setting("STRANDS_CONTROL_HZ", "number", "50", "Control loop rate of a rollout.", 1, 2000),
     Setting("STRANDS_ROBOT_MESH_DC", "text", "auto", "Network of the robot_mesh tool: off means the native mesh."),
     Setting("STRANDS_STATE_DIR", "path", "", "Directory for grants, lockouts and keys. Unset: ~/.strands_robots."),
+    Setting("STRANDS_TAGS", "list", "", "Tags of the robots of this process, by which callers choose robots."),
+    # The calling side.
+    Setting("STRANDS_FLEET", "text", "", "Connection profile where no network is stated: a name or a .toml file."),
+    Setting(
+        "STRANDS_FLEETS_DIR",
+        "path",
+        "",
+        "Folder of connection profiles. Unset: strands-robots/fleets in XDG_CONFIG_HOME.",
+    ),
+    Setting("XDG_CONFIG_HOME", "path", "", "Folder of this user's configuration. Unset: ~/.config."),
     # Rendering, by names that are not ours.
     Setting("MUJOCO_GL", "text", "", "OpenGL of MuJoCo: egl, osmesa or glfw. Unset: one that works without a display."),
     Setting("DISPLAY", "text", "", "X display; with one, MuJoCo's own choice of OpenGL is kept."),

@@ -17,9 +17,8 @@ from fixtures.waiting import eventually
 from tests.mesh.peers import Clock, Fleet
 
 from strands_robots.mesh import keys, wire_identity
-from strands_robots.mesh.core import identity_of
 from strands_robots.mesh.transport.memory import MemoryBus, MemoryTransport
-from strands_robots.mesh.wire_identity import Identity, IdentityError, Signer, Verifier
+from strands_robots.mesh.wire_identity import Identity, IdentityError, Signer, Verifier, identity_of
 
 BODY = {"robot_id": "arm-1", "timestamp": 1.5, "nested": {"b": [1, "é"], "a": None}}
 

@@ -15,6 +15,7 @@ from strands_robots.utils import DISTRIBUTION
 COMMANDS = {
     "serve": ("serve",),
     "peers": ("peers", "call"),
+    "fleets": ("fleets",),
     "stop": ("stop", "estop"),
     "safety_controller": ("safety-controller",),
     "resume": ("resume", "lockout", "grant"),

@@ -13,7 +13,7 @@ from typing import Annotated, Any, TypeVar
 
 import typer
 
-from strands_robots.cli.network import Network
+from strands_robots.cli.network import SOURCE, Network
 from strands_robots.cli.output import CliError, Exit, Screen
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.utils import ValidationError, shown
@@ -23,6 +23,9 @@ Body = TypeVar("Body", bound=Callable[..., None])
 Timeout = Annotated[float, typer.Option("--timeout", help="Seconds to wait for an answer.")]
 OnMesh = Annotated[bool, typer.Option("--mesh", help="On the native mesh instead of Device Connect.")]
 Seconds = Annotated[float | None, typer.Option("--for", help="End after that many seconds.")]
+
+WITHOUT_CHECK = ("stop", "estop", "doctor")
+"""Commands that use what they can of a connection profile."""
 
 _JSON = Parameter(
     "machine",
@@ -53,7 +56,13 @@ def command(app: typer.Typer, name: str, *, network: bool = False) -> Callable[[
             screen = Screen(arguments.pop("machine"))
             if network:
                 arguments["network"] = Network(**{name: arguments.pop(name) for name in shared})
-            raise typer.Exit(int(_exit_code(screen, lambda: body(screen, **arguments))))
+
+            def work() -> None:
+                if network:
+                    _use_profile(name, arguments)
+                body(screen, **arguments)
+
+            raise typer.Exit(int(_exit_code(screen, work)))
 
         run.__name__ = body.__name__
         run.__doc__ = body.__doc__
@@ -63,6 +72,19 @@ def command(app: typer.Typer, name: str, *, network: bool = False) -> Callable[[
         return body
 
     return register
+
+
+def _use_profile(name: str, arguments: dict[str, Any]) -> None:
+    """Refuse an unusable connection profile; take the caller's name from it.
+
+    A stop is not refused for what it does not need of the profile, the doctor reports it, and the default profile is
+    looked at only by what uses a network.
+    """
+    network: Network = arguments["network"]
+    if network.profile is not None and name not in WITHOUT_CHECK:
+        network.check()
+    if arguments.get("source") == SOURCE:
+        arguments["source"] = network.caller()
 
 
 def _parameters(function: Callable[..., Any]) -> dict[str, Parameter]:

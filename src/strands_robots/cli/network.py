@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import shlex
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -15,6 +16,8 @@ from strands_robots import settings
 from strands_robots.cli.output import CliError, Exit, plain
 from strands_robots.envelope import Envelope
 from strands_robots.fleet.link_flags import LinkFlags, as_flag
+from strands_robots.fleet.mesh_settings import put_settings
+from strands_robots.fleet.profiles import FleetProfile, mesh_at, profile_for, profile_name
 from strands_robots.utils import ValidationError, near, port, redacted
 
 if TYPE_CHECKING:
@@ -22,6 +25,8 @@ if TYPE_CHECKING:
     from strands_robots.device_connect.backends import LinkConfig
     from strands_robots.fleet.adapter import NetworkAdapter
     from strands_robots.mesh import Mesh
+
+logger = logging.getLogger(__name__)
 
 NO_METHOD = -32601
 """JSON-RPC's code of an unknown function."""
@@ -36,8 +41,11 @@ def _option(flag: str, text: str, **more: Any) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class Network:
-    """Network flags as the user gave them."""
+    """Network flags as the user gave them, over a connection profile."""
 
+    profile: Annotated[
+        str | None, _option("--fleet", "Connection profile: its name, or a .toml file.", metavar="NAME")
+    ] = None
     nats: Annotated[
         list[str] | None, _option("--nats", "NATS server, such as nats://host:4222 (repeat).", metavar="URL")
     ] = None
@@ -68,32 +76,78 @@ class Network:
             CliError: the flags contradict one another, or leave this machine without authentication.
             MissingExtraError: Device Connect is not installed.
         """
-        if self.credentials:
-            # For the processes that a command starts, and for what it prints.
-            settings.put("MESSAGING_CREDENTIALS_FILE", str(self.credentials))
         try:
-            return self._stated.link(as_flag)
+            profile = self._profile
+            stated = self._flags_over(profile)
+            link = stated.link(as_flag)
         except ValidationError as exc:
             raise CliError(str(exc), Exit.USAGE) from exc
+        if profile is not None and not profile.reaches_devices(self._given):
+            raise CliError(f"The connection profile {profile.label} has a mesh alone: give --mesh.", Exit.USAGE)
+        if stated.credentials:
+            # For the processes that a command starts, and for what it prints.
+            settings.put("MESSAGING_CREDENTIALS_FILE", str(stated.credentials))
+        if profile is not None:
+            put_settings(_mesh_beside(profile))
+        return link
+
+    def check(self) -> None:
+        """Refuse a connection profile that cannot be used.
+
+        Raises:
+            ValidationError: naming the file, the value and its domain.
+        """
+        profile = self._profile
+        if profile is not None:
+            profile.check()
+
+    def caller(self, otherwise: str = SOURCE) -> str:
+        """Return the caller's name of the connection profile, else ``otherwise``.
+
+        One that cannot be used is left out: a stop needs none.
+        """
+        profile = self._profile
+        try:
+            return (profile.name if profile is not None else None) or otherwise
+        except ValidationError as unfit:
+            logger.warning("%s The caller is %s.", unfit, otherwise)
+            return otherwise
+
+    @property
+    def _given(self) -> dict[str, Any]:
+        """Return the flags that were given, without the profile's name."""
+        given = {each.name: getattr(self, each.name) for each in fields(self) if each.name != "profile"}
+        return {name: value for name, value in given.items() if value is not None and value not in (False, [])}
+
+    @property
+    def _profile(self) -> FleetProfile | None:
+        return profile_for(self.profile, self._given)
+
+    def _flags_over(self, profile: FleetProfile | None) -> LinkFlags:
+        return LinkFlags(**self._given) if profile is None else profile.flags(self._given)
 
     @property
     def _stated(self) -> LinkFlags:
-        return LinkFlags(**{each.name: getattr(self, each.name) for each in fields(self)})
+        return self._flags_over(self._profile)
 
     @contextmanager
     def fleet(self, source: str = SOURCE) -> Iterator[FleetClient]:
         """Connect to the robots on this network for the length of the block.
 
+        Args:
+            source: the caller's name; :data:`SOURCE` gives way to that of the connection profile.
+
         Raises:
             CliError: the network cannot be reached, or fails in use.
         """
         link = self.link()
+        name = self.caller() if source == SOURCE else source
         from device_connect_edge.messaging import MessagingError  # noqa: PLC0415 - loaded when a network is used
 
         from strands_robots.device_connect import FleetClient  # noqa: PLC0415 - as above
 
         try:
-            with FleetClient(link, source) as fleet:
+            with FleetClient(link, name) as fleet:
                 yield fleet
         except MessagingError as exc:
             raise CliError(f"The network does not carry this: {exc}", Exit.SILENT) from exc
@@ -126,26 +180,47 @@ class Network:
     @property
     def flags(self) -> str:
         """The flags as given, without passwords, for another command."""
-        words = []
-        for each in fields(self):
-            value, flag = getattr(self, each.name), f"--{each.name.replace('_', '-')}"
+        words = list[str]()
+        for name, value in {"fleet": profile_name(self.profile, self._given), **self._given}.items():
+            flag = as_flag(name)
             if isinstance(value, list):
                 words += [word for one in value for word in (flag, redacted(one))]
-            elif value is not None and value is not False:
+            elif value is not None:
                 words += [flag] if value is True else [flag, str(value)]
         return "".join(f" {shlex.quote(word)}" for word in words)
 
     def use_mesh(self) -> None:
-        """Apply the flags to the native mesh, which takes only ``--port``.
+        """Apply the flags to the native mesh, which takes ``--fleet`` and ``--port``.
 
         Raises:
-            CliError: another flag was given.
-            ValidationError: the port is not one.
+            CliError: another flag was given, or the connection profile has no mesh.
+            ValidationError: the port is not one, or the profile cannot be used.
         """
-        if any(getattr(self, each.name) for each in fields(self) if each.name != "port"):
-            raise CliError("--mesh takes no network flag but --port; docs/mesh.md has its settings.", Exit.USAGE)
+        if self._given.keys() - {"port"}:
+            raise CliError(
+                "--mesh takes no network flag but --fleet and --port; docs/mesh.md has its settings.", Exit.USAGE
+            )
+        profile = self._profile
+        if profile is not None:
+            if profile.mesh is None:
+                raise CliError(f"--mesh: the connection profile {profile.label} has no mesh.", Exit.USAGE)
+            put_settings(profile.mesh)
         if self.port is not None:
-            settings.put("STRANDS_MESH_PORT", str(port("--port", self.port)))
+            number = port("--port", self.port)
+            put_settings({"STRANDS_MESH_PORT": str(number)} if profile is None else mesh_at(number))
+
+
+def _mesh_beside(profile: FleetProfile) -> Mapping[str, str]:
+    """Return the settings of the mesh for a command that may join it besides.
+
+    One that cannot be used is left out, and so is that of the environment: it may be another fleet's.
+    """
+    try:
+        stated = profile.mesh
+    except ValidationError as unfit:
+        logger.warning("%s The mesh is left out.", unfit)
+        stated = None
+    return {"STRANDS_MESH": "false"} if stated is None else stated
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from rich.text import Text
 
 from strands_robots.cli.command import OnMesh, Timeout, assignments, command
 from strands_robots.cli.network import SOURCE, Network, answering, call_device
-from strands_robots.cli.output import LATE_S, CliError, Exit, Screen, label, plain, readable, table
+from strands_robots.cli.output import LATE_S, CliError, Exit, Screen, label, plain, readable, table, with_tags
 from strands_robots.cli.readiness import other_user
 from strands_robots.envelope import is_error, text_of
 from strands_robots.fleet.link_flags import described
@@ -70,8 +70,9 @@ def peers(
     if device is not None:
         _show_functions(screen, found[0])
         return
-    rows = ((each.id, each.type, each.model, each.status.get("availability", ""), _age(each)) for each in found)
-    screen.show(table("", ("device", "type", "model", "status", "last heard"), rows))
+    rows = [(each.id, each.type, each.model, each.status.get("availability", ""), _age(each)) for each in found]
+    heads = ("device", "type", "model", "status", "last heard")
+    screen.show(table("", *with_tags(heads, rows, [each.tags for each in found])))
     screen.say("peers DEVICE, with the same flags, lists what it can do.")
 
 
@@ -210,7 +211,7 @@ def _list_functions(screen: Screen, fleet: FleetClient, device: str) -> None:
 def _facts(peer: Peer) -> dict[str, Any]:
     facts = {name: value for name, value in asdict(peer).items() if name not in ("location", "heard_at")}
     age = peer.age_s
-    return {**facts, "age_s": None if age is None else round(age, 3)}
+    return {**facts, "tags": list(peer.tags), "age_s": None if age is None else round(age, 3)}
 
 
 def _age(peer: Peer) -> Text:

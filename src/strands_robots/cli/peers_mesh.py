@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Any
 from rich.text import Text
 
 from strands_robots.cli.network import mesh_peer, temporary_mesh_id
-from strands_robots.cli.output import CliError, Exit, Screen, label, plain, table
+from strands_robots.cli.output import CliError, Exit, Screen, label, plain, table, with_tags
 from strands_robots.envelope import Envelope
 from strands_robots.safety.peer_answers import enrolled_peers, lockout_distrust
 from strands_robots.safety.statements import ALARM
+from strands_robots.tags import read_tags
 from strands_robots.tools import networks
 
 if TYPE_CHECKING:
@@ -25,13 +26,15 @@ def list_peers(screen: Screen, timeout: float) -> None:
         time.sleep(timeout)
         rows, keys = [row for row in mesh.peers if row["reachable"]], enrolled_peers()
     for row in rows:
+        row["tags"] = list(read_tags(row.get("tags")))
         if "locked" in row and (why := lockout_distrust(row["peer_id"], row, row.get("epochs") or [], keys)):
             row["distrusted"] = why
     if not rows:
         raise CliError("No peer is on the mesh of this machine.", Exit.SILENT, peers=[])
     screen.data({"status": "success", "peers": rows})
-    cells = ((r["peer_id"], r["type"], r["hostname"], _status(r), f"{r['age']:.1f} s") for r in rows)
-    screen.show(table("", ("peer", "type", "host", "status", "last heard"), cells))
+    cells = [(r["peer_id"], r["type"], r["hostname"], _status(r), f"{r['age']:.1f} s") for r in rows]
+    heads = ("peer", "type", "host", "status", "last heard")
+    screen.show(table("", *with_tags(heads, cells, [row["tags"] for row in rows])))
 
 
 def call_peer(

@@ -110,8 +110,9 @@ def mesh_port_problem(*, answers: bool = True) -> str:
     Args:
         answers: a mesh answers there. A Zenoh router in Python is then not told from a robot process.
     """
-    stated = (settings.raw(name) for name in ("ZENOH_CONNECT", "ZENOH_LISTEN"))
-    if any(stated) or settings.raw("STRANDS_MESH_BACKEND").lower() not in ("", "zenoh", "bridge"):
+    from strands_robots.mesh.transport.zenoh_config import stated_endpoints  # noqa: PLC0415 - loaded when it is used
+
+    if any(stated_endpoints()) or settings.raw("STRANDS_MESH_BACKEND").lower() not in ("", "zenoh", "bridge"):
         return ""
     number = settings.integer("STRANDS_MESH_PORT")
     uid, holder = port_holder(number)

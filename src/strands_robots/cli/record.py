@@ -50,6 +50,7 @@ def record(
     recorder = Recorder(out)
     with ExitStack() as stack:
         if on_mesh:
+            network.use_mesh()
             mesh = stack.enter_context(mesh_peer(None, temporary_mesh_id("record"), "tool"))
         else:
             fleet = stack.enter_context(network.fleet())

@@ -29,6 +29,7 @@ from strands_robots.fleet.link_flags import described
 from strands_robots.policies import warm_profiles
 from strands_robots.policies.base import SPEED_MAX
 from strands_robots.policies.profiles import load_profiles
+from strands_robots.tags import own_tags
 from strands_robots.utils import ValidationError, identifier, number, own_device_id, shown, text
 
 if TYPE_CHECKING:
@@ -122,6 +123,7 @@ def serve(
     cell: Annotated[
         str | None, typer.Option("--cell", help="The cell that it is in, for stops of one cell; none by default.")
     ] = None,
+    tag: Annotated[list[str] | None, typer.Option("--tag", help="A word by which callers choose it (repeat).")] = None,
     record: Annotated[
         Path | None, typer.Option("--record", help="Also record joints, pictures and events: a new .mcap file.")
     ] = None,
@@ -144,6 +146,7 @@ def serve(
         "STRANDS_ALLOW_MOCK": "true" if allow_mock else None,
         "STRANDS_DC_STATE_HZ": None if state_hz is None else str(number("--state-hz", state_hz, low=0.01, high=100)),
         "STRANDS_CELL": None if cell is None else identifier("--cell", cell),
+        "STRANDS_TAGS": ",".join(own_tags(tag)) if tag else None,
     }
     for name, value in flags.items():
         if value is not None:
@@ -245,8 +248,8 @@ def _on_mesh(screen: Screen, network: Network, body: Any, peer_id: str | None, m
         screen.data({"event": "serving", **facts})
         for each in lacking:
             screen.say(f"NOT READY. {each}", "bold red")
-        port = f" --port {network.port}" if network.port else ""
-        screen.say(f"{mesh.peer_id} is on the mesh. From another terminal: strands-robots peers --mesh{port}", "green")
+        others = f"strands-robots peers --mesh{network.flags}"
+        screen.say(f"{mesh.peer_id} is on the mesh. From another terminal: {others}", "green")
         screen.say("Ctrl-C stops the robot, then takes it off the mesh.")
         yield mesh.peer_id
 

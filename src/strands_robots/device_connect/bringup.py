@@ -13,6 +13,7 @@ import sys
 import threading
 import time
 from collections import Counter
+from collections.abc import Collection
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from typing import Any
@@ -21,7 +22,7 @@ from device_connect_edge.drivers import DeviceDriver
 from device_connect_edge.messaging import MessagingError
 
 from strands_robots import settings
-from strands_robots.contract import WorldRobot
+from strands_robots.contract import WorldRobot, body_of
 from strands_robots.device_connect._compat import Runtime
 from strands_robots.device_connect.backends import LinkConfig
 from strands_robots.device_connect.backends.base import NoResponderError
@@ -41,6 +42,7 @@ from strands_robots.device_connect.shutdown import LOOP_JOIN_TIMEOUT_S
 from strands_robots.device_connect.simulation_driver import SimulationDeviceDriver
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.serving.workers import called
+from strands_robots.tags import tags_of
 from strands_robots.utils import ValidationError, choice, own_device_id, redacted
 
 logger = logging.getLogger(__name__)
@@ -108,6 +110,7 @@ async def init_device_connect(  # noqa: PLR0917 - the documented signature
     link: LinkConfig | None = None,
     bringup_timeout: float = BRINGUP_TIMEOUT_S,
     cell: str | None = None,
+    tags: Collection[str] | str | None = None,
 ) -> Runtime:
     """Serve a robot or a simulation; returns when it can be discovered and called.
 
@@ -126,6 +129,7 @@ async def init_device_connect(  # noqa: PLR0917 - the documented signature
         bringup_timeout: seconds until the device has to be callable.
         cell: the cell that the robot is in, for stops of one cell; its own or that of ``STRANDS_CELL`` by
             default, "" for none.
+        tags: by which callers choose robots; its own or those of ``STRANDS_TAGS`` by default.
 
     Raises:
         ValidationError: an argument out of its domain, or an unauthenticated transport without an opt-in.
@@ -137,7 +141,7 @@ async def init_device_connect(  # noqa: PLR0917 - the documented signature
     reach = link_for(messaging_url, messaging_backend, tenant, link)
     insecure = insecure_opt_in(allow_insecure, reach, stated=link is not None)
     driver = driver_for(robot, peer_type)
-    stays_in = cell_of(driver, cell)
+    stays_in, marked = cell_of(driver, cell), tags_of(tags, driver, body_of(getattr(driver, "robot", None)))
     announceable(driver)
     warnings = _framework_warnings(name)
     registration = asyncio.create_task(
@@ -150,6 +154,8 @@ async def init_device_connect(  # noqa: PLR0917 - the documented signature
 
     async def before_live(messaging: Any) -> None:
         await refuse_duplicate(name, reach, messaging)
+        if marked:
+            runtime.status["tags"] = list(marked)
         # Before it can be called, it can be stopped.
         registered = await asyncio.shield(registration)
         if registered is not None:
@@ -212,6 +218,7 @@ def init_device_connect_sync(  # noqa: PLR0917 - the documented signature
     link: LinkConfig | None = None,
     bringup_timeout: float = BRINGUP_TIMEOUT_S,
     cell: str | None = None,
+    tags: Collection[str] | str | None = None,
 ) -> Runtime:
     """Serve a robot as :func:`init_device_connect`, on the process's device loop.
 
@@ -239,6 +246,7 @@ def init_device_connect_sync(  # noqa: PLR0917 - the documented signature
                 link=link,
                 bringup_timeout=bringup_timeout,
                 cell=cell,
+                tags=tags,
             )
             host = _hosts.get(runtime)
             if host is None:

@@ -25,6 +25,7 @@ from strands_robots.device_connect.beat import BEAT_S, HEARTBEAT_S, named_in
 from strands_robots.device_connect.enrollment import network_of
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety.sightings import sightings
+from strands_robots.tags import read_tags
 
 logger = logging.getLogger(__name__)
 
@@ -115,6 +116,11 @@ class Peer:
         """Its cell, "" for none; None where it states neither, and reads no scope."""
         cell = self.status.get("cell")
         return cell if isinstance(cell, str) else None
+
+    @property
+    def tags(self) -> tuple[str, ...]:
+        """The tags that it states."""
+        return read_tags(self.status.get("tags"))
 
     @classmethod
     def of(cls, description: Mapping[str, Any]) -> Peer:

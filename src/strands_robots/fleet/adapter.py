@@ -33,6 +33,7 @@ class FoundRobot:
     id: str
     type: str = ""
     model: str = ""
+    tags: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

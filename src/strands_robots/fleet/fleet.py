@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Self
@@ -15,6 +15,7 @@ from strands_robots.fleet.enrollment import Enrolment, enroll
 from strands_robots.fleet.fleet_verdict import FleetVerdict, NetworkVerdict
 from strands_robots.fleet.link_flags import LinkFlags
 from strands_robots.fleet.lockout_report import LockoutReport, Resumed
+from strands_robots.fleet.profiles import profile_for
 from strands_robots.fleet.remote_robot import RemoteRobot
 from strands_robots.fleet.side_by_side import side_by_side
 from strands_robots.fleet.stop_answers import measured
@@ -24,6 +25,7 @@ from strands_robots.safety.silence import Sending
 from strands_robots.safety.stop_roster import StopRoster, robots_known_at
 from strands_robots.safety.unheard import unheard_now
 from strands_robots.serving.stop_arguments import stop_reason, stop_scope
+from strands_robots.tags import own_tags
 from strands_robots.utils import DURATION_MAX_S, ValidationError, device_id, near, number, plain_text, shown
 
 logger = logging.getLogger(__name__)
@@ -33,19 +35,20 @@ SOURCE = "strands-robots"
 
 
 def connect(
+    fleet: str | Path | None = None,
     *,
     nats: Sequence[str] | str | None = None,
     connect: Sequence[str] | str | None = None,
     listen: Sequence[str] | str | None = None,
-    multicast: bool = False,
+    multicast: bool | None = None,
     port: int | None = None,
     tenant: str | None = None,
-    insecure: bool = False,
+    insecure: bool | None = None,
     tls_ca: str | Path | None = None,
     tls_cert: str | Path | None = None,
     tls_key: str | Path | None = None,
     credentials: str | Path | None = None,
-    name: str = SOURCE,
+    name: str | None = None,
     mesh: bool | None = None,
 ) -> Fleet:
     """Return the fleet in reach; use it as a context manager.
@@ -56,7 +59,14 @@ def connect(
         with connect(nats=["tls://broker:4222"], credentials="robot.creds.json") as fleet:
             print(fleet.robots())
 
+    A connection profile has them in a file, for both networks::
+
+        with connect("lab") as fleet:
+            print(fleet.where(kind="so100", tags="mobile"))
+
     Args:
+        fleet: a connection profile: its name, or the path of its file. Arguments that are given besides win. By default
+            that of ``STRANDS_FLEET``, unless an argument down to ``port`` says where the network is.
         nats: NATS servers, such as ``nats://host:4222``; one or a list, as the next two.
         connect: Zenoh endpoints to connect to, such as ``tls/host:7447``.
         listen: Zenoh endpoints to listen on.
@@ -68,30 +78,50 @@ def connect(
         tls_cert: this side's certificate.
         tls_key: this side's private key.
         credentials: Device Connect credentials file.
-        name: the caller's name that robots see; letters, digits, ``_`` and ``-``.
-        mesh: False leaves the mesh out; by default ``STRANDS_MESH`` decides.
+        name: the caller's name that robots see; letters, digits, ``_`` and ``-``. By default the profile's, else
+            ``strands-robots``.
+        mesh: False leaves the mesh out; by default the profile and ``STRANDS_MESH`` decide.
 
     Raises:
-        ValidationError: an argument outside its domain, or a network beyond this machine without authentication.
+        ValidationError: an argument outside its domain, a profile that cannot be used, or a network beyond this machine
+            without authentication.
         MissingExtraError: Device Connect is asked for and not installed.
     """
-    source, absent = device_id("name", name), dict[str, str]()
     files = {"tls_ca": tls_ca, "tls_cert": tls_cert, "tls_key": tls_key, "credentials": credentials}
-    paths = {each: Path(file).expanduser() for each, file in files.items() if file is not None}
-    flags = LinkFlags(_items(nats), _items(connect), _items(listen), multicast, port, tenant, insecure, **paths)
+    arguments: dict[str, Any] = {
+        "nats": _items(nats),
+        "connect": _items(connect),
+        "listen": _items(listen),
+        "multicast": multicast,
+        "port": port,
+        "tenant": tenant,
+        "insecure": insecure,
+        **{each: None if file is None else Path(file).expanduser() for each, file in files.items()},
+    }
+    given = {each: value for each, value in arguments.items() if value is not None and value != []}
+    profile = profile_for(fleet, given)
+    flags = LinkFlags(**given) if profile is None else profile.flags(given)
+    source = device_id("name", name if name is not None else (profile and profile.name) or SOURCE)
+    absent: dict[str, str] = {}
     networks: list[NetworkAdapter] = []
-    if flags != LinkFlags() or find_spec("device_connect_edge") is not None:
+    if profile is not None and not profile.reaches_devices(given):
+        absent[DEVICE_CONNECT] = f"the connection profile {profile.label} has none of its networks"
+    elif given or (profile is not None and profile.network) or find_spec("device_connect_edge") is not None:
         from strands_robots.fleet.device_connect.network import DeviceConnectNetwork  # noqa: PLC0415 - loaded when it is used
 
         networks.append(DeviceConnectNetwork(flags.link(), source))
     else:
         absent[DEVICE_CONNECT] = "the extra device-connect is not installed"
+    stated = None if profile is None else profile.mesh
     if mesh is False or mesh_env_request() is False:
         absent[MESH] = "it is switched off"
+    elif profile is not None and stated is None and mesh is None:
+        # The mesh of the environment may be another fleet's.
+        absent[MESH] = f"the connection profile {profile.label} has none"
     else:
         from strands_robots.fleet.mesh.network import MeshNetwork  # noqa: PLC0415 - as above
 
-        networks.append(MeshNetwork(source))
+        networks.append(MeshNetwork(source, stated))
     return Fleet(networks, absent)
 
 
@@ -181,17 +211,26 @@ class Fleet:
                 known.rediscovered(each, network)
         return [self._robots[name] for name in sorted(found)]
 
-    def where(self, *, kind: str | None = None, network: str | None = None) -> list[RemoteRobot]:
-        """Look for robots of a kind or a network.
+    def where(
+        self, *, kind: str | None = None, network: str | None = None, tags: Collection[str] | str | None = None
+    ) -> list[RemoteRobot]:
+        """Look for robots of a kind, of a network, or with tags.
 
         Args:
             kind: a type or a model, as :attr:`RemoteRobot.type` and :attr:`RemoteRobot.model` have it.
             network: ``device_connect`` or ``mesh``.
+            tags: one or several, all of which a robot has to have.
+
+        Raises:
+            ValidationError: what no robot can have as a tag.
         """
+        wanted = set(own_tags(() if tags is None else tags))
         return [
             each
             for each in self.robots()
-            if (kind is None or kind in (each.type, each.model)) and (network is None or network == each.network)
+            if (kind is None or kind in (each.type, each.model))
+            and (network is None or network == each.network)
+            and wanted <= set(each.tags)
         ]
 
     def stop(self) -> FleetVerdict:

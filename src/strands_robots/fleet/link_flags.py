@@ -39,6 +39,8 @@ class LinkFlags:
         tls_cert: this side's certificate.
         tls_key: this side's private key.
         credentials: Device Connect credentials file.
+        alone: they say all, as those of a connection profile do: no variable that names a network, a tenant or
+            certificates counts besides.
     """
 
     nats: Sequence[str] | None = None
@@ -52,6 +54,7 @@ class LinkFlags:
     tls_cert: Path | None = None
     tls_key: Path | None = None
     credentials: Path | None = None
+    alone: bool = False
 
     @property
     def opted_in(self) -> bool:
@@ -61,7 +64,7 @@ class LinkFlags:
     @property
     def stated_tenant(self) -> str:
         """The tenant of Device Connect, of the flag or the environment."""
-        return self.tenant or settings.raw("TENANT")
+        return self.tenant or (settings.default if self.alone else settings.raw)("TENANT")
 
     def link(self, spelled: Spelled = str) -> LinkConfig:
         """Return the link that the flags describe.
@@ -86,11 +89,12 @@ class LinkFlags:
     def _reached(self) -> LinkConfig:
         backends = _backends()
         tenant = self.stated_tenant
+        link: LinkConfig
         if self.nats or self.connect or self.listen or self.multicast:
             transport = "nats" if self.nats else "zenoh"
-            link: LinkConfig = backends.LinkConfig(transport=transport, tenant=tenant)
+            link = backends.LinkConfig(transport=transport, tenant=tenant)
             if self.credentials:
-                link = backends.link_from_environment(tenant, transport, self.credentials)
+                link = backends.link_from_environment(tenant, transport, self.credentials, alone=self.alone)
             return replace(
                 link,
                 mode="peer" if self.listen or self.multicast else "auto",
@@ -99,6 +103,12 @@ class LinkFlags:
                 multicast=True if self.multicast else None,
                 verify_hostname=True,
             )
+        if self.alone and (self.port is not None or not self.credentials):
+            link = backends.loopback_config(self.port, tenant)
+            return link
+        if self.alone:
+            link = backends.link_from_environment(tenant, credentials_file=self.credentials, alone=True)
+            return link
         from strands_robots.device_connect.links import usual_link  # noqa: PLC0415 - loaded when a network is used
 
         return usual_link(tenant, self.port, self.credentials)

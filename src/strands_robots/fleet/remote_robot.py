@@ -127,6 +127,11 @@ class RemoteRobot:
         return self._found.model
 
     @property
+    def tags(self) -> tuple[str, ...]:
+        """Tags that it states, by which :meth:`Fleet.where` finds it."""
+        return self._found.tags
+
+    @property
     def network(self) -> str:
         """``device_connect`` or ``mesh``."""
         return self._network.name
@@ -416,7 +421,9 @@ class RobotOfWorld(RemoteRobot):
 
     def __init__(self, world: RemoteRobot, name: str) -> None:
         self._world, self._name = world, name
-        super().__init__(FoundRobot(f"{world.id}/{name}", world.type, name), world._network, world._networks)
+        super().__init__(
+            FoundRobot(f"{world.id}/{name}", world.type, name, world.tags), world._network, world._networks
+        )
         self._whole: _Known | None = None
         self._shared_id = world._shared_id
 

@@ -7,7 +7,7 @@ import re
 import secrets
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from itertools import count
 from typing import Any
@@ -40,8 +40,7 @@ from strands_robots.mesh.subscriptions import DataCallback, SampleCallback, Subs
 from strands_robots.mesh.teleop import TeleopReceivers, join
 from strands_robots.mesh.throttle import AuditSink, AuditThrottle
 from strands_robots.mesh.transport import Declaration, Sample, Transport
-from strands_robots.mesh.transport.zenoh_config import Posture, TlsCredentials
-from strands_robots.mesh.wire_identity import Identity, signature_policy
+from strands_robots.mesh.wire_identity import Identity, identity_of
 from strands_robots.recording.cameras import frames_of
 from strands_robots.safety.gate import MotionGate
 from strands_robots.safety.persistence import simulation_key
@@ -51,6 +50,7 @@ from strands_robots.serving.own_verbs import own_verbs
 from strands_robots.serving.peer_verbs import description_of
 from strands_robots.serving.pipeline import Own, Pipeline
 from strands_robots.serving.robot_verbs import served
+from strands_robots.tags import tags_of
 from strands_robots.utils import number, text
 
 logger = logging.getLogger(__name__)
@@ -77,6 +77,7 @@ class Parts:
         audit: where safety events go; the audit log by default.
         keep: the lockout outlives the process under the peer's id.
         cell: the cell that the robot is in; empty for none.
+        tags: of the robot.
     """
 
     acquire: Callable[[], Transport | None] = session.acquire
@@ -90,6 +91,7 @@ class Parts:
     plane: SafetyPlane | None = None
     keep: bool = False
     cell: str = ""
+    tags: tuple[str, ...] = ()
 
     def recorder(self, name: str) -> AuditThrottle:
         """Return the audit of a peer."""
@@ -145,7 +147,7 @@ class Mesh(SensorLoopsMixin):
         self._teleop = TeleopReceivers(lambda source, device: InputReceiver(self, body_of(robot), source, device))
         self._description = Description(peer, robot, self._own_verbs)
         self._hearing = Hearing(context, self._adapter.halt)
-        self._presence = PresencePublisher(context, self.peer_type, self._describe, self._safety_facts)
+        self._presence = PresencePublisher(context, self.peer_type, self._describe, self._announced)
         self._state = StateReader(peer, robot, parts.clock)
         self._steps = StepPublisher(context, robot, settings.number("STRANDS_MESH_STREAM_HZ"))
         self._delivery = BoundedExecutor(f"{peer}-delivery", 1, DELIVERIES_MAX, drop_oldest=True)
@@ -186,7 +188,7 @@ class Mesh(SensorLoopsMixin):
                 robot,
                 self._pipeline,
                 kind=self.peer_type,
-                safety=self._safety_facts,
+                safety=self._announced,
                 report=self._adapter.report,
                 own=lambda child: {"ping": own["ping"], "resume": self._resume_of(child)},
                 robot_key=self._adapter.identity,
@@ -198,6 +200,9 @@ class Mesh(SensorLoopsMixin):
 
     def _safety_facts(self, peer_id: str = "") -> dict[str, Any]:
         return {**self._adapter.announced(peer_id), **self._hearing.facts()}
+
+    def _announced(self, peer_id: str = "") -> dict[str, Any]:
+        return self._safety_facts(peer_id) | ({"tags": list(self._parts.tags)} if self._parts.tags else {})
 
     def _lock_of(self, peer_id: str) -> Callable[[object, Sample, str], str | None]:
         return lambda estop, sample, sender: self._safety.on_own_estop(estop, sample, sender, peer_id)
@@ -637,35 +642,30 @@ def _safety_key(robot: Any, peer: str, *, keep: bool) -> str | None:
     return simulation_key(peer) if keep and robot is not None else None
 
 
-def identity_of(transport: Transport) -> Identity:
-    """The identity that the environment asks for on this transport.
-
-    Signed where the session has certificates. MQTT's own certificates are the broker's business, so there it is signed
-    only where that is demanded, with the mesh's.
-    """
-    posture: Posture | None = getattr(transport, "posture", None)
-    if posture is not None:
-        return Identity.from_settings(posture.credentials)
-    return Identity.from_settings(TlsCredentials.from_settings() if signature_policy() == "1" else None)
-
-
 def init_mesh(
-    robot: Any, peer_id: str | None = None, peer_type: str = "robot", mesh: bool = True, *, cell: str | None = None
+    robot: Any,
+    peer_id: str | None = None,
+    peer_type: str = "robot",
+    mesh: bool = True,
+    *,
+    cell: str | None = None,
+    tags: Collection[str] | str | None = None,
 ) -> Mesh | None:
     """Make and start a mesh peer for ``robot``; None when the mesh is off.
 
     Args:
         peer_id: default ``<tool_name_str or "robot">-<8 hex>``.
         cell: the cell that the robot is in, for stops of one cell; that of ``STRANDS_CELL`` by default, "" for none.
+        tags: by which callers choose robots; the robot's own or those of ``STRANDS_TAGS`` by default.
 
     Raises:
         ValueError: ``peer_id`` is no identifier, a reserved word or the name of another robot of this process, or
-            ``cell`` is no identifier.
+            ``cell`` or a tag is no identifier.
     """
     if not mesh or mesh_disabled_by_env():
         return None
-    named = peer_id if peer_id is not None else _default_id(robot)
-    started = Mesh(robot, named, peer_type, parts=Parts(keep=peer_id is not None, cell=own_cell(cell)))
+    parts = Parts(keep=peer_id is not None, cell=own_cell(cell), tags=tags_of(tags, robot))
+    started = Mesh(robot, peer_id if peer_id is not None else _default_id(robot), peer_type, parts=parts)
     started.start()
     return started
 

@@ -1,8 +1,9 @@
 """The one mesh session of a process, and its one registry of peers.
 
-The session is opened for its first user and closed with its last. Without stated endpoints (``ZENOH_CONNECT``,
-``ZENOH_LISTEN``) the first process of a machine is the hub on ``tcp/127.0.0.1:STRANDS_MESH_PORT`` and the others
-are its clients; when it dies a survivor takes the port. Zenoh is imported with the first session, not before.
+The session is opened for its first user and closed with its last. Without stated endpoints (``STRANDS_MESH_CONNECT``,
+``STRANDS_MESH_LISTEN``, else ``ZENOH_CONNECT``, ``ZENOH_LISTEN``) the first process of a machine is the hub on
+``tcp/127.0.0.1:STRANDS_MESH_PORT`` and the others are its clients; when it dies a survivor takes the port. Zenoh is
+imported with the first session, not before.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from strands_robots.mesh.older_peers import Pacer
 from strands_robots.mesh.registry import PEER_TIMEOUT, PeerRegistry
 from strands_robots.mesh.transport import Transport, TransportError
 from strands_robots.mesh.transport.factory import make_transport
+from strands_robots.mesh.transport.zenoh_config import stated_endpoints
 from strands_robots.mesh.wire import WireError
 from strands_robots.safety.network_key import MESH, NetworkKey
 from strands_robots.utils import MissingExtraError, number
@@ -170,7 +172,7 @@ def zenoh_error_types() -> tuple[type[BaseException], ...]:
 def network() -> NetworkKey:
     """Return the key of the mesh that this process joins, from its settings."""
     backend = settings.raw("STRANDS_MESH_BACKEND").lower()
-    endpoints = [*settings.items("ZENOH_CONNECT"), *settings.items("ZENOH_LISTEN")]
+    endpoints = [each for stated in stated_endpoints() for each in stated]
     if backend in ("zenoh", "bridge") and not endpoints:
         endpoints = [f"tcp/127.0.0.1:{settings.integer('STRANDS_MESH_PORT')}"]
     broker = settings.raw("STRANDS_IOT_ENDPOINT")

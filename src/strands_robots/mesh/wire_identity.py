@@ -25,12 +25,14 @@ from strands_robots import settings
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.mesh import wire
 from strands_robots.mesh.throttle import RecentKeys
-from strands_robots.mesh.transport.zenoh_config import TlsCredentials
+from strands_robots.mesh.transport.zenoh_config import Posture, TlsCredentials
 from strands_robots.safety.ed25519 import canonical
 from strands_robots.utils import ValidationError, identifier, missing_extra, shown
 
 if TYPE_CHECKING:
     from cryptography import x509
+
+    from strands_robots.mesh.transport import Transport
 
 logger = logging.getLogger(__name__)
 
@@ -219,6 +221,18 @@ def visitor_id(prefix: str) -> str:
     """
     own, files = f"{prefix}-{secrets.token_hex(4)}", TlsCredentials.from_settings()
     return own if files is None else f"{Signer(files.cert, files.key).common_name}__{own}"
+
+
+def identity_of(transport: Transport) -> Identity:
+    """The identity that the environment asks for on this transport.
+
+    Signed where the session has certificates. MQTT's own certificates are the broker's business, so there it is signed
+    only where that is demanded, with the mesh's.
+    """
+    posture: Posture | None = getattr(transport, "posture", None)
+    if posture is not None:
+        return Identity.from_settings(posture.credentials)
+    return Identity.from_settings(TlsCredentials.from_settings() if signature_policy() == "1" else None)
 
 
 def signature_policy() -> str:

@@ -240,7 +240,7 @@ def connected_agent(port: int) -> Iterator[Agent]:
         import device_connect_agent_tools as tools  # noqa: PLC0415 - loaded when the demo runs
     except ModuleNotFoundError as exc:
         raise missing_extra("the demo", "device-connect") from exc
-    for name in ("MESSAGING_CREDENTIALS_FILE", "NATS_CREDENTIALS_FILE", "ZENOH_LISTEN"):
+    for name in ("MESSAGING_CREDENTIALS_FILE", "NATS_CREDENTIALS_FILE", "ZENOH_LISTEN", "STRANDS_FLEET"):
         settings.put(name, "")
     for part in ("CA", "CERT", "KEY"):
         settings.put(f"MESSAGING_TLS_{part}_FILE", "")

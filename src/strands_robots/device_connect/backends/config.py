@@ -278,7 +278,11 @@ def loopback_config(meet_port: int | None = None, tenant: str = "default") -> Li
 
 
 def link_from_environment(
-    tenant: str = "default", transport: str | None = None, credentials_file: str | Path | None = None
+    tenant: str = "default",
+    transport: str | None = None,
+    credentials_file: str | Path | None = None,
+    *,
+    alone: bool = False,
 ) -> LinkConfig:
     """Return the link of the framework's own variables, else a multicast peer.
 
@@ -286,25 +290,31 @@ def link_from_environment(
         tenant: the tenant of the credentials where this is the default one.
         transport: that of the environment by default.
         credentials_file: that of the environment by default.
+        alone: the credentials file alone counts, and no variable.
 
     Raises:
         ValidationError: an unknown backend, or a credentials file that cannot be read.
     """
     credentials = _credentials_in(credentials_file)
-    backend = transport or (settings.raw("MESSAGING_BACKEND") if settings.is_set("MESSAGING_BACKEND") else "")
-    urls = _first_set("MESSAGING_URLS", *_URLS_OF.get(backend, ("NATS_URL", "ZENOH_CONNECT")))
+    backend = transport or (
+        settings.raw("MESSAGING_BACKEND") if settings.is_set("MESSAGING_BACKEND") and not alone else ""
+    )
+    names = () if alone else ("MESSAGING_URLS", *_URLS_OF.get(backend, ("NATS_URL", "ZENOH_CONNECT")))
+    urls = _first_set(*names)
     if not backend:
         backend = _backend_of(urls, credentials)
     section = credentials.get(backend) or {}
     if not urls:
         urls = tuple(section.get("urls") or ())
-    files = {part: settings.raw(f"MESSAGING_TLS_{part.upper()}_FILE") for part in ("ca", "cert", "key")}
+    files = {
+        part: "" if alone else settings.raw(f"MESSAGING_TLS_{part.upper()}_FILE") for part in ("ca", "cert", "key")
+    }
     from_file = _tls_fields(section.get("tls") or {})
     tls = {part: files[part] or from_file.get(part, "") for part in files}
     return LinkConfig(
         transport=choice("MESSAGING_BACKEND", backend, ("zenoh", "nats")),
         connect=endpoints(urls) if backend == "zenoh" else urls,
-        listen=settings.items("ZENOH_LISTEN") if backend == "zenoh" else (),
+        listen=settings.items("ZENOH_LISTEN") if backend == "zenoh" and not alone else (),
         multicast=True if backend == "zenoh" and not urls else None,
         jwt=section.get("jwt", ""),
         nkey_seed=section.get("nkey_seed", ""),

@@ -91,7 +91,7 @@ class DeviceConnectNetwork:
         with _carried():
             self._peers = {peer.id: peer for peer in self._connected.peers(timeout)}
         return [
-            FoundRobot(peer.id, plain_text(peer.type, 100), plain_text(peer.model, 100))
+            FoundRobot(peer.id, plain_text(peer.type, 100), plain_text(peer.model, 100), peer.tags)
             for peer in self._peers.values()
         ]
 

@@ -7,8 +7,6 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from strands_robots import settings
-
 if TYPE_CHECKING:
     from strands_robots.mesh import Mesh
 
@@ -30,10 +28,14 @@ def discover(mesh: Mesh, meanwhile: Callable[[], object] = lambda: None, *, sinc
         meanwhile: called each time it has looked.
         since: when it joined, in monotonic seconds; just now by default.
     """
-    from strands_robots.mesh.transport.zenoh_config import DISCOVERY_S, LINK_DISCOVERY_S  # noqa: PLC0415 - loaded when it is used
+    from strands_robots.mesh.transport.zenoh_config import (  # noqa: PLC0415 - loaded when it is used
+        DISCOVERY_S,
+        LINK_DISCOVERY_S,
+        stated_endpoints,
+    )
 
     began, found = time.monotonic() if since is None else since, math.inf
-    listens, connects = settings.items("ZENOH_LISTEN"), settings.items("ZENOH_CONNECT")
+    connects, listens = stated_endpoints()
     while (now := time.monotonic()) < began + LINK_DISCOVERY_S:
         if in_reach(mesh):
             found = min(found, now)

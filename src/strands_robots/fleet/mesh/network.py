@@ -13,7 +13,6 @@ from contextlib import closing, contextmanager
 from itertools import count
 from typing import TYPE_CHECKING, Any, Self
 
-from strands_robots import settings
 from strands_robots.envelope import Envelope
 from strands_robots.errors import ArgumentsError, NoAnswerError, NoSuchRobotError, UnreachableError
 from strands_robots.fleet.adapter import CLOSED, FIND_S, MESH, STOP_S, FoundRobot, OnEvent, RobotEvent
@@ -23,6 +22,7 @@ from strands_robots.fleet.mesh.discovery import LOOK_S, discover
 from strands_robots.fleet.mesh.lockouts import ask_peers, lockable_peers, resume_peers
 from strands_robots.fleet.mesh.standing import mesh_network, stand_on_mesh
 from strands_robots.fleet.mesh.stops import lock_peers, stop_answer, stop_peers
+from strands_robots.fleet.mesh_settings import MeshSettings
 from strands_robots.fleet.refusals import refusal_of_text
 from strands_robots.fleet.stop_button import StopSender
 from strands_robots.safety.network_key import NetworkKey
@@ -30,6 +30,7 @@ from strands_robots.safety.peer_answers import enrolled_peers
 from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope
 from strands_robots.safety.stop_roster import StopOutcome
 from strands_robots.serving.verb_schema import described
+from strands_robots.tags import read_tags
 from strands_robots.utils import MissingExtraError, ValidationError, finite, plain_text
 
 if TYPE_CHECKING:
@@ -47,14 +48,16 @@ class MeshNetwork:
 
     Args:
         source: the first part of this peer's id.
+        stated: settings of the mesh that a connection profile states, by variable; they hold while it is joined.
     """
 
     name = MESH
     announces_verbs = False
     reads: Mapping[str, str] = {"status": "status", "state": "state", "features": "features"}
 
-    def __init__(self, source: str) -> None:
+    def __init__(self, source: str, stated: Mapping[str, str] | None = None) -> None:
         self._source = source
+        self._settings = MeshSettings(stated or {})
         self._mesh: Mesh | None = None
         self._joined = math.inf
         self._subscriptions = count()
@@ -71,6 +74,18 @@ class MeshNetwork:
     def open(self) -> None:
         """Join; raise :class:`UnreachableError` where there is no mesh."""
         from strands_robots.mesh import session  # noqa: PLC0415 - the network is loaded when it is used
+
+        if self._settings.take(alive=session.session_alive):
+            _forget_peers()
+        try:
+            self._mesh = self._dialled()
+        except BaseException:
+            self._settings.give_back()
+            raise
+        self._joined = time.monotonic()
+
+    def _dialled(self) -> Mesh:
+        from strands_robots.mesh import session  # noqa: PLC0415 - as above
         from strands_robots.mesh.core import Mesh, Parts  # noqa: PLC0415 - as above
         from strands_robots.mesh.transport import TransportError  # noqa: PLC0415 - as above
         from strands_robots.mesh.wire_identity import IdentityError, visitor_id  # noqa: PLC0415 - as above
@@ -84,14 +99,19 @@ class MeshNetwork:
                 raise
         except (TransportError, IdentityError, MissingExtraError, ValueError) as exc:
             raise UnreachableError(plain_text(str(exc))) from exc
-        self._mesh, self._joined = mesh, time.monotonic()
+        return mesh
 
     def find(self, timeout: float = FIND_S) -> list[FoundRobot]:
         """Return the robots in reach, once they had the time to announce themselves."""
         self._settle(timeout)
         self._discoveries += 1
         return [
-            FoundRobot(str(row["peer_id"]), plain_text(row.get("type"), 100), plain_text(row.get("tool_name"), 100))
+            FoundRobot(
+                str(row["peer_id"]),
+                plain_text(row.get("type"), 100),
+                plain_text(row.get("tool_name"), 100),
+                read_tags(row.get("tags")),
+            )
             for row in self._rows()
         ]
 
@@ -258,6 +278,8 @@ class MeshNetwork:
         mesh, self._mesh = self._mesh, None
         if mesh is not None:
             mesh.close()
+            if self._settings.give_back():
+                _forget_peers()
 
     @property
     def _joined_mesh(self) -> Mesh:
@@ -276,10 +298,13 @@ class MeshNetwork:
 
     def _settle(self, timeout: float) -> None:
         """Wait until peers that are linked to us have announced themselves."""
-        from strands_robots.mesh.transport.zenoh_config import DISCOVERY_S, LINK_DISCOVERY_S  # noqa: PLC0415 - as above
+        from strands_robots.mesh.transport.zenoh_config import (  # noqa: PLC0415 - as above
+            DISCOVERY_S,
+            LINK_DISCOVERY_S,
+            stated_endpoints,
+        )
 
-        stated = settings.items("ZENOH_CONNECT") or settings.items("ZENOH_LISTEN")
-        linked_by = self._joined + LINK_DISCOVERY_S if stated else self._joined
+        linked_by = self._joined + LINK_DISCOVERY_S if any(stated_endpoints()) else self._joined
         until = max(self._joined + DISCOVERY_S, min(linked_by, time.monotonic() + timeout))
         while (now := time.monotonic()) < until and not (now >= self._joined + DISCOVERY_S and self._rows()):
             time.sleep(LOOK_S)
@@ -294,6 +319,14 @@ class MeshNetwork:
                 return False
             time.sleep(LOOK_S)
         return True
+
+
+def _forget_peers() -> None:
+    """Forget the peers of the mesh that this process was on."""
+    from strands_robots.mesh import session  # noqa: PLC0415 - loaded when it is used
+
+    if not session.session_alive():
+        session.clear_peers()
 
 
 def _has_robot(row: Mapping[str, Any]) -> bool:

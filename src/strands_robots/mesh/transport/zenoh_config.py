@@ -100,7 +100,7 @@ class Posture:
             TransportError: it would leave loopback without certificates and without the opt-in, or a certificate
                 file is missing, a link, or a key that others can read, or the access rules are refused.
         """
-        connect, listen = settings.items("ZENOH_CONNECT"), settings.items("ZENOH_LISTEN")
+        connect, listen = stated_endpoints()
         multicast = settings.boolean("STRANDS_MESH_MULTICAST")
         credentials = None if _insecure() else TlsCredentials.from_settings()
         if credentials is None:
@@ -124,7 +124,17 @@ class Posture:
 
 def discovery_timeout(default: float) -> float:
     """Seconds to wait for a peer: longer than ``default`` with stated endpoints."""
-    return LINK_DISCOVERY_S if settings.items("ZENOH_LISTEN") or settings.items("ZENOH_CONNECT") else default
+    return LINK_DISCOVERY_S if any(stated_endpoints()) else default
+
+
+def stated_endpoints() -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the endpoints that the mesh connects to, and those it listens on."""
+    own = (settings.items("STRANDS_MESH_CONNECT"), settings.items("STRANDS_MESH_LISTEN"))
+    shared = (settings.items("ZENOH_CONNECT"), settings.items("ZENOH_LISTEN"))
+    connect, listen = (
+        () if stated == (settings.NO_ENDPOINT,) else stated or other for stated, other in zip(own, shared, strict=True)
+    )
+    return connect, listen
 
 
 def is_loopback(endpoint: str) -> bool:

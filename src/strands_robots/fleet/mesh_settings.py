@@ -1,0 +1,70 @@
+"""Settings of the mesh that a connection profile states.
+
+A process has one session on the mesh, made from its settings. So a profile's are put for the whole process while a
+fleet of that profile is joined, and a fleet of another one is refused meanwhile: it would reach the wrong robots.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping
+from typing import ClassVar
+
+from strands_robots import settings
+from strands_robots.errors import UnreachableError
+
+
+class MeshSettings:
+    """Settings of one fleet's mesh, by variable; empty for those of the environment."""
+
+    _lock: ClassVar[threading.Lock] = threading.Lock()
+    _joined: ClassVar[list[Mapping[str, str]]] = []
+    _before: ClassVar[dict[str, str]] = {}
+
+    def __init__(self, stated: Mapping[str, str]) -> None:
+        self._stated = dict(stated)
+
+    def take(self, *, alive: Callable[[], bool]) -> bool:
+        """Put the settings, until as many fleets of them have given them back.
+
+        True where the process is on another mesh than before.
+
+        Args:
+            alive: returns whether this process has a session already.
+
+        Raises:
+            UnreachableError: the process is on another mesh.
+        """
+        with self._lock:
+            if self._joined and self._joined[0] != self._stated:
+                raise UnreachableError("this process is on the mesh of another connection profile")
+            if not self._joined:
+                before = {name: settings.verbatim(name) for name in self._stated}
+                if (
+                    any(settings.raw(name) != (value or settings.default(name)) for name, value in self._stated.items())
+                    and alive()
+                ):
+                    raise UnreachableError("this process is on a mesh already, with other settings than the profile's")
+                self._before.update(before)
+                put_settings(self._stated)
+            self._joined.append(self._stated)
+            return bool(self._stated) and len(self._joined) == 1
+
+    def give_back(self) -> bool:
+        """Restore what was before, with the last fleet of these settings.
+
+        True where that is another mesh.
+        """
+        with self._lock:
+            self._joined.pop()
+            if self._joined:
+                return False
+            put_settings(self._before)
+            self._before.clear()
+            return bool(self._stated)
+
+
+def put_settings(stated: Mapping[str, str]) -> None:
+    """Put settings by variable, for this process and its children."""
+    for name, value in stated.items():
+        settings.put(name, value)

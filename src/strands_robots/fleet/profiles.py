@@ -1,0 +1,319 @@
+"""Connection profiles: one TOML file a fleet, with its network and certificates.
+
+A profile decides which authority is trusted and which robots a stop reaches. So a file that others can write is
+refused, an unknown key is never skipped, and the file says all: the environment's networks, tenant and certificates do
+not count besides.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from strands_robots import settings
+from strands_robots.fleet.link_flags import LinkFlags
+from strands_robots.safety.state_files import WRITABLE
+from strands_robots.utils import ValidationError, device_id, flag, identifier, near, port, shown, text
+
+BYTES_MAX = 64 * 1024
+ENTRIES_MAX = 64
+SUFFIX = ".toml"
+
+WAYS = ("nats", "connect", "listen", "multicast", "port")
+"""Flags that say where a network is. One that is given replaces all of a profile's, and its ``insecure``."""
+
+Check = Callable[[str, object, Path], Any]
+Value = TypeVar("Value")
+
+
+@dataclass(frozen=True, slots=True)
+class FleetProfile:
+    """One fleet as its file describes it.
+
+    Attributes:
+        label: the name or the path by which it was asked for.
+        file: where it stands.
+        network: the fields of :class:`LinkFlags` that it states. No variable that names a network counts besides.
+        stated_name: the caller's name, None for none; or why it cannot be used.
+        stated_mesh: the mesh's settings by variable, None where the mesh is left out; or why they cannot be used.
+    """
+
+    label: str
+    file: Path
+    network: Mapping[str, Any]
+    stated_name: str | ValidationError | None = None
+    stated_mesh: Mapping[str, str] | ValidationError | None = None
+
+    @property
+    def name(self) -> str | None:
+        """The caller's name, None for none.
+
+        Raises:
+            ValidationError: it is no id of a caller.
+        """
+        return _usable(self.stated_name)
+
+    @property
+    def mesh(self) -> Mapping[str, str] | None:
+        """Settings of the mesh by variable; None where the fleet has no mesh.
+
+        Raises:
+            ValidationError: the table ``[mesh]`` cannot be used.
+        """
+        return _usable(self.stated_mesh)
+
+    def check(self) -> None:
+        """Refuse a name or a mesh that cannot be used.
+
+        Raises:
+            ValidationError: naming the first of them.
+        """
+        _ = self.name, self.mesh
+
+    def flags(self, given: Mapping[str, Any]) -> LinkFlags:
+        """Return the network with the flags that were given besides, which win.
+
+        Args:
+            given: fields of :class:`LinkFlags`, without those that were not stated.
+        """
+        own = dict(self.network)
+        if any(given.get(way) for way in WAYS):
+            # Consent to an unauthenticated network is for the one that the file names.
+            own = {key: value for key, value in own.items() if key not in {*WAYS, "insecure"}}
+        return LinkFlags(**{**own, **given, "alone": True})
+
+    def reaches_devices(self, given: Mapping[str, Any]) -> bool:
+        """Return False for a fleet that is on the mesh alone."""
+        return bool(self.network) or self.stated_mesh is None or any(given.get(way) for way in WAYS)
+
+
+def profile_for(fleet: str | Path | None, given: Mapping[str, Any]) -> FleetProfile | None:
+    """Return the profile that is asked for, else the default one.
+
+    Args:
+        fleet: a name or a file; None for that of ``STRANDS_FLEET``, unless ``given`` says where the network is.
+        given: fields of :class:`LinkFlags` that were stated besides.
+
+    Raises:
+        ValidationError: it cannot be used.
+    """
+    wanted = profile_name(fleet, given)
+    return None if wanted is None else read_profile(wanted)
+
+
+def profile_name(fleet: str | Path | None, given: Mapping[str, Any]) -> str | None:
+    """Return the name or the file of the profile that counts; None for none."""
+    if fleet is not None:
+        return str(fleet)
+    return None if any(given.get(way) for way in WAYS) else settings.raw("STRANDS_FLEET") or None
+
+
+def profiles_folder() -> Path:
+    """Return the folder of the profiles that have a name."""
+    stated = settings.raw("STRANDS_FLEETS_DIR")
+    if stated:
+        return Path(stated).expanduser()
+    configuration = Path(settings.raw("XDG_CONFIG_HOME"))
+    # The XDG specification has a relative path ignored.
+    home = configuration if configuration.is_absolute() else Path.home() / ".config"
+    return home / "strands-robots" / "fleets"
+
+
+def profile_names() -> list[str]:
+    """Return the names of the profiles, sorted."""
+    try:
+        return sorted(each.stem for each in profiles_folder().iterdir() if each.suffix == SUFFIX)
+    except OSError:
+        return []
+
+
+def read_profile(wanted: str | Path) -> FleetProfile:
+    """Read a connection profile.
+
+    Args:
+        wanted: its name, or the path of a file: a value with a ``/`` or that ends in ``.toml``.
+
+    Raises:
+        ValidationError: there is none, others can write it, or it states what it cannot.
+    """
+    label = str(wanted)
+    if "/" in label or label.endswith(SUFFIX):
+        file = _expanded(Path(label)).absolute()
+    else:
+        file = profiles_folder().absolute() / f"{identifier('fleet', label)}{SUFFIX}"
+    table = _parsed(file, _content(label, file))
+    named: str | ValidationError | None = None
+    mesh: Mapping[str, str] | ValidationError | None = None
+    unknown = next((key for key in table if key not in _KEYS), None)
+    if unknown is not None:
+        raise ValidationError(f"{file} has the unknown key {shown(unknown)}.{near(unknown, _KEYS)}")
+    if "name" in table:
+        try:
+            named = device_id(f"name in {file}", table["name"])
+        except ValidationError as exc:
+            named = exc
+    if "mesh" in table:
+        try:
+            mesh = _mesh(table["mesh"], file)
+        except ValidationError as exc:
+            mesh = exc
+    network = {key: check(f"{key} in {file}", table[key], file) for key, check in _NETWORK.items() if key in table}
+    return FleetProfile(label, file, network, named, mesh)
+
+
+def _content(label: str, file: Path) -> bytes:
+    """Return the bytes of a file that nobody but its owner can write."""
+    try:
+        descriptor = os.open(file, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+    except FileNotFoundError:
+        names = "" if file.parent != profiles_folder().absolute() else near(file.stem, profile_names())
+        raise ValidationError(f"There is no connection profile {shown(label)}: {file} is no file.{names}") from None
+    except (OSError, ValueError) as exc:
+        raise ValidationError(f"The connection profile {shown(label)} cannot be read: {exc}.") from exc
+    try:
+        status = os.fstat(descriptor)
+        _require_own(file, status)
+        with os.fdopen(os.dup(descriptor), "rb") as opened:
+            content = opened.read(BYTES_MAX + 1)
+    except OSError as exc:
+        raise ValidationError(f"{file} cannot be read: {exc.strerror}.") from exc
+    finally:
+        os.close(descriptor)
+    if len(content) > BYTES_MAX:
+        raise ValidationError(f"{file} must have at most {BYTES_MAX} bytes, not {max(status.st_size, len(content))}.")
+    return content
+
+
+def _require_own(file: Path, status: os.stat_result) -> None:
+    if not stat.S_ISREG(status.st_mode):
+        raise ValidationError(f"{file} is no plain file.")
+    if status.st_uid not in {0, os.getuid()}:
+        raise ValidationError(f"{file} belongs to uid {status.st_uid} and not to you (uid {os.getuid()}).")
+    mode = stat.S_IMODE(status.st_mode)
+    if mode & WRITABLE:
+        raise ValidationError(f"{file} has mode {mode:04o}: others may write it; run chmod go-w on it.")
+
+
+def _parsed(file: Path, content: bytes) -> dict[str, Any]:
+    import tomllib  # noqa: PLC0415 - a command without a profile starts without it
+
+    try:
+        return tomllib.loads(content.decode())
+    except UnicodeDecodeError as exc:
+        raise ValidationError(f"{file} is no TOML: it is not UTF-8 at byte {exc.start}.") from exc
+    except tomllib.TOMLDecodeError as exc:
+        raise ValidationError(f"{file} is no TOML: {exc}.") from exc
+    except RecursionError:
+        raise ValidationError(f"{file} is no TOML of a profile: it is nested too deeply.") from None
+
+
+def _mesh(value: object, file: Path) -> Mapping[str, str] | None:
+    """Return the table ``[mesh]`` as settings; None where it switches the mesh off."""
+    if not isinstance(value, dict):
+        raise ValidationError(f"mesh in {file} must be a table, not {shown(value)}.")
+    unknown = next((key for key in value if key not in _MESH), None)
+    if unknown is not None:
+        raise ValidationError(f"{file} has the unknown key {shown(unknown)} in [mesh].{near(unknown, _MESH)}")
+    stated = {key: check(f"mesh.{key} in {file}", value[key], file) for key, check in _MESH.items() if key in value}
+    if not stated.pop("enabled", True):
+        return None
+    insecure = stated.pop("insecure", False)
+    named = {_VARIABLES[key]: each if isinstance(each, str) else _spelled(each) for key, each in stated.items()}
+    return {
+        **dict.fromkeys(_OF_NO_MESH, ""),
+        **mesh_at(),
+        "STRANDS_MESH_AUTH_MODE": "none" if insecure else "mtls",
+        "STRANDS_MESH_I_KNOW_THIS_IS_INSECURE": _spelled(insecure),
+        "STRANDS_MESH_LOCAL_DEV": "false",
+        **named,
+    }
+
+
+def mesh_at(port_number: int | None = None) -> dict[str, str]:
+    """Return the settings of a mesh that meets on this machine, and nowhere else.
+
+    Args:
+        port_number: the loopback port of its hub; that of the environment by default.
+    """
+    at = {} if port_number is None else {"STRANDS_MESH_PORT": str(port_number)}
+    return {
+        "STRANDS_MESH_BACKEND": "zenoh",
+        "STRANDS_MESH_CONNECT": settings.NO_ENDPOINT,
+        "STRANDS_MESH_LISTEN": settings.NO_ENDPOINT,
+        "STRANDS_MESH_MULTICAST": "false",
+        **at,
+    }
+
+
+def _spelled(value: object) -> str:
+    if isinstance(value, tuple):
+        return ",".join(value) or settings.NO_ENDPOINT
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def _urls(name: str, value: object, _file: Path) -> tuple[str, ...]:
+    several = [value] if isinstance(value, str) else value
+    if not isinstance(several, list) or len(several) > ENTRIES_MAX:
+        raise ValidationError(f"{name} must be a text or a list of at most {ENTRIES_MAX} texts, not {shown(value)}.")
+    return tuple(text(name, each, longest=500) for each in several)
+
+
+def _path(name: str, value: object, file: Path) -> Path:
+    return file.parent / _expanded(Path(text(name, value, longest=1000)))
+
+
+def _expanded(path: Path) -> Path:
+    try:
+        return path.expanduser()
+    except RuntimeError as exc:
+        raise ValidationError(f"{path} has no home directory to expand.") from exc
+
+
+def _plain(check: Callable[[str, object], Any]) -> Check:
+    return lambda name, value, _file: check(name, value)
+
+
+_NETWORK: dict[str, Check] = {
+    "nats": _urls,
+    "connect": _urls,
+    "listen": _urls,
+    "multicast": _plain(flag),
+    "port": _plain(port),
+    "tenant": _plain(device_id),
+    "insecure": _plain(flag),
+    "tls_ca": _path,
+    "tls_cert": _path,
+    "tls_key": _path,
+    "credentials": _path,
+}
+
+_MESH: dict[str, Check] = {
+    "enabled": _plain(flag),
+    "port": _plain(port),
+    "connect": _urls,
+    "listen": _urls,
+    "multicast": _plain(flag),
+    "namespace": _plain(lambda name, value: text(name, value, longest=100)),
+    "insecure": _plain(flag),
+    "tls_ca": _path,
+    "tls_cert": _path,
+    "tls_key": _path,
+    "acl_file": _path,
+}
+
+_VARIABLES = {key: f"STRANDS_MESH_{key.upper()}" for key in _MESH}
+
+_OF_NO_MESH = tuple(_VARIABLES[key] for key in ("namespace", "tls_ca", "tls_cert", "tls_key", "acl_file"))
+"""Variables that are empty where the file does not state them."""
+
+_KEYS = (*_NETWORK, "name", "mesh")
+
+
+def _usable(stated: Value | ValidationError) -> Value:
+    if isinstance(stated, ValidationError):
+        raise stated
+    return stated
