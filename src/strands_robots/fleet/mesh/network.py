@@ -58,6 +58,8 @@ class MeshNetwork:
     def __init__(self, source: str, stated: Mapping[str, str] | None = None) -> None:
         self._source = source
         self._settings = MeshSettings(stated or {})
+        # Of a profile's mesh it is known once its settings are put.
+        self._key = None if stated else mesh_network()
         self._mesh: Mesh | None = None
         self._joined = math.inf
         self._subscriptions = count()
@@ -77,6 +79,7 @@ class MeshNetwork:
 
         if self._settings.take(alive=session.session_alive):
             _forget_peers()
+        self._key = mesh_network()
         try:
             self._mesh = self._dialled()
         except BaseException:
@@ -191,8 +194,14 @@ class MeshNetwork:
 
     @property
     def key(self) -> NetworkKey:
-        """The name of the mesh that the settings name."""
-        return mesh_network()
+        """The name of the mesh that the settings, or a profile's, name.
+
+        Raises:
+            UnreachableError: the settings of a profile could not be put.
+        """
+        if self._key is None:
+            raise UnreachableError("the mesh of the connection profile is not joined")
+        return self._key
 
     @property
     def reach(self) -> str:
