@@ -127,7 +127,9 @@ class FleetVerdict(Mapping[str, StopVerdict]):
     def __str__(self) -> str:
         said = [f"{name} did not stop." for name, each in self._verdicts.items() if each.stopped is False]
         said += [f"{name}: {why}." for name, each in self._verdicts.items() for why in each.unknown.values()]
-        return " ".join([*said, *filter(None, (each.sentence for each in self.networks))]) or "No robot is known."
+        told = [each for each in self.networks if each.absent or each.problems or (each.outcome and each.outcome.size)]
+        said += [f"{each.network}: {each.sentence}" if len(told) > 1 else each.sentence for each in told]
+        return " ".join(filter(None, said)) or "No robot is known."
 
     def __repr__(self) -> str:
         return f"<FleetVerdict of {len(self)} robots: {'ok' if self.ok else str(self)}>"
