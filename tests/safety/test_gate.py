@@ -92,25 +92,25 @@ def test_a_halt_voids_the_permits_of_whoever_halts_at_the_same_time() -> None:
 
 def test_a_motion_asked_for_before_a_halt_is_refused_when_its_turn_comes_after() -> None:
     gate = MotionGate()
-    asked = gate.asked()
+    request = gate.request()
     gate.revoke()
-    with gate.asked_at(asked), pytest.raises(MotionRefused, match="halted after it was asked for"):
+    with gate.within(request), pytest.raises(MotionRefused, match="halted after it was asked for"):
         gate.permit("start")
     assert gate.permit("start").valid, "what is asked for after the halt may move"
 
 
 def test_a_motion_asked_for_at_this_generation_is_given_its_permit() -> None:
     gate = MotionGate()
-    with gate.asked_at(gate.asked()):
+    with gate.within(gate.request()):
         permit = gate.permit("start")
     assert permit.valid
 
 
 def test_the_moment_of_asking_belongs_to_one_thread() -> None:
     gate, seen = MotionGate(), []
-    asked = gate.asked()
+    request = gate.request()
     gate.revoke()
-    with gate.asked_at(asked):
+    with gate.within(request):
         other = threading.Thread(target=lambda: seen.append(gate.refusal("start")))
         other.start()
         other.join(20)
@@ -131,21 +131,21 @@ def test_every_latch_of_a_robot_has_to_be_free_before_it_moves() -> None:
 
 def test_giving_up_a_call_voids_what_it_began_and_nothing_else() -> None:
     gate = MotionGate()
-    other, asked = gate.permit("wave"), gate.asked()
-    with gate.asked_at(asked):
+    other, request = gate.permit("wave"), gate.request()
+    with gate.within(request):
         begun = gate.permit("start")
-    asked.give_up()
+    request.give_up()
     assert (begun.valid, begun.revoked, other.valid) == (False, False, True)
-    with gate.asked_at(asked), pytest.raises(MotionRefused):
+    with gate.within(request), pytest.raises(MotionRefused):
         gate.permit("start")
 
 
 def test_a_call_inside_a_call_is_as_old_as_the_outer_one() -> None:
     gate = MotionGate()
-    old = gate.asked()
+    old = gate.request()
     gate.revoke()
-    with gate.asked_at(old):
-        with gate.asked_at(gate.asked()):
+    with gate.within(old):
+        with gate.within(gate.request()):
             assert gate.refusal("start") is not None
         assert gate.refusal("start") is not None, "the outer call goes on being old"
     assert gate.refusal("start") is None

@@ -214,8 +214,8 @@ class RobotDriver(CollectedOnce):
             return error(problem) if problem else await super().invoke(function_name, **params)
         caller = params.pop("source_device", None)
         moves, named = verb.kind is Kind.MOTION, params.get("robot_name")
-        asked = self.pipeline.pending.arrive(named if isinstance(named, str) else "") if moves else None
-        command = Command(verb, params, caller, asked)
+        request = self.pipeline.pending.arrive(named if isinstance(named, str) else "") if moves else None
+        command = Command(verb, params, caller, request)
         answered, hand_over = loop_future()
         try:
             self.pipeline.share(verb).submit(partial(self.pipeline.serve, command, hand_over))
@@ -227,8 +227,8 @@ class RobotDriver(CollectedOnce):
             result = busy(command)
         except TimeoutError:
             # This command alone: to revoke the gate without a halt would leave what moves with its last command.
-            if command.asked is not None:
-                command.asked.give_up()
+            if request is not None:
+                request.give_up()
             return error(f"The robot did not answer {verb.name} in time; what it may still start is void.")
         if moves and result.refusal is None:
             logger.info("%s: %s by caller %s (self-declared).", self.peer_id, verb.name, shown(caller))

@@ -211,10 +211,10 @@ class CommandReceiver:
             self._stop(request, verb)
             return
         named = request.command.get("robot_name")
-        asked = self._pipeline.pending.arrive(named if isinstance(named, str) else "")
+        arrived = self._pipeline.pending.arrive(named if isinstance(named, str) else "")
         # A verb of a robot's own refuses what it does not have; the others drop it.
         arguments = {name: value for name, value in request.command.items() if name != "action"}
-        command = Command(verb, arguments if verb.own else request.command, request.sender_id, asked, request)
+        command = Command(verb, arguments if verb.own else request.command, request.sender_id, arrived, request)
         answered = partial(self._answer, request, verb)
         if verb.name == "ping":
             # It reaches nothing below the mesh, so it waits for no worker and no worker waits for it.

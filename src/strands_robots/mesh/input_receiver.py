@@ -379,7 +379,7 @@ class InputReceiver:
             return
         try:
             # A frame that waits for the bus is as old as its stream: a halt since then refuses it there.
-            with nullcontext() if permit is None else permit.inside():
+            with nullcontext() if permit is None else permit.request.gate.within(permit.request):
                 answer = self._apply(self._robot, action)
         except Exception as exc:  # noqa: BLE001 - a bus raises what it likes; the frame counts as not applied
             answer = {"status": "error", "reason": f"{type(exc).__name__}: {exc}"}

@@ -85,17 +85,19 @@ def answered(verb: Callable[P, Envelope]) -> Callable[P, Envelope]:
     return answering
 
 
-class Asked:
-    """A call for motion and its time; a later halt voids what it begins.
+class MotionRequest:
+    """A call for motion, dated by its arrival; a later halt voids what it begins.
 
     Attributes:
+        gate: of the robot that is asked.
         begun: something has moved by it, whatever it is answered.
         read: the verb that asks, where it is declared a read and gets no permit; empty for motions.
     """
 
-    __slots__ = ("__weakref__", "begun", "generation", "given_up", "read")
+    __slots__ = ("__weakref__", "begun", "gate", "generation", "given_up", "read")
 
-    def __init__(self, generation: int, read: str = "") -> None:
+    def __init__(self, gate: MotionGate, generation: int, read: str = "") -> None:
+        self.gate = gate
         self.generation = generation
         self.read = read
         self.given_up = False
@@ -109,11 +111,12 @@ class Asked:
 class Permit:
     """Leave to move until the next halt or until the caller withdraws it."""
 
-    __slots__ = ("_asked", "_ends", "_gate", "_withdrawn", "verb")
+    __slots__ = ("_ends", "_gate", "_withdrawn", "request", "verb")
 
-    def __init__(self, gate: MotionGate, asked: Asked, verb: str) -> None:
-        self._gate = gate
-        self._asked = asked
+    def __init__(self, request: MotionRequest, verb: str) -> None:
+        self._gate = request.gate
+        self.request = request
+        """What it was given for; all that this begins has the same."""
         self._withdrawn = False
         self._ends: float | None = None
         self.verb = verb
@@ -121,23 +124,18 @@ class Permit:
     @property
     def generation(self) -> int:
         """The gate's, when the motion was asked for."""
-        return self._asked.generation
-
-    @property
-    def call(self) -> Asked:
-        """The call that it was given to; what the call begins besides has the same."""
-        return self._asked
+        return self.request.generation
 
     @property
     def valid(self) -> bool:
         """False for ever after a halt, a lock, a withdrawal, or its call's end."""
         over = self._ends is not None and time.monotonic() >= self._ends
-        return not (over or self._withdrawn or self._asked.given_up or self.revoked)
+        return not (over or self._withdrawn or self.request.given_up or self.revoked)
 
     @property
     def revoked(self) -> bool:
         """True for ever once the whole robot was halted or locked."""
-        return self._gate.generation != self._asked.generation
+        return self._gate.generation != self.request.generation
 
     @property
     def locked(self) -> bool:
@@ -182,13 +180,9 @@ class Permit:
             except MotionsHeldError:
                 continue
 
-    def inside(self) -> AbstractContextManager[None]:
-        """Make motions begun inside, on this thread, part of this one."""
-        return self._gate.asked_at(self._asked)
-
     def begin(self) -> None:
         """Note that something moves by this permit from now on."""
-        self._asked.begun = True
+        self.request.begun = True
 
     def end_at(self, moment: float) -> None:
         """Void this permit alone from a moment on, in monotonic s."""
@@ -231,7 +225,7 @@ class MotionGate:
         self._attaching = threading.Lock()
         self._counting = threading.Lock()
         self._generation = 0
-        self._here = threading.local()
+        self._of_thread = threading.local()
         self._watchers: tuple[Callable[[], None], ...] = ()
         self._given = 0
         self.under_way = VerbsUnderWay()
@@ -291,36 +285,40 @@ class MotionGate:
 
         return unwatch
 
-    def asked(self) -> Asked:
-        """A call that asks for motion now; for :meth:`asked_at` when its turn comes."""
-        return Asked(self._generation)
+    def request(self) -> MotionRequest:
+        """Return a request for motion that is made now, for :meth:`permit` later.
+
+        A call that waits for a thread or a connection is thus older than a stop that comes meanwhile.
+        """
+        return MotionRequest(self, self._generation)
 
     @contextmanager
-    def asked_at(self, asked: Asked) -> Iterator[None]:
-        """Date motions begun inside, on this thread; a later halt refuses them.
+    def within(self, request: MotionRequest) -> Iterator[None]:
+        """Make permits that a stranger's code asks for on this thread part of a request.
 
-        A call that waited for a thread or a connection is thus older than the stop that came meanwhile. Of two
-        around one another the outer one counts, which is the older.
+        A robot of ours is given its request as an argument. A stranger's robot, and the verbs that its author declares,
+        call gate and robot without one, so this thread has to remember it. Of two requests around one another the
+        outer one counts, which is the older.
         """
-        before: Asked | None = getattr(self._here, "asked", None)
-        self._here.asked = before or asked
+        before = self._outer()
+        self._of_thread.request = before or request
         try:
             yield
         finally:
-            self._here.asked = before
+            self._of_thread.request = before
 
     @contextmanager
     def reading(self, verb: str) -> Iterator[None]:
         """Refuse permits on this thread, for the time of a verb that is a read."""
-        before: Asked | None = getattr(self._here, "asked", None)
-        self._here.asked = Asked(self._generation, read=verb)
+        before = self._outer()
+        self._of_thread.request = MotionRequest(self, self._generation, read=verb)
         try:
             yield
         finally:
-            self._here.asked = before
+            self._of_thread.request = before
 
     @contextmanager
-    def moving(self, verb: str, within_s: float) -> Iterator[Permit]:
+    def moving(self, verb: str, within_s: float, request: MotionRequest | None = None) -> Iterator[Permit]:
         """Give the permit of a robot's own verb, and mark the time until it has returned.
 
         The permit is void after ``within_s`` seconds, and once the verb has returned.
@@ -328,8 +326,8 @@ class MotionGate:
         Raises:
             MotionRefused: locked, halted since it was asked for, or another own verb has not returned.
         """
-        permit = self.permit(verb)
-        call = VerbCall(verb, permit.call, lambda: permit.valid, permit.call.give_up)
+        permit = self.permit(verb, request)
+        call = VerbCall(verb, permit.request, lambda: permit.valid, permit.request.give_up)
         with self.under_way.entered(call) as other:
             if other:
                 raise MotionRefused(error(f"{verb} is refused: {other} of this robot has not returned."))
@@ -338,7 +336,7 @@ class MotionGate:
                 permit.check()
                 permit.begin()
                 permit.end_at(time.monotonic() + within_s)
-                with permit.inside():
+                with self.within(permit.request):
                     yield permit
                 call.ended = "completed" if permit.valid else "stopped"
             except BaseException as exc:
@@ -357,17 +355,22 @@ class MotionGate:
                 return locked
         return None
 
-    def refusal(self, verb: str) -> Envelope | None:
+    def refusal(self, verb: str, request: MotionRequest | None = None) -> Envelope | None:
         """Return the refusal of ``verb`` while locked or halted since, else None."""
-        return self._refusal(verb, self._asked_here())
+        return self._refusal(verb, self._dated(request))
 
-    def permit(self, verb: str) -> Permit:
-        """Return leave to move; raise :class:`MotionRefused` if locked or halted."""
+    def permit(self, verb: str, request: MotionRequest | None = None) -> Permit:
+        """Return leave to move; raise :class:`MotionRefused` if locked or halted.
+
+        Args:
+            verb: its name in the refusal.
+            request: what the motion is a part of; one that is made now by default.
+        """
         # The generation is read before the latches, so that a lock engaged in between voids this permit.
-        asked = self._asked_here()
-        permit = Permit(self, asked, verb)
+        dated = self._dated(request)
+        permit = Permit(dated, verb)
         for _ in range(2):
-            refusal = self._refusal(verb, asked)
+            refusal = self._refusal(verb, dated)
             if refusal is not None:
                 raise MotionRefused(refusal)
             # Counted between two looks at the latches: a settling that begins beside this either is a latch that
@@ -396,7 +399,7 @@ class MotionGate:
 
         No latch is asked, for the robot is locked. Only a robot's own halt may call this; the next halt voids it.
         """
-        return Permit(self, Asked(generation), "settle")
+        return Permit(MotionRequest(self, generation), "settle")
 
     def renew(self, permit: Permit) -> Permit:
         """Void every other permit, as a halt does, and return a fresh one.
@@ -407,22 +410,25 @@ class MotionGate:
             valid = permit.valid
             if valid:
                 self._generation += 1
-            asked = Asked(self._generation)
-        refusal = self._refusal(permit.verb, asked) if valid else error(_LATE.format(permit.verb))
+            request = MotionRequest(self, self._generation)
+        refusal = self._refusal(permit.verb, request) if valid else error(_LATE.format(permit.verb))
         if refusal is not None:
             raise MotionRefused(refusal)
-        return Permit(self, asked, permit.verb)
+        return Permit(request, permit.verb)
 
-    def _asked_here(self) -> Asked:
-        return getattr(self._here, "asked", None) or Asked(self._generation)
+    def _outer(self) -> MotionRequest | None:
+        return getattr(self._of_thread, "request", None)
 
-    def _refusal(self, verb: str, asked: Asked) -> Envelope | None:
-        if asked.read:
-            return error(f"{verb} is refused: {asked.read} is declared a read, and a read moves nothing.")
+    def _dated(self, request: MotionRequest | None) -> MotionRequest:
+        return self._outer() or request or MotionRequest(self, self._generation)
+
+    def _refusal(self, verb: str, request: MotionRequest) -> Envelope | None:
+        if request.read:
+            return error(f"{verb} is refused: {request.read} is declared a read, and a read moves nothing.")
         locked = self.lockout(verb)
         if locked is not None:
             return locked
-        late = asked.given_up or asked.generation != self._generation
+        late = request.given_up or request.generation != self._generation
         return error(_LATE.format(verb)) if late else None
 
 

@@ -21,7 +21,7 @@ from strands_robots.envelope import Envelope, error, is_error
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.identity_map import IdentityMap
 from strands_robots.safety.approval import Approval, Claim, digest
-from strands_robots.safety.gate import REFUSALS, Asked, MotionGate, MotionRefused, refusal_envelope
+from strands_robots.safety.gate import REFUSALS, MotionGate, MotionRefused, MotionRequest, refusal_envelope
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.serving.admissions import Admission
 from strands_robots.serving.control import ControlLeases, NotHolderError, leases_of
@@ -81,14 +81,14 @@ class Command:
     Attributes:
         arguments: unchecked, as the caller gave them.
         caller: the caller's declared name, or whatever stood in its place.
-        asked: the robot's gate when the command arrived; None for a peer without a robot.
+        request: made of the robot's gate when the command arrived; None for a peer without a robot.
         proof: what the network knows of the sender besides its name.
     """
 
     verb: Verb
     arguments: Mapping[str, Any]
     caller: object = None
-    asked: Asked | None = None
+    request: MotionRequest | None = None
     proof: Any = None
 
 
@@ -154,32 +154,32 @@ class PendingCommands:
         self._gate = gate
         self._robot = robot
         self._lock: threading.Lock = shared._lock if shared else threading.Lock()
-        self._pending: WeakKeyDictionary[Asked, str] = shared._pending if shared else WeakKeyDictionary()
+        self._pending: WeakKeyDictionary[MotionRequest, str] = shared._pending if shared else WeakKeyDictionary()
 
     def of(self, robot: str) -> PendingCommands:
         """The same commands, for the peer of one robot of the world."""
         return PendingCommands(self._gate, robot, self)
 
-    def arrive(self, robot: str = "") -> Asked | None:
+    def arrive(self, robot: str = "") -> MotionRequest | None:
         """Note a command's arrival; what it begins may be no older than this."""
         if self._gate is None:
             return None
-        asked = self._gate.asked()
+        request = self._gate.request()
         with self._lock:
-            self._pending[asked] = self._robot or robot
-        return asked
+            self._pending[request] = self._robot or robot
+        return request
 
-    def serving(self, asked: Asked | None) -> AbstractContextManager[None]:
+    def serving(self, request: MotionRequest | None) -> AbstractContextManager[None]:
         """The time in which this thread carries the command out."""
-        return nullcontext() if self._gate is None or asked is None else self._gate.asked_at(asked)
+        return nullcontext() if request is None else request.gate.within(request)
 
     def void(self, robot: str = "") -> None:
         """Void pending commands of this robot of the world, because it is stopped."""
         name = robot or self._robot
         with self._lock:
-            for asked, named in self._pending.items() if name else ():
+            for request, named in self._pending.items() if name else ():
                 if named in (name, ""):
-                    asked.give_up()
+                    request.give_up()
 
 
 _PENDING: IdentityMap[PendingCommands] = IdentityMap()
@@ -246,7 +246,7 @@ class Pipeline:
             arguments = self._checked(command)
             callers = self.authorize(command, arguments) or ()
             admit = self._control(command, arguments)
-            with self.pending.serving(command.asked):
+            with self.pending.serving(command.request):
                 if verb.kind is Kind.MOTION:
                     self._give_leave(leave, command, arguments, admit, callers)
                 # Of what ends in an exception nobody knows whether it moves.
@@ -274,7 +274,7 @@ class Pipeline:
         try:
             try:
                 # A motion that began and ended badly is answered with an error, too.
-                leave.close(begun or (command.asked is not None and command.asked.begun))
+                leave.close(begun or (command.request is not None and command.request.begun))
             except OSError:
                 logger.exception("%s: the grant of %s is still in its folder.", self.peer_id(), verb.name)
             answered(Result(result, refusal))
@@ -327,7 +327,7 @@ class Pipeline:
                 admission = leases.admit(verb.name, command.caller, lease_id, name, ttl_s, hold=hold)
             except NotHolderError as exc:
                 raise Refused(RefusalReason.CONTROL, str(exc), envelope=exc.envelope) from None
-            admission.begun = lambda: command.asked is not None and command.asked.begun
+            admission.begun = lambda: command.request is not None and command.request.begun
             return admission
 
         return admit

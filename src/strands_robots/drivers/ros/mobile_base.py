@@ -358,7 +358,7 @@ class MobileBaseRobot:
             permit = self.gate.permit(verb)
             refusal = self.command_gate.refusal(*target, verb, tool_context)
             # The operator may take minutes to answer: a stop meanwhile also ends the handshake, which would arm.
-            with permit.inside():
+            with self.gate.within(permit.request):
                 refusal = refusal or self.handshake(tool_context)
             if refusal is not None:
                 return refusal
