@@ -14,9 +14,10 @@ from fixtures.toy_robots import ToyRobot
 from fixtures.waiting import eventually
 
 from strands_robots.envelope import error, success
-from strands_robots.safety.approval import Approval, Claim, Grants, digest
-from strands_robots.serving import admissions
-from strands_robots.serving.pipeline import Command, Pipeline, RefusalReason, Refused, Result
+from strands_robots.safety.approval import Approval, Grants, Leave, digest
+from strands_robots.serving import starting_motions
+from strands_robots.serving.leave import Command, RefusalReason, Refused
+from strands_robots.serving.pipeline import Pipeline, Result
 from strands_robots.serving.robot_verbs import ARM_VERBS
 from strands_robots.serving.verbs import Arguments
 
@@ -297,7 +298,7 @@ def test_a_grant_is_spent_by_what_began_or_may_have(
 def test_another_callers_motion_is_refused_at_once_while_a_call_that_lasts_moves(
     robot: ToyRobot, grants: Grants, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(admissions, "START_WAIT_S", 600.0)
+    monkeypatch.setattr(starting_motions, "START_WAIT_S", 600.0)
     moves, end = threading.Event(), threading.Event()
 
     def last(toy: Any, arguments: Arguments) -> Any:
@@ -323,9 +324,9 @@ def test_another_callers_motion_is_refused_at_once_while_a_call_that_lasts_moves
 def test_a_caller_is_answered_though_the_grant_cannot_be_taken_away(
     robot: ToyRobot, grants: Grants, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fails(claim: Claim) -> None:
+    def fails(leave: Leave, begun: bool) -> None:
         raise OSError("read-only file system")
 
     grants.grant("execute", "arm-1")
-    monkeypatch.setattr(Claim, "spend", fails)
+    monkeypatch.setattr(Leave, "settle", fails)
     assert ok(served(pipeline(robot, grants), "agent-a"))

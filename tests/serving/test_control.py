@@ -16,7 +16,8 @@ from strands_robots.serving.control import ControlLease, NotHolderError, leases_
 from strands_robots.serving.control_changes import ControlChange
 from strands_robots.serving.control_verbs import CONTROL_VERBS
 from strands_robots.serving.lease_watch import LeaseWatch
-from strands_robots.serving.pipeline import Command, Pipeline, RefusalReason, Result
+from strands_robots.serving.leave import Command, RefusalReason
+from strands_robots.serving.pipeline import Pipeline, Result
 from strands_robots.serving.robot_verbs import ARM_VERBS, WORLD_VERBS
 from strands_robots.serving.take_assertion import PURPOSE, VERSION, sign_take
 
@@ -94,7 +95,7 @@ def refused(bench: Bench, who: str, lease_id: str = "") -> dict[str, Any]:
 
 def test_holder_moves_and_another_is_refused_with_holder_and_seconds(bench: Bench) -> None:
     held = bench.acquire(ttl_s=60.0)
-    bench.lease.admit("moveTo", "agent-a", held).close()
+    bench.lease.admit("moveTo", "agent-a", held).settle()
     bench.clock.now += 20.0
     answer = refused(bench, "agent-b")
     assert (answer["code"], answer["holder"], answer["expires_in_s"]) == ("not_holder", "agent-a", 40.0)
@@ -110,7 +111,7 @@ def test_each_motion_renews_the_lease(bench: Bench) -> None:
     held = bench.acquire(ttl_s=60.0)
     for _ in range(5):
         bench.clock.now += 50.0
-        bench.lease.admit("moveTo", "agent-a", held).close()
+        bench.lease.admit("moveTo", "agent-a", held).settle()
     assert bench.lease.facts()["expires_in_s"] == 60.0
 
 
@@ -138,18 +139,18 @@ def test_released_robot_is_free_for_others(bench: Bench) -> None:
 
 
 def test_motion_on_a_free_robot_holds_it_until_it_has_ended(bench: Bench) -> None:
-    admission = bench.lease.admit("moveTo", "agent-a", "")
+    leave = bench.lease.admit("moveTo", "agent-a", "")
     assert refused(bench, "agent-b")["expires_in_s"] is None
     bench.body.moves = True
-    admission.close()
+    leave.settle()
     assert refused(bench, "agent-b")["holder"] == "agent-a"
-    bench.lease.admit("moveTo", "agent-a", "").close()
+    bench.lease.admit("moveTo", "agent-a", "").settle()
     bench.body.moves = False
-    bench.lease.admit("moveTo", "agent-b", "").close()
+    bench.lease.admit("moveTo", "agent-b", "").settle()
 
 
 def test_motion_with_a_time_is_halted_when_it_is_not_renewed(bench: Bench) -> None:
-    bench.lease.admit("moveTo", "agent-a", SECRET, 5.0).close()
+    bench.lease.admit("moveTo", "agent-a", SECRET, 5.0).settle()
     bench.body.moves = True
     for _ in range(3):
         bench.clock.now += 4.0
@@ -164,12 +165,12 @@ def test_motion_with_a_time_is_halted_when_it_is_not_renewed(bench: Bench) -> No
 
 
 def test_motion_with_a_time_that_has_ended_is_not_halted(bench: Bench) -> None:
-    bench.lease.admit("moveTo", "agent-a", SECRET, 5.0).close()
+    bench.lease.admit("moveTo", "agent-a", SECRET, 5.0).settle()
     bench.clock.now += 5.0
     bench.lease.expire()
     assert bench.body.halts == []
     assert bench.lease.facts()["held"] is False
-    bench.lease.admit("moveTo", "agent-b", SECRET + "b", 5.0).close()
+    bench.lease.admit("moveTo", "agent-b", SECRET + "b", 5.0).settle()
 
 
 def test_motion_with_a_time_that_is_still_starting_is_halted(bench: Bench) -> None:
@@ -180,18 +181,18 @@ def test_motion_with_a_time_that_is_still_starting_is_halted(bench: Bench) -> No
 
 
 def test_motion_with_a_time_keeps_others_out_until_it_has_ended(bench: Bench) -> None:
-    bench.lease.admit("moveTo", "agent-a", SECRET, 5.0).close()
+    bench.lease.admit("moveTo", "agent-a", SECRET, 5.0).settle()
     bench.body.moves = True
     assert refused(bench, "agent-b")["expires_in_s"] is None
     assert refused(bench, "agent-a", "another secret")["code"] == "not_holder"
-    bench.lease.admit("setGripper", "agent-a", SECRET, 5.0).close()
+    bench.lease.admit("setGripper", "agent-a", SECRET, 5.0).settle()
     assert bench.lease.facts()["for_one_motion"] is True
     bench.body.moves = False
     bench.acquire("agent-b")
 
 
 def test_motion_that_was_refused_leaves_the_robot_free(bench: Bench) -> None:
-    bench.lease.admit("moveTo", "agent-a", "").close()
+    bench.lease.admit("moveTo", "agent-a", "").settle()
     bench.acquire("agent-b")
 
 
@@ -203,7 +204,7 @@ def test_human_takes_control_and_the_motion_is_halted_before_the_answer(bench: B
     assert bench.body.halts == ["control taken by ann: because"]
     displaced = refused(bench, "agent-a", held)
     assert (displaced["code"], displaced["holder"]) == ("displaced", "ann")
-    bench.lease.admit("moveTo", "ann", answer["lease_id"]).close()
+    bench.lease.admit("moveTo", "ann", answer["lease_id"]).settle()
     assert bench.changes[-1] == ControlChange("taken", "arm-1", "ann", "human", 2, "because")
 
 
@@ -225,7 +226,7 @@ def test_assertion_for_something_else_takes_nothing(bench: Bench, changed: dict[
     answer = bench.take(**changed)
     assert answer["status"] == "error"
     assert why in answer["content"][0]["text"]
-    bench.lease.admit("moveTo", "agent-a", held).close()
+    bench.lease.admit("moveTo", "agent-a", held).settle()
     assert bench.body.halts == []
 
 
@@ -393,7 +394,7 @@ class Unreadable(Bench):
 @pytest.mark.parametrize("state", [OSError("the bus is gone"), None, True])
 def test_motion_whose_state_is_not_known_to_be_at_rest_is_halted_at_its_time(state: bool | Exception | None) -> None:
     bench = Unreadable()
-    bench.lease.admit("execute", "agent-a", SECRET, 5.0).close()
+    bench.lease.admit("execute", "agent-a", SECRET, 5.0).settle()
     bench.state = state
     bench.clock.now += 5.0
     bench.lease.expire()
@@ -404,7 +405,7 @@ def test_motion_whose_state_is_not_known_to_be_at_rest_is_halted_at_its_time(sta
 
 def test_robot_at_rest_is_not_halted_at_the_end_of_a_motions_time() -> None:
     bench = Unreadable()
-    bench.lease.admit("execute", "agent-a", SECRET, 5.0).close()
+    bench.lease.admit("execute", "agent-a", SECRET, 5.0).settle()
     bench.state = False
     bench.clock.now += 5.0
     bench.lease.expire()
@@ -426,11 +427,11 @@ def test_lease_ends_and_is_told_though_the_halt_failed(bench: Bench, monkeypatch
 
 def test_robot_whose_state_cannot_be_read_stays_its_movers() -> None:
     bench = Unreadable()
-    bench.lease.admit("moveTo", "agent-a", "").close()
+    bench.lease.admit("moveTo", "agent-a", "").settle()
     bench.state = OSError("the bus is gone")
     assert refused(bench, "agent-b")["code"] == "not_holder"
     bench.state = None
-    bench.lease.admit("moveTo", "agent-b", "").close()
+    bench.lease.admit("moveTo", "agent-b", "").settle()
 
 
 @pytest.mark.parametrize("state", ["running", "idle", "wandering", None])
@@ -445,7 +446,7 @@ def test_time_of_a_motion_bounds_the_lease_that_its_caller_holds(bench: Bench, a
     held = bench.acquire(ttl_s=60.0)
     watched: list[float | None] = []
     bench.lease._watched = lambda lease: watched.append(lease.due)
-    bench.lease.admit("execute", "agent-a", held, asked).close()
+    bench.lease.admit("execute", "agent-a", held, asked).settle()
     assert watched == ([bench.clock.now + lasts] if asked else [])
     bench.clock.now += lasts / 2
     bench.lease.renew(held)
@@ -458,16 +459,16 @@ def test_time_of_a_motion_bounds_the_lease_that_its_caller_holds(bench: Bench, a
 
 
 def test_second_motion_bounds_the_time_of_the_first(bench: Bench) -> None:
-    bench.lease.admit("execute", "agent-a", SECRET, 60.0).close()
+    bench.lease.admit("execute", "agent-a", SECRET, 60.0).settle()
     bench.body.moves = True
-    bench.lease.admit("execute", "agent-a", SECRET, 2.0).close()
+    bench.lease.admit("execute", "agent-a", SECRET, 2.0).settle()
     bench.clock.now += 2.0
     bench.lease.expire()
     assert len(bench.body.halts) == 1
 
 
 def test_name_of_a_caller_with_a_secret_does_not_stand_for_it(bench: Bench) -> None:
-    bench.lease.admit("execute", "agent-a", SECRET, 5.0).close()
+    bench.lease.admit("execute", "agent-a", SECRET, 5.0).settle()
     bench.body.moves = True
     assert refused(bench, "agent-a")["code"] == "not_holder"
     with pytest.raises(NotHolderError):

@@ -43,9 +43,9 @@ def robot(wedge: threading.Event) -> Iterator[ToyRobot]:
 def moved(robot: ToyRobot) -> ControlLease:
     """Have agent-a move the robot for a short time; return the lease."""
     lease = leases_of(robot, hardware=False).of()
-    admission = lease.admit("execute", "agent-a", SECRET, TTL_S)
+    leave = lease.admit("execute", "agent-a", SECRET, TTL_S)
     assert robot.start_task("wave", duration=300.0)["status"] == "success"
-    admission.close()
+    leave.settle()
     return lease
 
 
@@ -62,7 +62,7 @@ def test_robot_whose_status_hangs_is_halted_at_the_end_of_its_lease(robot: ToyRo
 
 def test_status_that_hangs_holds_up_no_call_for_long(robot: ToyRobot, wedge: threading.Event) -> None:
     lease = leases_of(robot, hardware=False).of()
-    lease.admit("execute", "agent-a", SECRET, 60.0).close()
+    lease.admit("execute", "agent-a", SECRET, 60.0).settle()
     robot.before["get_task_status"] = wedge.wait
     began = time.monotonic()
     for _ in range(50):
@@ -76,7 +76,7 @@ def test_status_that_hangs_holds_up_no_call_for_long(robot: ToyRobot, wedge: thr
 
 def test_status_that_hangs_occupies_one_thread(robot: ToyRobot, wedge: threading.Event) -> None:
     lease = leases_of(robot, hardware=False).of()
-    lease.admit("execute", "agent-a", SECRET, 60.0).close()
+    lease.admit("execute", "agent-a", SECRET, 60.0).settle()
     inside: list[str] = []
 
     def hang() -> None:
@@ -145,10 +145,10 @@ def test_world_that_hangs_is_asked_for_nothing_before_the_stop_of_its_robot(wedg
     world = Hanging()
     try:
         lease = leases_of(world, hardware=False).of("left")
-        admission = lease.admit("execute", "agent-a", SECRET, TTL_S)
+        leave = lease.admit("execute", "agent-a", SECRET, TTL_S)
         for name in ("left", "right"):
             assert world.start_policy(name, "wave", duration=300.0)["status"] == "success"
-        admission.close()
+        leave.settle()
         world.wedged = True
         eventually(lambda: not world.rollouts["left"].running, PROMPTLY_S, "the stop of one robot")
         assert world.rollouts["right"].running

@@ -21,7 +21,7 @@ from strands_robots.errors import (
     RobotError,
     UnknownVerbError,
 )
-from strands_robots.serving.pipeline import RefusalReason
+from strands_robots.serving.leave import RefusalReason
 from strands_robots.utils import plain_text
 
 WHY_MAX = 500

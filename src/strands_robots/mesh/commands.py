@@ -21,8 +21,9 @@ from strands_robots.safety.identity import SigningIdentity
 from strands_robots.safety.peer_answers import with_stop_statement
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import Outcome, StopVerdict, explain, grade
+from strands_robots.serving.leave import Command, RefusalReason, Refused
 from strands_robots.serving.peer_verbs import PEER_VERBS
-from strands_robots.serving.pipeline import Command, Own, Pipeline, RefusalReason, Refused, Result, busy
+from strands_robots.serving.pipeline import Own, Pipeline, Result, busy
 from strands_robots.serving.robot_verbs import peer_stop_answer, run_to_end
 from strands_robots.serving.stop_requests import Request as StopRequest
 from strands_robots.serving.stop_requests import StopRequests

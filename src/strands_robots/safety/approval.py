@@ -18,7 +18,7 @@ import json
 import os
 import secrets
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -73,22 +73,20 @@ def _plain(value: Any) -> Any:
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
-@dataclass(frozen=True, slots=True)
-class Claim:
-    """Leave to do one verb once; end it by :meth:`spend` or :meth:`give_back`."""
+class Leave:
+    """Leave of one motion to begin, until it is known whether it has.
 
-    file: Path | None = None
+    Args:
+        ends: what was taken for it; each is told whether the motion has begun.
+    """
 
-    def spend(self) -> None:
-        """The verb was done: a grant is gone for good."""
-        if self.file is not None:
-            self.file.unlink(missing_ok=True)
+    def __init__(self, *ends: Callable[[bool], object]) -> None:
+        self._ends = ends
 
-    def give_back(self) -> None:
-        """The verb was not done: a grant may be claimed again until it expires."""
-        if self.file is not None:
-            with contextlib.suppress(FileNotFoundError):  # the folder was tidied meanwhile
-                self.file.rename(self.file.with_name(self.file.name.removesuffix(_CLAIMED)))
+    def settle(self, begun: bool = True) -> None:
+        """Spend what was taken for a motion that has begun; else give it back."""
+        for end in self._ends:
+            end(begun)
 
 
 class Grants:
@@ -131,13 +129,13 @@ class Grants:
         writing.rename(path)
         return path
 
-    def claim(self, verb: str, peer: str, callers: Collection[str] = (), arguments_digest: str = "") -> Claim | None:
+    def claim(self, verb: str, peer: str, callers: Collection[str] = (), arguments_digest: str = "") -> Leave | None:
         """Take one grant that is for this command, or None."""
         for path in self.fitting(verb, peer, callers, arguments_digest):
             taken = path.with_name(path.name + _CLAIMED)
             with contextlib.suppress(FileNotFoundError):  # another command was first
                 path.rename(taken)
-                return Claim(taken)
+                return Leave(partial(_settled, taken))
         return None
 
     def fitting(self, verb: str, peer: str, callers: Collection[str] = (), arguments_digest: str = "") -> list[Path]:
@@ -172,6 +170,15 @@ class Grants:
         return None
 
 
+def _settled(claimed: Path, begun: bool) -> None:
+    """Remove the grant of a motion that has begun; let any other be claimed again."""
+    if begun:
+        claimed.unlink(missing_ok=True)
+        return
+    with contextlib.suppress(FileNotFoundError):  # the folder was tidied meanwhile
+        claimed.rename(claimed.with_name(claimed.name.removesuffix(_CLAIMED)))
+
+
 class Approval:
     """The operator's approval of the verbs of one robot.
 
@@ -191,7 +198,7 @@ class Approval:
         self._bypass = bypass
         self._grants = grants
 
-    def claim(self, verb: str, peer: str, callers: Collection[str] = (), arguments_digest: str = "") -> Claim | None:
+    def claim(self, verb: str, peer: str, callers: Collection[str] = (), arguments_digest: str = "") -> Leave | None:
         """Return leave to do ``verb`` on ``peer`` now, or None when not approved.
 
         Args:
@@ -199,7 +206,7 @@ class Approval:
             arguments_digest: of the command's arguments, see :func:`digest`.
         """
         if self._standing(verb, peer, callers):
-            return Claim()
+            return Leave()
         return self._grants().claim(verb, peer, callers, arguments_digest)
 
     def given(self, verb: str, peer: str, callers: Collection[str] = (), arguments_digest: str = "") -> bool:

@@ -29,15 +29,16 @@ from strands_robots.contract import AT_REST, RUNNING, Robot, WorldRobot, body_of
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.identity_map import IdentityMap
+from strands_robots.safety.approval import Leave
 from strands_robots.safety.authorization import ANONYMOUS, caller_name
 from strands_robots.safety.resume import configured_keys
 from strands_robots.safety.stop_executor import stop_executor
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import StopVerdict
-from strands_robots.serving.admissions import Admission, Admissions
 from strands_robots.serving.control_changes import ControlChange, Observers, OnChange
 from strands_robots.serving.control_epochs import FirstEpoch
 from strands_robots.serving.lease_watch import LeaseWatch
+from strands_robots.serving.starting_motions import StartingMotions
 from strands_robots.serving.take_assertion import outdated, unproven
 from strands_robots.serving.workers import BoundedCall, Share, ShareFullError
 from strands_robots.serving.world_stops import RobotStop, stop_within
@@ -151,7 +152,7 @@ class ControlLease:
         self._clock, self._wall, self._watched = clock, wall, watched
         self._changing = threading.RLock()
         self._lease: Lease | None = None
-        self._starting = Admissions(self._changing)
+        self._starting = StartingMotions(self._changing)
         self._displaced: dict[str, str] = {}
         self._observers = Observers()
         self._first_epoch = first_epoch
@@ -262,13 +263,23 @@ class ControlLease:
         self._tell("taken", lease, reason)
         return self._answer(lease, epoch, None if halting is None else halting.result())
 
-    def admit(self, verb: str, caller: object, lease_id: str, ttl_s: float = 0.0, *, hold: bool = True) -> Admission:
+    def admit(
+        self,
+        verb: str,
+        caller: object,
+        lease_id: str,
+        ttl_s: float = 0.0,
+        *,
+        hold: bool = True,
+        begun: Callable[[], bool] = lambda: False,
+    ) -> Leave:
         """Admit a motion of the holder, or hold a free robot for it.
 
         Args:
             ttl_s: on a free robot ``lease_id`` is a secret of the caller's own, and the motion is halted so long after
                 the last renewal; 0 for a motion that needs none. A held lease lasts no longer than that from then on.
             hold: False to ask and change nothing.
+            begun: returns whether something moves by it already, before the leave is settled.
 
         Raises:
             NotHolderError: another holds the robot, or the lease is over.
@@ -279,19 +290,19 @@ class ControlLease:
             if hold:
                 self._starting.wait(partial(self._undecided, holder, lease_id), lambda: self._lease is None)
             elif self._undecided(holder, lease_id):
-                return Admission()
+                return Leave()
             before = self._lease
             self._refuse(verb, holder, lease_id, ttl_s)
             if not hold:
-                return Admission()
+                return Leave()
             if before is None:
                 after = self._hold_for_motion(holder, HUMAN if verb == FOLLOW else AGENT, lease_id, ttl_s)
             else:
                 after = self._used(verb, lease_id, ttl_s) if lease_id else before
-            admission = Admission(lambda each, begun: self._admitted(each, begun, before, after))
+            motion = object()
             if after.one_motion:
-                self._starting.add(admission)
-            return admission
+                self._starting.add(motion, begun)
+            return Leave(lambda begun: self._admitted(motion, begun, before, after))
 
     def _refuse(self, verb: str, holder: str, lease_id: str, ttl_s: float) -> None:
         lease = self._lease
@@ -307,10 +318,10 @@ class ControlLease:
             return False
         return not _owns(lease, holder, lease_id)
 
-    def _admitted(self, admission: Admission, begun: bool, before: Lease | None, after: Lease) -> None:
-        """End an admission; one that began nothing takes back what it changed."""
+    def _admitted(self, motion: object, begun: bool, before: Lease | None, after: Lease) -> None:
+        """Note that a motion has begun, or take back what it changed."""
         with self._changing:
-            self._starting.close(admission)
+            self._starting.close(motion)
             lease = self._lease
             if lease is None or lease.lease_id != after.lease_id:
                 return
@@ -549,18 +560,18 @@ class ControlLeases:
         return lease
 
     def admit(
-        self, command: str, caller: object, lease_id: str, name: str | None, ttl_s: float = 0.0, *, hold: bool = True
-    ) -> Admission:
+        self, command: str, caller: object, lease_id: str, name: str | None, ttl_s: float = 0.0, **how: Any
+    ) -> Leave:
         """Admit a motion of the named robot; with None of all robots of the world.
 
         Raises:
             NotHolderError: another holds the robot, or the lease is over.
         """
         if name is not None or not isinstance(self._robot(), WorldRobot):
-            return self.of(name or "").admit(command, caller, lease_id, ttl_s, hold=hold)
+            return self.of(name or "").admit(command, caller, lease_id, ttl_s, **how)
         for each in tuple(self._by_name.values()):
             each.refuse_others(command, caller, lease_id)
-        return Admission()
+        return Leave()
 
     def facts(self) -> dict[str, Any]:
         """Return the holder of the robot; by name for the robots of a world."""
@@ -637,10 +648,10 @@ class _OneOf(ControlLeases):
         return self._world.of(self._name)
 
     def admit(
-        self, command: str, caller: object, lease_id: str, name: str | None, ttl_s: float = 0.0, *, hold: bool = True
-    ) -> Admission:
+        self, command: str, caller: object, lease_id: str, name: str | None, ttl_s: float = 0.0, **how: Any
+    ) -> Leave:
         """Admit a motion of this robot."""
-        return self._world.admit(command, caller, lease_id, self._name, ttl_s, hold=hold)
+        return self._world.admit(command, caller, lease_id, self._name, ttl_s, **how)
 
     def facts(self) -> dict[str, Any]:
         """Return the holder of this robot."""

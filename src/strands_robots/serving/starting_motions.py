@@ -1,4 +1,7 @@
-"""Motions of one robot that were admitted and have not begun or been refused."""
+"""Motions of one robot that were admitted and have not begun or been refused.
+
+A detail of the control lease, which calls every method with its own lock held.
+"""
 
 from __future__ import annotations
 
@@ -14,34 +17,16 @@ LOOK_S = 0.02
 """Seconds between two looks whether a motion has begun."""
 
 
-class Admission:
-    """Leave of one motion to begin.
+class StartingMotions:
+    """The motions that are about to begin, and those that wait for their start.
 
     Args:
-        end: is told of the end; nothing is held without it.
-    """
-
-    def __init__(self, end: Callable[[Admission, bool], None] | None = None) -> None:
-        self._end = end
-        self.begun: Callable[[], bool] = lambda: False
-        """Whether something moves by it already, while its call has not ended."""
-
-    def close(self, begun: bool = True) -> None:
-        """Report that the motion has begun, or with False that it was refused."""
-        if self._end is not None:
-            self._end(self, begun)
-
-
-class Admissions:
-    """The admissions that are open, and the motions that wait for their end.
-
-    Args:
-        changing: the lock of the robot's lease; every method is called with it held.
+        changing: the lock of the robot's lease.
     """
 
     def __init__(self, changing: threading.RLock) -> None:
         self._closed = threading.Condition(changing)
-        self._open: set[Admission] = set()
+        self._open: dict[object, Callable[[], bool]] = {}
         self._waiting: list[object] = []
 
     def __bool__(self) -> bool:
@@ -50,15 +35,15 @@ class Admissions:
     @property
     def undecided(self) -> bool:
         """True while the robot may yet refuse one of them."""
-        return any(not each.begun() for each in self._open)
+        return any(not begun() for begun in self._open.values())
 
-    def add(self, admission: Admission) -> None:
-        """Note a motion that is about to begin."""
-        self._open.add(admission)
+    def add(self, motion: object, begun: Callable[[], bool]) -> None:
+        """Note a motion that is about to begin, until ``begun`` is true or it is closed."""
+        self._open[motion] = begun
 
-    def close(self, admission: Admission) -> None:
+    def close(self, motion: object) -> None:
         """Note that it has begun or was refused; who waits looks anew."""
-        self._open.discard(admission)
+        self._open.pop(motion, None)
         self._closed.notify_all()
 
     def wait(self, undecided: Callable[[], bool], free: Callable[[], bool]) -> None:
