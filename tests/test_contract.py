@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from typing import Any
 
 import pytest
 from fixtures.devices import BlindDevice
 
 from strands_robots.bus_access import bus_lock, read_joints
-from strands_robots.contract import AdaptedRobot, TaskRobot, adapt, put_away
+from strands_robots.contract import AdaptedRobot, TaskRobot, adapt, for_request, put_away
 from strands_robots.envelope import Envelope, error, success
-from strands_robots.safety.gate import MotionGate
+from strands_robots.safety.gate import MotionGate, answered
 from strands_robots.safety.stopping import StopVerdict, grade
 from strands_robots.utils import ValidationError
 
@@ -227,6 +228,23 @@ def test_two_wrappers_of_one_robot_share_its_gate_so_that_a_stop_on_one_network_
     one.halt("stop")
     assert not permit.valid
     assert AdaptedRobot(Foreign()).gate is not one.gate
+
+
+@pytest.mark.parametrize(
+    ("method", "taken"),
+    [
+        (lambda *, request=None: request is not None, True),
+        (lambda request=None: request is not None, False),
+        (lambda **options: "request" in options, False),
+        (answered(lambda *, request=None: request is not None), True),
+        (dict, {}),
+    ],
+    ids=["by keyword", "a stranger's own request", "any option", "decorated", "no code"],
+)
+def test_request_is_given_to_a_method_that_takes_it_by_keyword_alone(method: Callable[..., Any], taken: object) -> None:
+    request = MotionGate().request()
+    assert for_request(request, method)() == taken
+    assert for_request(None, method)() == (taken if taken == {} else False)
 
 
 def test_robot_that_is_put_away_refuses_motion_until_that_is_taken_back() -> None:

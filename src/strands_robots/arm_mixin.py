@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, ParamSpec
 
-from strands_robots.contract import RUNNING
+from strands_robots.contract import RUNNING, for_request
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.kinematics.arm_parts import ArmParts
 from strands_robots.kinematics.arm_task import ArmTask
@@ -20,7 +20,7 @@ from strands_robots.kinematics.stated_joint import StatedJoint
 from strands_robots.policies.base import Action
 from strands_robots.policies.rollout import Body, Rollout
 from strands_robots.recording.cameras import frames_of
-from strands_robots.safety.gate import Permit, answered
+from strands_robots.safety.gate import MotionRequest, Permit, answered
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.utils import WAIT_S as WAIT_S  # noqa: PLC0414 - part of what callers of the motions import
 from strands_robots.utils import ValidationError, choice, identifier, missing_extra, number, shown
@@ -125,10 +125,17 @@ class ArmMixin:
         return {}
 
     @abstractmethod
-    def start_motion(self, robot_name: str, verb: str, plan: Callable[[float, Permit], Motion]) -> Rollout:
+    def start_motion(
+        self,
+        robot_name: str,
+        verb: str,
+        plan: Callable[[float, Permit], Motion],
+        *,
+        request: MotionRequest | None = None,
+    ) -> Rollout:
         """Plan with the control rate (Hz) and start, once the body is found free.
 
-        The plan's search ends when its permit is void.
+        The plan's search ends when its permit is void. A halt since the request was made refuses the motion.
         """
 
     @planned
@@ -172,6 +179,7 @@ class ArmMixin:
         robot_name: str = "",
         *,
         around: bool = True,
+        request: MotionRequest | None = None,
     ) -> Envelope:
         """Move joints to positions in degrees, by name; the others stay.
 
@@ -180,12 +188,11 @@ class ArmMixin:
         """
         stated = self.stated_joints(robot_name)
         if stated:
-            return self._move_stated(stated, joints, speed, wait, robot_name)
+            return self._move_stated(stated, joints, speed, wait, robot_name, request=request)
         from strands_robots.kinematics import moves  # noqa: PLC0415 - loaded with the first motion
 
-        return self._move(
-            "moveJoints", partial(moves.move_joints, degrees=joints), speed, wait, robot_name, whole=True, around=around
-        )
+        plan = partial(moves.move_joints, degrees=joints)
+        return self._move("moveJoints", plan, speed, wait, robot_name, request=request, whole=True, around=around)
 
     @planned
     def move_to(
@@ -199,12 +206,13 @@ class ArmMixin:
         wait: bool = True,
         robot_name: str = "",
         around: bool = True,
+        request: MotionRequest | None = None,
     ) -> Envelope:
         """Move the tip to a point; ``approach`` is the steepest reachable by default."""
         from strands_robots.kinematics import moves  # noqa: PLC0415 - loaded with the first motion
 
         plan = partial(moves.move_to, position=_vector(x, y, z), approach=approach)
-        return self._move("moveTo", plan, speed, wait, robot_name, around=around)
+        return self._move("moveTo", plan, speed, wait, robot_name, request=request, around=around)
 
     @planned
     def move_by(
@@ -219,6 +227,7 @@ class ArmMixin:
         wait: bool = True,
         robot_name: str = "",
         around: bool = True,
+        request: MotionRequest | None = None,
     ) -> Envelope:
         """Move the tip on a straight line, by an offset or a distance in a direction."""
         from strands_robots.kinematics import moves  # noqa: PLC0415 - loaded with the first motion
@@ -230,14 +239,18 @@ class ArmMixin:
             offset = distance * _vector(*moves.DIRECTIONS[choice("direction", direction, tuple(moves.DIRECTIONS))])
         if not offset.any():
             raise ValidationError("moveBy needs dx, dy or dz, or a direction.")
-        return self._move("moveBy", partial(moves.move_by, offset=offset), speed, wait, robot_name, around=around)
+        plan = partial(moves.move_by, offset=offset)
+        return self._move("moveBy", plan, speed, wait, robot_name, request=request, around=around)
 
     @planned
-    def set_gripper(self, opening: float, wait: bool = True, robot_name: str = "") -> Envelope:
+    def set_gripper(
+        self, opening: float, wait: bool = True, robot_name: str = "", *, request: MotionRequest | None = None
+    ) -> Envelope:
         """Move the gripper; ``holding`` says whether something is between the jaws."""
         from strands_robots.kinematics import moves  # noqa: PLC0415 - loaded with the first motion
 
-        return self._move("setGripper", partial(moves.set_gripper, opening=opening), 1.0, wait, robot_name)
+        plan = partial(moves.set_gripper, opening=opening)
+        return self._move("setGripper", plan, 1.0, wait, robot_name, request=request)
 
     @planned
     def get_objects(self, robot_name: str = "") -> Envelope:
@@ -270,6 +283,7 @@ class ArmMixin:
         wait: bool = True,
         robot_name: str = "",
         around: bool = True,
+        request: MotionRequest | None = None,
     ) -> Envelope:
         """Pick up an object by its name, or one of a width at a point."""
         from strands_robots.kinematics import grasp, objects, sight  # noqa: PLC0415 - loaded with the first motion
@@ -294,7 +308,9 @@ class ArmMixin:
 
         looked = None if seen is None else sight.Sight(seen, target.name, within_mm=sight.CARRIED_MM)
         kept = lambda: self._held.update({body.name: held[-1]})  # noqa: E731 - one argument of the call below
-        return self._move("pick", plan, speed, wait, robot_name, started=kept, sight=looked, around=around)
+        return self._move(
+            "pick", plan, speed, wait, robot_name, request=request, started=kept, sight=looked, around=around
+        )
 
     @planned
     def place(
@@ -309,6 +325,7 @@ class ArmMixin:
         wait: bool = True,
         robot_name: str = "",
         around: bool = True,
+        request: MotionRequest | None = None,
     ) -> Envelope:
         """Put the held object down on the table at a point, or on another object."""
         from strands_robots.kinematics import grasp, sight  # noqa: PLC0415 - loaded with the first motion
@@ -333,11 +350,18 @@ class ArmMixin:
         plan = partial(grasp.place, position=position, approach=approach, held=held, on=on)
         stands = position + _vector(0.0, 0.0, held.below)
         looked = None if seen is None else sight.Sight(seen, held.name, stands)
-        return self._move("place", plan, speed, wait, robot_name, sight=looked, around=around)
+        return self._move("place", plan, speed, wait, robot_name, request=request, sight=looked, around=around)
 
     @planned
     def go_to(
-        self, place: str, speed: float = 0.5, wait: bool = True, robot_name: str = "", *, around: bool = True
+        self,
+        place: str,
+        speed: float = 0.5,
+        wait: bool = True,
+        robot_name: str = "",
+        *,
+        around: bool = True,
+        request: MotionRequest | None = None,
     ) -> Envelope:
         """Move to the joints of a saved place, or to ``home``."""
         from strands_robots.kinematics import moves  # noqa: PLC0415 - loaded with the first motion
@@ -349,7 +373,7 @@ class ArmMixin:
         if name not in places:
             raise ValidationError(f"place must be one of {', '.join(places)}, not {shown(name)}.")
         plan = partial(moves.go_to, place=name, degrees=places[name])
-        return self._move("goTo", plan, speed, wait, robot_name, whole=True, around=around)
+        return self._move("goTo", plan, speed, wait, robot_name, request=request, whole=True, around=around)
 
     @planned
     def save_place(self, place: str, robot_name: str = "") -> Envelope:
@@ -475,6 +499,7 @@ class ArmMixin:
         wait: bool,
         robot_name: str,
         *,
+        request: MotionRequest | None,
         whole: bool = False,
         started: Callable[[], object] = lambda: None,
         sight: Sight | None = None,
@@ -501,10 +526,17 @@ class ArmMixin:
             going = lambda: permit.valid and time.monotonic() < until  # noqa: E731 - one argument of the next call
             return plan(Start(arm, state, hz, speed, seen if around else (), held, going))
 
-        return self._play(verb, body, planned_at, wait, started=started, sight=sight)
+        return self._play(verb, body, planned_at, wait, request=request, started=started, sight=sight)
 
     def _move_stated(
-        self, stated: Sequence[StatedJoint], joints: Mapping[str, float], speed: float, wait: bool, robot_name: str
+        self,
+        stated: Sequence[StatedJoint],
+        joints: Mapping[str, float],
+        speed: float,
+        wait: bool,
+        robot_name: str,
+        *,
+        request: MotionRequest | None,
     ) -> Envelope:
         from strands_robots.kinematics import joint_motion  # noqa: PLC0415 - numpy, with the first motion
 
@@ -516,7 +548,7 @@ class ArmMixin:
             still = self.still_action(body.name)
             return joint_motion.move_joints(goals, state, still, joints, hz=hz, speed=speed)
 
-        return self._play("moveJoints", body, planned_at, wait)
+        return self._play("moveJoints", body, planned_at, wait, request=request)
 
     def _play(
         self,
@@ -525,6 +557,7 @@ class ArmMixin:
         plan: Callable[[float, Permit], Motion],
         wait: bool,
         *,
+        request: MotionRequest | None,
         started: Callable[[], object] = lambda: None,
         sight: Sight | None = None,
     ) -> Envelope:
@@ -539,7 +572,7 @@ class ArmMixin:
             planned.append(motion)
             return motion
 
-        rollout = self.start_motion(body.name, verb, planned_at)
+        rollout = for_request(request, self.start_motion)(body.name, verb, planned_at)
         task = ArmTask(f"{verb}-{next(self._task_numbers)}", rollout, planned[-1], sight=sight)
         self._tasks[body.name] = task
         self._recent[:] = [*self._recent[-15:], task]

@@ -34,7 +34,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, TypeVar, get_type_hints, overload
 
-from strands_robots.safety.gate import Permit
+from strands_robots.safety.gate import MotionRequest, Permit
 from strands_robots.safety.kept_gates import gate_of
 from strands_robots.utils import DURATION_MAX_S, START_S, ValidationError, flag, number, plain_text, shown, text
 from strands_robots.verb_parameters import Domain, VerbParameter, is_permit, parameter_of
@@ -120,7 +120,9 @@ class DeclaredVerb:
             raise ValidationError(f"{self.method} is declared a read (motion=False), and a read gets no Permit.")
         _ = self.parameters
 
-    def carry_out(self, robot: object, arguments: Mapping[str, Any]) -> tuple[Any, str]:
+    def carry_out(
+        self, robot: object, arguments: Mapping[str, Any], request: MotionRequest | None = None
+    ) -> tuple[Any, str]:
         """Call the method with checked arguments, and a permit where it takes one.
 
         Returns:
@@ -134,7 +136,7 @@ class DeclaredVerb:
         if not self.motion:
             with gate.reading(self.name):
                 return self.function(robot, **arguments), ""
-        with gate.moving(self.name, START_S + self.lasts) as permit:
+        with gate.moving(self.name, START_S + self.lasts, request) as permit:
             given = {self.permit: permit} if self.permit else {}
             result = self.function(robot, **arguments, **given)
             return result, "completed" if permit.valid else "stopped"

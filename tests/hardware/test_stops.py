@@ -17,7 +17,7 @@ from fixtures.waiting import eventually
 from strands_robots.envelope import error
 from strands_robots.hardware import DeviceBody, HardwareRobot
 from strands_robots.hardware import robot as hardware_robot
-from strands_robots.safety.gate import Permit
+from strands_robots.safety.gate import MotionRequest, Permit
 from strands_robots.utils import ValidationError
 
 
@@ -209,8 +209,8 @@ def line_of(robot: HardwareRobot) -> threading.Semaphore:
     """Released each time that a motion is given leave: from then on it stands in line, and a halt reaches it."""
     given, permit = threading.Semaphore(0), robot.gate.permit
 
-    def giving(verb: str) -> Permit:
-        leave = permit(verb)
+    def giving(verb: str, request: MotionRequest | None = None) -> Permit:
+        leave = permit(verb, request)
         given.release()
         return leave
 

@@ -176,6 +176,13 @@ def test_a_stream_that_a_halt_ended_opens_again_when_asked(stream: Stream) -> No
     eventually(lambda: stream.arm.actions)
 
 
+def test_a_stream_that_was_asked_for_before_a_halt_does_not_open(stream: Stream) -> None:
+    request = stream.arm.gate.request()
+    stream.arm.halt("by hand")
+    stream.receiver.start(request)
+    assert "halted after it was asked for" in str(stream.receiver.start_refusal)
+
+
 def test_another_session_on_the_leaders_topic_moves_nothing(stream: Stream) -> None:
     stream.peers.stranger().put("strands/lead/input/leader", stream.frame())
     eventually(lambda: stream.stat("rejected_source")() == 1)

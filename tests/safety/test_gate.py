@@ -94,19 +94,47 @@ def test_a_motion_asked_for_before_a_halt_is_refused_when_its_turn_comes_after()
     gate = MotionGate()
     request = gate.request()
     gate.revoke()
-    with gate.within(request), pytest.raises(MotionRefused, match="halted after it was asked for"):
-        gate.permit("start")
+    with pytest.raises(MotionRefused, match="halted after it was asked for"):
+        gate.permit("start", request)
     assert gate.permit("start").valid, "what is asked for after the halt may move"
 
 
 def test_a_motion_asked_for_at_this_generation_is_given_its_permit() -> None:
     gate = MotionGate()
-    with gate.within(gate.request()):
-        permit = gate.permit("start")
+    permit = gate.permit("start", gate.request())
     assert permit.valid
+    gate.revoke()
+    assert not permit.valid
 
 
-def test_the_moment_of_asking_belongs_to_one_thread() -> None:
+def test_a_request_to_a_robot_that_has_this_one_inside_is_refused_after_a_halt_of_either() -> None:
+    gate, outer = MotionGate(), MotionGate()
+    request = outer.request()
+    permit = gate.permit("start", request)
+    assert permit.valid
+    gate.revoke()
+    assert not permit.valid
+    outer.revoke()
+    with pytest.raises(MotionRefused, match="halted after it was asked for"):
+        gate.permit("start", request)
+
+
+def test_a_strangers_code_is_refused_what_a_halt_has_overtaken() -> None:
+    gate = MotionGate()
+    request = gate.request()
+    gate.revoke()
+    with gate.within(request), pytest.raises(MotionRefused, match="halted after it was asked for"):
+        gate.permit("start")
+    assert gate.permit("start").valid
+
+
+def test_a_read_is_given_no_permit_by_a_request_of_its_own() -> None:
+    gate = MotionGate()
+    with gate.reading("look"), pytest.raises(MotionRefused, match="look is declared a read"):
+        gate.permit("start", gate.request())
+
+
+def test_the_request_of_a_strangers_code_belongs_to_one_thread() -> None:
     gate, seen = MotionGate(), []
     request = gate.request()
     gate.revoke()
@@ -132,12 +160,11 @@ def test_every_latch_of_a_robot_has_to_be_free_before_it_moves() -> None:
 def test_giving_up_a_call_voids_what_it_began_and_nothing_else() -> None:
     gate = MotionGate()
     other, request = gate.permit("wave"), gate.request()
-    with gate.within(request):
-        begun = gate.permit("start")
+    begun = gate.permit("start", request)
     request.give_up()
     assert (begun.valid, begun.revoked, other.valid) == (False, False, True)
-    with gate.within(request), pytest.raises(MotionRefused):
-        gate.permit("start")
+    with pytest.raises(MotionRefused):
+        gate.permit("start", request)
 
 
 def test_a_call_inside_a_call_is_as_old_as_the_outer_one() -> None:

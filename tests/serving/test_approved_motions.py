@@ -15,6 +15,7 @@ from fixtures.waiting import eventually
 
 from strands_robots.envelope import error, success
 from strands_robots.safety.approval import Approval, Grants, Leave, digest
+from strands_robots.safety.gate import MotionRequest
 from strands_robots.serving import starting_motions
 from strands_robots.serving.leave import Command, RefusalReason, Refused
 from strands_robots.serving.pipeline import Pipeline, Result
@@ -264,21 +265,21 @@ def test_a_grant_is_kept_while_another_holds_the_robot(robot: ToyRobot, grants: 
     assert not path.exists()
 
 
-def began_and_failed(robot: ToyRobot) -> object:
-    robot.gate.permit("execute").begin()
+def began_and_failed(robot: ToyRobot, request: MotionRequest) -> object:
+    robot.gate.permit("execute", request).begin()
     return error("it was stopped")
 
 
-def raised(robot: ToyRobot) -> object:
+def raised(robot: ToyRobot, request: MotionRequest) -> object:
     raise OSError("no answer")
 
 
-def answered_nothing(robot: ToyRobot) -> object:
+def answered_nothing(robot: ToyRobot, request: MotionRequest) -> object:
     return None
 
 
-def refused(robot: ToyRobot) -> object:
-    robot.gate.permit("execute")
+def refused(robot: ToyRobot, request: MotionRequest) -> object:
+    robot.gate.permit("execute", request)
     return error("it is busy")
 
 
@@ -286,11 +287,11 @@ def refused(robot: ToyRobot) -> object:
     ("answer", "spent"), [(began_and_failed, True), (raised, True), (answered_nothing, True), (refused, False)]
 )
 def test_a_grant_is_spent_by_what_began_or_may_have(
-    robot: ToyRobot, grants: Grants, answer: Callable[[ToyRobot], object], spent: bool
+    robot: ToyRobot, grants: Grants, answer: Callable[..., object], spent: bool
 ) -> None:
     grants.grant("execute", "arm-1")
     line = pipeline(robot, grants)
-    line.own = {"execute": lambda arguments: answer(robot)}
+    line.own = {"execute": lambda arguments, request: answer(robot, request)}
     served(line, "agent-a")
     assert (grants.claim("execute", "arm-1") is None) is spent
 
@@ -301,13 +302,13 @@ def test_another_callers_motion_is_refused_at_once_while_a_call_that_lasts_moves
     monkeypatch.setattr(starting_motions, "START_WAIT_S", 600.0)
     moves, end = threading.Event(), threading.Event()
 
-    def last(toy: Any, arguments: Arguments) -> Any:
-        toy.gate.permit("execute").begin()
+    def last(toy: Any, arguments: Arguments, request: MotionRequest | None) -> Any:
+        toy.gate.permit("execute", request).begin()
         moves.set()
         end.wait(120)
         return success("done")
 
-    lasting = replace(ARM_VERBS["execute"], run=last)
+    lasting = replace(ARM_VERBS["execute"], begin=last)
     line, results = pipeline(robot, grants, "execute"), list[Result]()
     with ThreadPoolExecutor(2) as pool:
         try:

@@ -48,8 +48,7 @@ def test_reads_need_no_leave_to_move() -> None:
 
 def test_robot_without_an_arm_says_so() -> None:
     verb = ARM_MOTION_VERBS["getPose"]
-    assert verb.run is not None
-    answer: Any = verb.run(adapt(ToyRobot()), {})
+    answer: Any = verb.call(adapt(ToyRobot()), {})()
     assert answer["reason"] == "This robot has no arm whose motions can be planned here."
 
 
@@ -63,9 +62,8 @@ def world() -> Iterator[Simulation]:
 
 def run(world: Simulation, name: str, **arguments: Any) -> dict[str, Any]:
     verb = WORLD_MOTION_VERBS[name]
-    assert verb.run is not None
     checked = verb.checked(arguments)
-    answer = verb.run(world, {key: value for key, value in checked.items() if not key.startswith("lease_")})
+    answer = verb.call(world, {key: value for key, value in checked.items() if not key.startswith("lease_")})()
     assert isinstance(answer, dict)
     return answer
 

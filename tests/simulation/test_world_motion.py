@@ -15,7 +15,7 @@ from fixtures.waiting import eventually
 
 from strands_robots.contract import RolloutEvent
 from strands_robots.envelope import Envelope, error
-from strands_robots.safety.gate import Permit
+from strands_robots.safety.gate import MotionRequest, Permit
 from strands_robots.safety.orders import StopOrder, new_epoch
 from strands_robots.safety.stopping import Outcome, StopVerdict, grade, read_verdict
 from strands_robots.simulation import Simulation
@@ -468,8 +468,8 @@ def test_reset_that_waited_for_the_lock_is_refused_after_a_halt(
     requested: list[str] = []
     permit = world.gate.permit
 
-    def noted(verb: str) -> Permit:
-        granted = permit(verb)
+    def noted(verb: str, request: MotionRequest | None = None) -> Permit:
+        granted = permit(verb, request)
         requested.append(verb)
         return granted
 

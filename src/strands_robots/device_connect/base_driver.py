@@ -38,6 +38,7 @@ from strands_robots.envelope import Envelope, error, jsonable, success
 from strands_robots.safety.approval import Approval
 from strands_robots.safety.authorization import ANONYMOUS, Authorization, caller_name
 from strands_robots.safety.estop_listener import ESTOP
+from strands_robots.safety.gate import MotionRequest
 from strands_robots.safety.lockout import LockoutLatch
 from strands_robots.safety.orders import REASON_MAX, epoch_of
 from strands_robots.safety.stop_executor import stop_executor
@@ -247,16 +248,15 @@ class RobotDriver(CollectedOnce):
             raise Refused(RefusalReason.CALLER, refusal)
         return (caller_name(command.caller) or ANONYMOUS,)
 
-    def _resume(self, arguments: Arguments) -> Envelope:
+    def _resume(self, arguments: Arguments, request: MotionRequest | None) -> Envelope:
         if self.registration is None and self._unregistered is not None:
             self._registered_here = register_safety(self.peer_id, self, None, named=False)
         registration = self.registration
         return error("resume rejected") if registration is None else registration.resume(arguments["assertion"])
 
-    def _status(self, arguments: Arguments) -> object:
+    def _status(self, arguments: Arguments, request: MotionRequest | None) -> object:
         """The robot's status with its lockouts, the dead-man check-in and who holds it."""
-        verb = self.verbs["getStatus"]
-        answer = verb.run(self.robot, arguments) if verb.run is not None else getattr(self.robot, verb.method)()
+        answer = self.verbs["getStatus"].call(self.robot, arguments)()
         if not isinstance(answer, dict):
             return answer
         if self.registration is not None:

@@ -44,6 +44,7 @@ from strands_robots.safety.gate import (
     REFUSALS,
     MotionGate,
     MotionRefused,
+    MotionRequest,
     Permit,
     PermitVoidError,
     Waiting,
@@ -229,10 +230,10 @@ class HardwareRobot(ArmMixin, TeleopMixin):
         cameras = getattr(self.device, "cameras", None)
         return LazyFrames({str(name): partial(_picture, camera) for name, camera in (cameras or {}).items()})
 
-    def send_action(self, action: Mapping[str, float]) -> Envelope:
+    def send_action(self, action: Mapping[str, float], *, request: MotionRequest | None = None) -> Envelope:
         """Set targets once; ``sent`` has the values taken. Refused while it is driven."""
         try:
-            permit = self.gate.permit("send_action")
+            permit = self.gate.permit("send_action", request)
             with self.starting:
                 self._stand_by()
                 self._free()
@@ -322,6 +323,8 @@ class HardwareRobot(ArmMixin, TeleopMixin):
         policy_provider: str = "mock",
         duration: float = 30.0,
         policy_port: int = 0,
+        *,
+        request: MotionRequest | None = None,
         **policy: Any,
     ) -> Envelope:
         """Start a task and return at once; refused while something drives the robot.
@@ -331,6 +334,7 @@ class HardwareRobot(ArmMixin, TeleopMixin):
             policy_provider: a registered policy, such as mock, remote or lerobot_local.
             duration: seconds, above 0 up to an hour.
             policy_port: port of the policy's server; 0 for the provider's own.
+            request: what it begins for; made now by default.
             policy: what that policy's constructor takes besides, ``control_frequency`` (Hz, at most the robot's rate)
                 and ``n_steps`` (actions after which it ends).
         """
@@ -338,6 +342,7 @@ class HardwareRobot(ArmMixin, TeleopMixin):
             task = self._start(
                 "start_task",
                 self._task_of(instruction, policy_provider, duration, {"policy_port": policy_port, **policy}),
+                request,
             )
         except REFUSALS as refused:
             return refusal_envelope("start_task", refused)
@@ -591,7 +596,14 @@ class HardwareRobot(ArmMixin, TeleopMixin):
 
         return made
 
-    def start_motion(self, robot_name: str, verb: str, plan: Callable[[float, Permit], Motion]) -> Rollout:
+    def start_motion(
+        self,
+        robot_name: str,
+        verb: str,
+        plan: Callable[[float, Permit], Motion],
+        *,
+        request: MotionRequest | None = None,
+    ) -> Rollout:
         """Plan and start a motion of the arm."""
         self.body(robot_name)
 
@@ -600,11 +612,11 @@ class HardwareRobot(ArmMixin, TeleopMixin):
             permit.check()
             return motion_rollout(self._body, motion, permit, self.control_hz, self.observers)
 
-        return self._start(verb, made)
+        return self._start(verb, made, request)
 
-    def _start(self, verb: str, made: Callable[[Permit], Rollout]) -> Rollout:
+    def _start(self, verb: str, made: Callable[[Permit], Rollout], request: MotionRequest | None = None) -> Rollout:
         # Before the wait for the robot: a stop that comes while this waits, connects or loads is newer.
-        permit = self.gate.permit(verb)
+        permit = self.gate.permit(verb, request)
         with self._waiting.until_begun(permit), self.starting:
             permit.check()
             self._stand_by()

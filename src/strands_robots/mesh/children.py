@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
-from strands_robots.contract import Observer, Unsubscribe, WorldRobot
+from strands_robots.contract import Observer, Unsubscribe, WorldRobot, for_request
 from strands_robots.envelope import Envelope, error
 from strands_robots.mesh import topics
 from strands_robots.mesh.commands import CommandReceiver, SenderCheck, execute_on
@@ -24,6 +24,7 @@ from strands_robots.mesh.teleop import TeleopReceivers
 from strands_robots.mesh.throttle import AuditThrottle
 from strands_robots.mesh.transport import Declaration, Sample, TransportError, undeclare
 from strands_robots.recording.cameras import has_cameras
+from strands_robots.safety.gate import MotionRequest
 from strands_robots.safety.identity import SigningIdentity
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS
@@ -65,11 +66,17 @@ class OneRobot:
         return [name for name in self._world.list_robots() if name == self.tool_name_str]
 
     def start_policy(
-        self, robot_name: str, instruction: str, policy_provider: str = "mock", duration: float = 30.0, **policy: Any
+        self,
+        robot_name: str,
+        instruction: str,
+        policy_provider: str = "mock",
+        duration: float = 30.0,
+        *,
+        request: MotionRequest | None = None,
+        **policy: Any,
     ) -> Envelope:
-        return self._world.start_policy(
-            robot_name, instruction, policy_provider=policy_provider, duration=duration, **policy
-        )
+        policy |= {"policy_provider": policy_provider, "duration": duration}
+        return for_request(request, self._world.start_policy)(robot_name, instruction, **policy)
 
     def stop_policy(self, robot_name: str) -> Envelope:
         return self._world.stop_policy(robot_name)
@@ -255,7 +262,7 @@ class Children:
                 **parents,
                 **self._arm_verbs(name),
                 "status": status_of(robot, partial(self._report, peer)),
-                "describe": lambda arguments: description_of(robot),
+                "describe": lambda arguments, _: description_of(robot),
                 "execute": execute_on(robot, parent),
             },
             pending=self._pipeline.pending.of(name),
@@ -286,22 +293,21 @@ class Children:
         """Return the verbs of an arm and its cameras, which the world carries out."""
 
         def carried_out(verb: Verb) -> Own:
-            own = verb.run
             named = {"robot_name": name} if "robot_name" in verb.by_name else {}
 
-            def run(arguments: Arguments) -> object:
+            def begin(arguments: Arguments, request: MotionRequest | None) -> object:
                 if arguments.get("robot_name", name) != name:
                     return error(f"robot_name must be {name}, or be left out.")
-                return own(self._world, {**arguments, **named}) if own else None
+                return verb.call(self._world, {**arguments, **named}, request)()
 
-            return run
+            return begin
 
         verbs = {verb: PEER_VERBS[verb] for verb in (*ARM_MOTION_VERBS, *PICTURE_VERBS)}
         return {verb: carried_out(described) for verb, described in verbs.items()}
 
     def _ask_parent(self, name: str) -> Own:
         text = f"{name} is one robot of a world; ask {self._context.peer_id}."
-        return lambda arguments: error(text)
+        return lambda arguments, _: error(text)
 
     def _end(self, peer: str) -> None:
         # The sampler and a stop of the mesh may both come: the first one ends it.

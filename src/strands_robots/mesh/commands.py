@@ -140,7 +140,7 @@ def stop_target(robot: Robot | None, name: str = "") -> Haltable | None:
 
 def execute_on(robot: Robot, context: Context, closed: Callable[[], bool] = lambda: False) -> Own:
     """Make the ``execute`` of a peer: a policy runs to its end."""
-    return lambda arguments: run_to_end(robot, arguments, lambda: closed() or not context.running())
+    return lambda arguments, request: run_to_end(robot, arguments, lambda: closed() or not context.running(), request)
 
 
 def pong(context: Context) -> dict[str, Any]:

@@ -156,9 +156,9 @@ class Mesh(SensorLoopsMixin):
             "teleop_status": self._teleop.status,
             "teleop_receive": self._teleop.receive,
             "teleop_stop": self._teleop.stop,
-            "ping": lambda arguments: pong(context),
+            "ping": lambda arguments, _: pong(context),
             "resume": self._resume_of(peer),
-            "describe": lambda arguments: description_of(robot, self._own_verbs),
+            "describe": lambda arguments, _: description_of(robot, self._own_verbs),
         }
         if robot is not None:
             own["status"] = status_of(robot, lambda nonce: {**self._adapter.report("", nonce), **self._hearing.facts()})
@@ -208,7 +208,7 @@ class Mesh(SensorLoopsMixin):
         return lambda estop, sample, sender: self._safety.on_own_estop(estop, sample, sender, peer_id)
 
     def _resume_of(self, peer_id: str) -> Own:
-        return lambda arguments: self._safety.on_resume_command(arguments.get("assertion"), peer_id)
+        return lambda arguments, _: self._safety.on_resume_command(arguments.get("assertion"), peer_id)
 
     def _describe(self) -> dict[str, Any]:
         """Return the fields of presence: the robot's own, and the streams of this peer."""

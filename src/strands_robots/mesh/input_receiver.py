@@ -6,20 +6,19 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
-from contextlib import nullcontext
 from functools import partial
 from typing import Any, Protocol
 
 from strands_robots import settings
 from strands_robots.bus_access import read_joints
-from strands_robots.contract import Haltable
+from strands_robots.contract import Haltable, for_request
 from strands_robots.envelope import is_error
 from strands_robots.mesh import topics, wire
 from strands_robots.mesh.executor import BoundedExecutor
 from strands_robots.mesh.security import INPUT_VALUE_ABS, validate_input_frame, validate_mesh_identifier
 from strands_robots.mesh.transport import Sample
 from strands_robots.policies.base import numbers
-from strands_robots.safety.gate import MotionGate, MotionRefused, Permit
+from strands_robots.safety.gate import MotionGate, MotionRefused, MotionRequest, Permit
 from strands_robots.safety.stop_executor import stop_executor
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.utils import ValidationError
@@ -98,7 +97,7 @@ class InputReceiver:
         self._robot = robot
         self._source = validate_mesh_identifier(source_peer_id, "source_peer_id")
         self._device = validate_mesh_identifier(device_name, "device_name")
-        self._apply: ApplyFn = apply_fn or (lambda body, action: body.send_action(action))
+        self._apply = apply_fn
         self._limits = joint_limits(robot)
         self._executor: BoundedExecutor | None = None
         self._running = False
@@ -151,12 +150,16 @@ class InputReceiver:
             "hz_actual": round(counts["received"] / elapsed, 2) if elapsed > 0 else 0.0,
         }
 
-    def start(self) -> None:
-        """Open the stream for the leader's session, or set :attr:`start_refusal`."""
+    def start(self, request: MotionRequest | None = None) -> None:
+        """Open the stream for the leader's session, or set :attr:`start_refusal`.
+
+        Args:
+            request: of the command that opens it; a halt since it was made refuses the stream.
+        """
         if self.running:
             return
         self.close()
-        self.start_refusal = self._open()
+        self.start_refusal = self._open(request)
         fields = {"device": self._device, "session": self._session}
         if self.start_refusal is not None:
             logger.warning("%s was not opened: %s", self.topic, self.start_refusal)
@@ -204,13 +207,13 @@ class InputReceiver:
         heard = time.monotonic()
         executor.submit(lambda: self._take(sample, heard))
 
-    def _open(self) -> str | None:
+    def _open(self, request: MotionRequest | None) -> str | None:
         session = self._mesh.peer_wire_zid(self._source)
         if session is None:
             return f"{self._source} has not announced itself from any session"
         gate = getattr(self._robot, "gate", None) or getattr(self._mesh.robot, "gate", None)
         try:
-            self._permit = (gate if isinstance(gate, MotionGate) else MotionGate()).permit("teleop_receive")
+            self._permit = (gate if isinstance(gate, MotionGate) else MotionGate()).permit("teleop_receive", request)
         except MotionRefused as refused:
             return str(refused)
         if self._mesh.lockout_epoch is not None:
@@ -379,8 +382,11 @@ class InputReceiver:
             return
         try:
             # A frame that waits for the bus is as old as its stream: a halt since then refuses it there.
-            with nullcontext() if permit is None else permit.request.gate.within(permit.request):
-                answer = self._apply(self._robot, action)
+            request = None if permit is None else permit.request
+            if self._apply is None:
+                answer = for_request(request, self._robot.send_action)(action)
+            else:
+                answer = for_request(request, self._apply)(self._robot, action)
         except Exception as exc:  # noqa: BLE001 - a bus raises what it likes; the frame counts as not applied
             answer = {"status": "error", "reason": f"{type(exc).__name__}: {exc}"}
         self._counts["received"] += 1

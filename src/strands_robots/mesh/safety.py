@@ -30,6 +30,7 @@ from strands_robots.mesh.scoped_stops import ScopedStop
 from strands_robots.mesh.throttle import RecentKeys
 from strands_robots.mesh.transport import Sample, TransportError
 from strands_robots.safety import ed25519
+from strands_robots.safety.gate import MotionRequest
 from strands_robots.safety.head_witness import CheckInAnswers, HeadWitness
 from strands_robots.safety.orders import StopOrder, new_epoch, signed_stop
 from strands_robots.safety.peer_answers import (
@@ -80,9 +81,8 @@ def status_of(robot: Robot, facts: Callable[[str], Mapping[str, Any]]) -> Own:
         facts: returns them for the nonce of the question.
     """
 
-    def status(arguments: Arguments) -> object:
-        run = PEER_VERBS["status"].run
-        answer = run(robot, arguments) if run is not None else None
+    def status(arguments: Arguments, request: MotionRequest | None) -> object:
+        answer = PEER_VERBS["status"].call(robot, arguments)()
         return {**answer, **facts(arguments.get("nonce", ""))} if isinstance(answer, Mapping) else answer
 
     return status

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable
 
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.mesh.input_receiver import InputReceiver
+from strands_robots.safety.gate import MotionRequest
 from strands_robots.serving.verbs import Arguments
 from strands_robots.serving.workers import UNBOUNDED
 
@@ -25,7 +26,7 @@ class TeleopReceivers:
         self._receivers: dict[Key, InputReceiver] = {}
         self._lock = threading.Lock()
 
-    def receive(self, command: Arguments) -> Envelope:
+    def receive(self, command: Arguments, request: MotionRequest | None = None) -> Envelope:
         """Follow ``source_peer_id``'s device (``leader`` by default)."""
         key = (command["source_peer_id"], command.get("device_name", "leader"))
         with self._lock:
@@ -35,19 +36,19 @@ class TeleopReceivers:
             if len(self._receivers) >= STREAMS_MAX:
                 return error(f"teleop_receive: {STREAMS_MAX} input streams are open already.")
             receiver = self._open(*key)
-            receiver.start()
+            receiver.start(request)
             if receiver.start_refusal is not None:
                 return error(f"teleop_receive: {receiver.start_refusal}.")
             self._receivers[key] = receiver
         return success(f"Following {key[0]}/{key[1]}.", **receiver.stats)
 
-    def status(self, command: Arguments) -> Envelope:
+    def status(self, command: Arguments, request: MotionRequest | None = None) -> Envelope:
         """The counters of every stream."""
         with self._lock:
             streams = [receiver.stats for receiver in self._receivers.values()]
         return success(f"{sum(stream['running'] for stream in streams)} input streams run.", streams=streams)
 
-    def stop(self, command: Arguments) -> Envelope:
+    def stop(self, command: Arguments, request: MotionRequest | None = None) -> Envelope:
         """Close the named stream or all, and wait up to 2 s for last frames."""
         source, device = command.get("source_peer_id"), command.get("device_name")
         with self._lock:

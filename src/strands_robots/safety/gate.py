@@ -103,6 +103,11 @@ class MotionRequest:
         self.given_up = False
         self.begun = False
 
+    @property
+    def overtaken(self) -> bool:
+        """True for ever once the robot was halted since, or the call was given up."""
+        return self.given_up or self.generation != self.gate.generation
+
     def give_up(self) -> None:
         """Void what the call began or may still begin, and nothing else."""
         self.given_up = True
@@ -130,7 +135,7 @@ class Permit:
     def valid(self) -> bool:
         """False for ever after a halt, a lock, a withdrawal, or its call's end."""
         over = self._ends is not None and time.monotonic() >= self._ends
-        return not (over or self._withdrawn or self.request.given_up or self.revoked)
+        return not (over or self._withdrawn or self.request.overtaken)
 
     @property
     def revoked(self) -> bool:
@@ -420,7 +425,11 @@ class MotionGate:
         return getattr(self._of_thread, "request", None)
 
     def _dated(self, request: MotionRequest | None) -> MotionRequest:
-        return self._outer() or request or MotionRequest(self, self._generation)
+        made = MotionRequest(self, self._generation)
+        if request is not None and request.gate is not self:
+            # It was made of a robot that has this one inside: a halt of either refuses the motion.
+            made.given_up, request = request.overtaken, None
+        return self._outer() or request or made
 
     def _refusal(self, verb: str, request: MotionRequest) -> Envelope | None:
         if request.read:
@@ -428,8 +437,7 @@ class MotionGate:
         locked = self.lockout(verb)
         if locked is not None:
             return locked
-        late = request.given_up or request.generation != self._generation
-        return error(_LATE.format(verb)) if late else None
+        return error(_LATE.format(verb)) if request.overtaken else None
 
 
 _LATE = "{} is refused: the robot was halted after it was asked for; nothing was started."

@@ -9,11 +9,12 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-from strands_robots.contract import Robot, body_of
+from strands_robots.contract import Robot, body_of, for_request
 from strands_robots.envelope import Envelope, error, is_error
 from strands_robots.recording.cameras import camera_named
+from strands_robots.safety.gate import MotionRequest
 from strands_robots.serving.picture_verbs import picture
-from strands_robots.serving.verbs import ROBOT_NAME, Arguments, Check, Kind, Parameter, Verb, table
+from strands_robots.serving.verbs import ROBOT_NAME, Arguments, Begin, Check, Kind, Parameter, Verb, table
 from strands_robots.utils import WAIT_S, ValidationError, flag, identifier, mapping, number, shown, text
 
 REACH_MAX_M = 3.0
@@ -107,24 +108,24 @@ _DIRECTION = Parameter(
 _DISTANCE = Parameter("distance", float, "Metres in that direction, 0 to 1", within(0, 1), default=0.05)
 
 
-def of_arm(method: str) -> Callable[[Robot, Arguments], Envelope]:
+def of_arm(method: str) -> Callable[[Any, Arguments, MotionRequest | None], Envelope]:
     """Carry a verb out by a method of the robot, refused where it has none."""
 
-    def run(robot: Any, arguments: Arguments) -> Envelope:
+    def begin(robot: Any, arguments: Arguments, request: MotionRequest | None) -> Envelope:
         carried_out = getattr(body_of(robot), method, None)
         if not callable(carried_out):
             return error("This robot has no arm whose motions can be planned here.")
-        answer: Envelope = carried_out(**arguments)
+        answer: Envelope = for_request(request, carried_out)(**arguments)
         return answer
 
-    return run
+    return begin
 
 
-def _motion(method: str) -> Callable[[Robot, Arguments], Envelope]:
+def _motion(method: str) -> Begin:
     """Carry a motion out, and add the picture that was asked for to its answer."""
     move = of_arm(method)
 
-    def run(robot: Robot, arguments: Arguments) -> Envelope:
+    def begin(robot: Robot, arguments: Arguments, request: MotionRequest | None) -> object:
         given = dict(arguments)
         if given.get("around") is True:
             # A robot of one's own may have the motion without this argument.
@@ -135,7 +136,7 @@ def _motion(method: str) -> Callable[[Robot, Arguments], Envelope]:
                 camera = camera_named(robot, camera)
             except ValidationError as refused:
                 return error(f"picture: {refused}")
-        answer = move(robot, given)
+        answer = move(robot, given, request)
         if not camera or "task_id" not in answer:
             return answer
         taken = picture(robot, camera)
@@ -143,7 +144,7 @@ def _motion(method: str) -> Callable[[Robot, Arguments], Envelope]:
             return {**answer, "picture_error": taken["reason"]}
         return {**answer, "picture": {name: taken[name] for name in ("camera", "width", "height", "format", "jpeg")}}
 
-    return run
+    return begin
 
 
 _VERBS = (
@@ -153,7 +154,7 @@ _VERBS = (
         "Read where the tip of the gripper is, its approach and the joints, in metres and degrees in the base frame.",
         returns="x, y, z, approach, joints, gripper, holding, model",
         method="arm_pose",
-        run=of_arm("arm_pose"),
+        begin=of_arm("arm_pose"),
     ),
     Verb(
         "moveJoints",
@@ -168,7 +169,7 @@ _VERBS = (
         ),
         returns=RESULT,
         method="move_joints",
-        run=_motion("move_joints"),
+        begin=_motion("move_joints"),
         lasts=True,
     ),
     Verb(
@@ -178,7 +179,7 @@ _VERBS = (
         (*(_coordinate(axis) for axis in "xyz"), APPROACH, SPEED, WAIT, PICTURE, AROUND),
         returns=RESULT,
         method="move_to",
-        run=_motion("move_to"),
+        begin=_motion("move_to"),
         lasts=True,
     ),
     Verb(
@@ -196,7 +197,7 @@ _VERBS = (
         ),
         returns=RESULT,
         method="move_by",
-        run=_motion("move_by"),
+        begin=_motion("move_by"),
         lasts=True,
     ),
     Verb(
@@ -206,7 +207,7 @@ _VERBS = (
         (Parameter("opening", float, "From 0 (closed) to 1 (open)", within(0, 1)), WAIT, PICTURE),
         returns=RESULT,
         method="set_gripper",
-        run=_motion("set_gripper"),
+        begin=_motion("set_gripper"),
         lasts=True,
     ),
     Verb(
@@ -216,7 +217,7 @@ _VERBS = (
         (PLACE, SPEED, WAIT, PICTURE, AROUND),
         returns=RESULT,
         method="go_to",
-        run=_motion("go_to"),
+        begin=_motion("go_to"),
         lasts=True,
     ),
     Verb(
@@ -225,7 +226,7 @@ _VERBS = (
         "Read the objects that can be seen: centre and extents in metres and yaw in degrees in the base frame.",
         returns="objects",
         method="get_objects",
-        run=of_arm("get_objects"),
+        begin=of_arm("get_objects"),
     ),
     Verb(
         "pick",
@@ -244,7 +245,7 @@ _VERBS = (
         ),
         returns=RESULT,
         method="pick",
-        run=_motion("pick"),
+        begin=_motion("pick"),
         lasts=True,
     ),
     Verb(
@@ -262,7 +263,7 @@ _VERBS = (
         ),
         returns=RESULT,
         method="place",
-        run=_motion("place"),
+        begin=_motion("place"),
         lasts=True,
     ),
     Verb(
@@ -272,7 +273,7 @@ _VERBS = (
         (PLACE,),
         returns="place, joints, places",
         method="save_place",
-        run=of_arm("save_place"),
+        begin=of_arm("save_place"),
         critical=False,
     ),
     Verb(
@@ -292,7 +293,7 @@ _VERBS = (
         ),
         returns=RESULT,
         method="wait_for",
-        run=_motion("wait_for"),
+        begin=_motion("wait_for"),
         lasts=True,
     ),
 )

@@ -2,26 +2,27 @@
 
 from __future__ import annotations
 
-from strands_robots.contract import Robot, body_of
+from strands_robots.contract import Robot, body_of, for_request
 from strands_robots.envelope import Envelope, error
 from strands_robots.ros.gate import Approved
+from strands_robots.safety.gate import MotionRequest
 from strands_robots.serving.robot_verbs import ARM_VERBS
-from strands_robots.serving.verbs import Arguments, Kind, Parameter, Run, Verb, table
+from strands_robots.serving.verbs import Arguments, Begin, Kind, Parameter, Verb, table
 from strands_robots.utils import DURATION_MAX_S, duration, number, text
 
 
-def _of_base(method: str, cannot: str) -> Run:
+def _of_base(method: str, cannot: str) -> Begin:
     """Carry a verb out by a method of a mobile base; any other robot refuses it."""
 
-    def run(robot: Robot, arguments: Arguments) -> Envelope:
+    def begin(robot: Robot, arguments: Arguments, request: MotionRequest | None) -> Envelope:
         start = getattr(body_of(robot), method, None)
         if not callable(start):
             return error(cannot)
         # The operator's approval of this verb is the approval of what it sends.
-        answer: Envelope = start(**arguments, tool_context=Approved())
+        answer: Envelope = for_request(request, start)(**arguments, tool_context=Approved())
         return answer
 
-    return run
+    return begin
 
 
 def _navigates(robot: Robot) -> bool:
@@ -46,7 +47,7 @@ DRIVE = Verb(
     ),
     returns="task_status",
     method="start_drive",
-    run=_of_base("start_drive", "drive: this robot is no mobile base."),
+    begin=_of_base("start_drive", "drive: this robot is no mobile base."),
 )
 NAVIGATE_TO = Verb(
     "navigateTo",
@@ -74,7 +75,7 @@ NAVIGATE_TO = Verb(
     returns="task_status",
     method="start_navigation",
     suits=_navigates,
-    run=_of_base("start_navigation", "navigateTo: this robot has no navigation stack."),
+    begin=_of_base("start_navigation", "navigateTo: this robot has no navigation stack."),
 )
 
 BASE_VERBS = {**ARM_VERBS, **table([DRIVE])}

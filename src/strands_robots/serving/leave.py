@@ -87,7 +87,7 @@ _Terms = tuple[str, str | None, float]
 """``lease_id``, the robot of a world (None for all of them) and ``lease_ttl_s`` of a motion under a lease."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class MotionRules:
     """Rules by which the commands of one robot on one network may begin.
 
@@ -96,6 +96,7 @@ class MotionRules:
         peer_id: gives the name that the operator's approval is for.
         hardware: True where a motion needs the operator's approval besides the caller's authorization.
         authorize: the network's question to the caller.
+        approval: the operator's.
         leases: who holds the robot, on every network.
     """
 

@@ -10,6 +10,7 @@ from typing import Any
 
 from strands_robots.contract import WorldRobot, body_of, stops_motions
 from strands_robots.envelope import Envelope, jsonable, success
+from strands_robots.safety.gate import MotionRequest
 from strands_robots.serving.advertised import RobotDescription
 from strands_robots.serving.robot_verbs import ARM_VERBS, WORLD_VERBS
 from strands_robots.serving.verb_schema import described
@@ -117,10 +118,10 @@ def _served(body: object, declared: DeclaredVerb) -> Verb:
             "@verb(motion=False)."
         )
 
-    def run(robot: Any, arguments: Arguments) -> Envelope:
+    def begin(robot: Any, arguments: Arguments, request: MotionRequest | None) -> Envelope:
         # A default that the method changes is none for the next call.
         given = {each: copy.deepcopy(value) for each, value in arguments.items()}
-        return answer_of(name, *declared.carry_out(body_of(robot), given))
+        return answer_of(name, *declared.carry_out(body_of(robot), given, request))
 
     return Verb(
         name,
@@ -133,7 +134,7 @@ def _served(body: object, declared: DeclaredVerb) -> Verb:
             for each in declared.parameters
         ),
         returns=declared.returns,
-        run=run,
+        begin=begin,
         lasts=declared.lasts > 0,
         # It may move any robot of a world, so a lease on one of them refuses it.
         of_world=isinstance(body, WorldRobot),

@@ -13,6 +13,7 @@ from typing import Any
 from strands_robots.contract import Robot, WorldRobot, body_of
 from strands_robots.drivers.reachy import ReachyDriver
 from strands_robots.envelope import Envelope, error, success
+from strands_robots.safety.gate import MotionRequest
 from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS, for_robot
 from strands_robots.serving.base_verbs import DRIVE, NAVIGATE_TO
 from strands_robots.serving.control_verbs import CONTROL_VERBS
@@ -94,21 +95,22 @@ def _follows(robot: Robot) -> bool:
 
 def _of_reachy(verb: Verb) -> Verb:
     """Return a verb of Reachy Mini that every other robot refuses."""
-    carry_out = verb.run
 
-    def run(robot: Robot, arguments: Arguments) -> object:
+    def begin(robot: Robot, arguments: Arguments, request: MotionRequest | None) -> object:
         body = body_of(robot)
-        if carry_out is None or not isinstance(body, ReachyDriver):
+        if not isinstance(body, ReachyDriver):
             return error(f"{verb.name}: this robot is no Reachy Mini.")
-        return carry_out(body, arguments)
+        return verb.call(body, arguments, request)()
 
-    return replace(verb, drops_unknown=True, run=run, suits=lambda robot: isinstance(body_of(robot), ReachyDriver))
+    return replace(verb, drops_unknown=True, begin=begin, suits=lambda robot: isinstance(body_of(robot), ReachyDriver))
 
 
 _COMMON = {"getStatus", "resume", "releaseTorque", *CONTROL_VERBS}
 """Verbs of Reachy Mini that every peer has; its status is the peer's ``status``."""
 
-_REACHY = tuple(_of_reachy(verb) for verb in REACHY_VERBS.values() if verb.run and verb.name not in _COMMON)
+_REACHY = tuple(
+    _of_reachy(verb) for verb in REACHY_VERBS.values() if (verb.run or verb.begin) and verb.name not in _COMMON
+)
 
 PEER_VERBS = table(
     [
@@ -120,18 +122,20 @@ PEER_VERBS = table(
             "execute", Kind.MOTION, "Run a policy and wait for its end.", _PEER_POLICY, lasts=True, suits=takes_tasks
         ),
         _peer_verb(
-            "start", Kind.MOTION, "Start a policy and return at once.", _PEER_POLICY, run=start, suits=takes_tasks
+            "start", Kind.MOTION, "Start a policy and return at once.", _PEER_POLICY, begin=start, suits=takes_tasks
         ),
         _peer_verb(
             "step",
             Kind.MOTION,
             WORLD_VERBS["step"].summary,
             (_optional("steps", int, "Physics steps to take, 1 to 10000", between(1, 10_000)),),
-            run=step_world,
+            begin=step_world,
             suits=is_world,
             of_world=True,
         ),
-        _peer_verb("reset", Kind.MOTION, WORLD_VERBS["reset"].summary, run=reset_world, suits=is_world, of_world=True),
+        _peer_verb(
+            "reset", Kind.MOTION, WORLD_VERBS["reset"].summary, begin=reset_world, suits=is_world, of_world=True
+        ),
         _peer_verb("teleop_status", Kind.READ, "Read the counters of every input stream.", suits=_follows),
         _peer_verb(
             "teleop_receive", Kind.MOTION, "Follow a leader's input stream.", (_SOURCE, _DEVICE), suits=_follows

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -17,11 +16,11 @@ from weakref import WeakKeyDictionary
 from strands_robots.contract import Robot, body_of
 from strands_robots.envelope import Envelope, error, is_error
 from strands_robots.identity_map import IdentityMap
-from strands_robots.safety.approval import Approval, Leave
+from strands_robots.safety.approval import Leave
 from strands_robots.safety.gate import REFUSALS, MotionGate, MotionRequest, refusal_envelope
 from strands_robots.safety.stop_log import stop_logger
-from strands_robots.serving.control import ControlLeases, NotHolderError, leases_of
-from strands_robots.serving.leave import Authorize, Command, MotionRules, RefusalReason, Refused
+from strands_robots.serving.control import NotHolderError, leases_of
+from strands_robots.serving.leave import Command, MotionRules, RefusalReason, Refused
 from strands_robots.serving.verbs import Arguments, Kind, Verb
 from strands_robots.serving.workers import Share, Shares, shares_of
 from strands_robots.utils import ValidationError
@@ -55,8 +54,8 @@ def busy(command: Command) -> Result:
 Answered = Callable[[Result], None]
 """Gets a command's answer on the thread that served it; it may not raise."""
 
-Own = Callable[[Arguments], object]
-"""Carries out a verb that is the network peer's own and not its robot's."""
+Own = Callable[[Arguments, MotionRequest | None], object]
+"""Carries out a verb that is the network peer's own and not its robot's, for the command's request."""
 
 
 class PendingCommands:
@@ -88,10 +87,6 @@ class PendingCommands:
             self._pending[request] = self._robot or robot
         return request
 
-    def serving(self, request: MotionRequest | None) -> AbstractContextManager[None]:
-        """The time in which this thread carries the command out."""
-        return nullcontext() if request is None else request.gate.within(request)
-
     def void(self, robot: str = "") -> None:
         """Void pending commands of this robot of the world, because it is stopped."""
         name = robot or self._robot
@@ -105,17 +100,15 @@ _PENDING: IdentityMap[PendingCommands] = IdentityMap()
 
 
 @dataclass
-class Pipeline:
-    """Serves the commands of one robot on one network.
+class Pipeline(MotionRules):
+    """Serves the commands of one robot on one network, by its rules.
 
     Attributes:
-        rules: by which a command may begin.
         own: verbs that the peer carries out itself, by name.
         pending: commands that a stop has to reach before they begin.
         shares: the robot's threads.
     """
 
-    rules: MotionRules
     own: Mapping[str, Own] = field(default_factory=dict)
     pending: PendingCommands = field(default_factory=lambda: PendingCommands(None))
     shares: Shares = field(default_factory=Shares)
@@ -124,36 +117,15 @@ class Pipeline:
     _changed: threading.Condition = field(default_factory=threading.Condition, init=False, repr=False)
 
     @classmethod
-    def of(
-        cls,
-        robot: Robot | None,
-        peer_id: Callable[[], str],
-        *,
-        hardware: bool,
-        authorize: Authorize,
-        approval: Approval | None = None,
-        leases: ControlLeases | None = None,
-        **parts: Any,
-    ) -> Pipeline:
+    def of(cls, robot: Robot | None, peer_id: Callable[[], str], **parts: Any) -> Pipeline:
         """Make the pipeline of a robot, with shares and pending commands of its own."""
         gate = None if robot is None else robot.gate
         # The same on every network: a stop of one robot of a world voids what waits on the others.
         pending = PendingCommands(None) if robot is None else _PENDING.of(body_of(robot), lambda: PendingCommands(gate))
         parts.setdefault("pending", pending)
         parts.setdefault("shares", Shares() if robot is None else shares_of(robot))
-        if leases is None and robot is not None:
-            leases = leases_of(robot, hardware=hardware)
-        return cls(MotionRules(robot, peer_id, hardware, authorize, approval or Approval(), leases), **parts)
-
-    @property
-    def robot(self) -> Robot | None:
-        """The robot behind its contract; None for a peer that only watches and commands."""
-        return self.rules.robot
-
-    @property
-    def leases(self) -> ControlLeases | None:
-        """The leases of the robot, the same on every network."""
-        return self.rules.leases
+        parts.setdefault("leases", None if robot is None else leases_of(robot, hardware=parts["hardware"]))
+        return cls(robot, peer_id, **parts)
 
     def share(self, verb: Verb) -> Share:
         """Return the share of threads for a verb; only motions wait for motions."""
@@ -175,19 +147,16 @@ class Pipeline:
             self._serving.append(verb.name)
         try:
             arguments = self._checked(command)
-            leave = self.rules.leave(command, arguments)
-            with self.pending.serving(command.request):
-                # Of what ends in an exception nobody knows whether it moves.
-                begun = True
-                if verb.name in self.own:
-                    result = self.own[verb.name](arguments)
-                elif self.robot is None:
-                    result = error(f"{verb.name}: no robot is registered on this peer.")
-                elif verb.run is not None:
-                    result = verb.run(self.robot, arguments)
-                else:
-                    result = getattr(self.robot, verb.method)(**arguments)
-                begun = not is_error(result)
+            leave = self.leave(command, arguments)
+            # Of what ends in an exception nobody knows whether it moves.
+            begun = True
+            if verb.name in self.own:
+                result = self.own[verb.name](arguments, command.request)
+            elif self.robot is None:
+                result = error(f"{verb.name}: no robot is registered on this peer.")
+            else:
+                result = verb.call(self.robot, arguments, command.request)()
+            begun = not is_error(result)
         except Refused as refused:
             refusal, result, begun = refused, refused.envelope, False
         except NotHolderError as exc:
@@ -196,7 +165,7 @@ class Pipeline:
             result, begun = _own_refusal(verb.name, exc), False
         except BaseException:
             # A binding's panic is no Exception; the caller is answered all the same, and the thread goes on.
-            logger.exception("%s: %s failed.", self.rules.peer_id(), verb.name)
+            logger.exception("%s: %s failed.", self.peer_id(), verb.name)
             refusal = Refused(RefusalReason.FAILED, f"{verb.name} failed inside the device; its log has the details.")
             result = refusal.envelope
         try:
@@ -204,7 +173,7 @@ class Pipeline:
                 # A motion that began and ended badly is answered with an error, too.
                 leave.settle(begun or command.begun)
             except OSError:
-                logger.exception("%s: the grant of %s is still in its folder.", self.rules.peer_id(), verb.name)
+                logger.exception("%s: the grant of %s is still in its folder.", self.peer_id(), verb.name)
             answered(Result(result, refusal))
         finally:
             with self._changed:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import ParamSpec
 
 from strands_robots.drivers.reachy import ReachyDriver
 from strands_robots.drivers.reachy.connection import STATUS_PATH
@@ -11,11 +12,13 @@ from strands_robots.drivers.reachy.driver import LIBRARIES, motor_names
 from strands_robots.drivers.reachy.rest import DaemonError
 from strands_robots.drivers.reachy.target import HeadPose, Target, bounded
 from strands_robots.envelope import Envelope, error, success
+from strands_robots.safety.gate import MotionRequest
 from strands_robots.serving.control_verbs import CONTROL_VERBS
 from strands_robots.serving.verbs import (
     NONCE,
     RESUME,
     Arguments,
+    Begin,
     Check,
     Kind,
     Parameter,
@@ -25,6 +28,8 @@ from strands_robots.serving.verbs import (
     table,
 )
 from strands_robots.utils import choice, identifier, shown
+
+P = ParamSpec("P")
 
 DEGREES, MILLIMETRES = math.degrees(1.0), 1000.0
 
@@ -41,36 +46,36 @@ def _offset(name: str, key: str, meaning: str) -> Parameter:
     return Parameter(name, float, meaning, _bound(key, "mm", MILLIMETRES), default=0)
 
 
-def _answering(act: Callable[[ReachyDriver, Arguments], object]) -> Run:
+def _answering(act: Callable[P, object]) -> Callable[P, object]:
     """Answer an error of the daemon with its sentence and HTTP status."""
 
-    def run(reachy: ReachyDriver, arguments: Arguments) -> object:
+    def answering(*args: P.args, **kwargs: P.kwargs) -> object:
         try:
-            return act(reachy, arguments)
+            return act(*args, **kwargs)
         except DaemonError as exc:
             return error(str(exc), http_status=exc.status)
 
-    return run
+    return answering
 
 
-def _torque(verb: str, on: bool) -> Run:
-    return _answering(lambda reachy, arguments: reachy.motors.torque(on, arguments["motor_ids"], verb))
+def _torque(verb: str, on: bool) -> Begin:
+    return lambda reachy, arguments, request: reachy.motors.torque(on, arguments["motor_ids"], verb, request=request)
 
 
-def _gesture(name: str) -> Run:
-    return _answering(lambda reachy, _: reachy.gesture(name))
+def _gesture(name: str) -> Begin:
+    return lambda reachy, _, request: reachy.gesture(name, request=request)
 
 
-def _look(reachy: ReachyDriver, arguments: Arguments) -> object:
-    return reachy.go(reachy.checked(Target(HeadPose(**arguments))), "look")
+def _look(reachy: ReachyDriver, arguments: Arguments, request: MotionRequest | None) -> object:
+    return reachy.go(reachy.checked(Target(HeadPose(**arguments))), "look", request=request)
 
 
-def _antennas(reachy: ReachyDriver, arguments: Arguments) -> object:
-    return reachy.go(Target(antennas=(arguments["right"], arguments["left"])), "antennas")
+def _antennas(reachy: ReachyDriver, arguments: Arguments, request: MotionRequest | None) -> object:
+    return reachy.go(Target(antennas=(arguments["right"], arguments["left"])), "antennas", request=request)
 
 
-def _body(reachy: ReachyDriver, arguments: Arguments) -> object:
-    return reachy.go(reachy.checked(Target(body_yaw=arguments["yaw"])), "body")
+def _body(reachy: ReachyDriver, arguments: Arguments, request: MotionRequest | None) -> object:
+    return reachy.go(reachy.checked(Target(body_yaw=arguments["yaw"])), "body", request=request)
 
 
 def _daemon_status(reachy: ReachyDriver, arguments: Arguments) -> Envelope:
@@ -81,8 +86,8 @@ def _daemon_status(reachy: ReachyDriver, arguments: Arguments) -> Envelope:
     return {**payload, "status": answer["status"], "content": answer["content"]}
 
 
-def _motion(name: str, summary: str, run: Run, *parameters: Parameter, instead: str = "") -> Verb:
-    return Verb(name, Kind.MOTION, summary, parameters, run=run, instead=instead)
+def _motion(name: str, summary: str, begin: Begin, *parameters: Parameter, instead: str = "") -> Verb:
+    return Verb(name, Kind.MOTION, summary, parameters, begin=_answering(begin), instead=instead)
 
 
 def _read(name: str, summary: str, run: Run, *parameters: Parameter) -> Verb:
@@ -109,7 +114,7 @@ REACHY_VERBS = table(
         _motion(
             "look",
             "Set the head pose: at once within a short way, else by a quick ramp that any later motion or stop ends.",
-            _answering(_look),
+            _look,
             _angle(
                 "pitch", "head_pitch", "Degrees, -40 to 40, positive looks down; pitch and roll together at most 60"
             ),
@@ -122,14 +127,14 @@ REACHY_VERBS = table(
         _motion(
             "antennas",
             "Set the antenna angles.",
-            _answering(_antennas),
+            _antennas,
             _angle("left", "antenna_left", "Left antenna in degrees, -180 to 180"),
             _angle("right", "antenna_right", "Right antenna in degrees, -180 to 180"),
         ),
         _motion(
             "body",
             "Turn the body.",
-            _answering(_body),
+            _body,
             _angle("yaw", "body_yaw", "Degrees, -160 to 160, positive turns left"),
         ),
         _motion("nod", "Nod the head: yes.", _gesture("nod")),
@@ -138,17 +143,17 @@ REACHY_VERBS = table(
         _motion(
             "wakeUp",
             "Enable the motors, make sure that they are, and play the wake-up; its end is told by motionComplete.",
-            _answering(lambda reachy, _: reachy.wake_up()),
+            lambda reachy, _, request: reachy.wake_up(request=request),
         ),
         _motion(
             "sleep",
             "Lie down, with the motors off at the end; the end is told by motionComplete.",
-            _answering(lambda reachy, _: reachy.sleep()),
+            lambda reachy, _, request: reachy.sleep(request=request),
         ),
         _motion(
             "playMove",
             "Play a recorded move; its end is told by motionComplete.",
-            _answering(lambda reachy, a: reachy.catalogue.play(a["move_name"], a["library"])),
+            lambda reachy, a, request: reachy.catalogue.play(a["move_name"], a["library"], request=request),
             Parameter("move_name", str, "Name of the move, as listMoves gives it", identifier),
             _LIBRARY,
         ),

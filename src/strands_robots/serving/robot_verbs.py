@@ -12,8 +12,19 @@ from dataclasses import replace
 from typing import Any
 
 from strands_robots.bus_access import read_joints
-from strands_robots.contract import RUNNING, SETTLE, Robot, RolloutEvent, TaskRobot, WorldRobot, adapt, body_of
+from strands_robots.contract import (
+    RUNNING,
+    SETTLE,
+    Robot,
+    RolloutEvent,
+    TaskRobot,
+    WorldRobot,
+    adapt,
+    body_of,
+    for_request,
+)
 from strands_robots.envelope import Envelope, error, is_error, success
+from strands_robots.safety.gate import MotionRequest
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS, WORLD_MOTION_VERBS, for_robot
 from strands_robots.serving.control_verbs import CONTROL_VERBS
@@ -116,23 +127,25 @@ def peer_stop_answer(verdict: StopVerdict) -> dict[str, Any]:
     return result
 
 
-def _execute(world: WorldRobot, arguments: Arguments) -> Envelope:
+def _execute(world: WorldRobot, arguments: Arguments, request: MotionRequest | None) -> Envelope:
     policy = dict(arguments)
     name = robot_of(world, policy.pop("robot_name"), first=True)
-    answer = world.start_policy(name, policy.pop("instruction"), **policy)
+    answer = for_request(request, world.start_policy)(name, policy.pop("instruction"), **policy)
     return {**answer, "robot_name": name}
 
 
-def step_world(robot: Robot, arguments: Arguments) -> Envelope:
+def step_world(robot: Robot, arguments: Arguments, request: MotionRequest | None = None) -> Envelope:
     """Advance the physics of a world; refused by any other robot."""
     if not isinstance(robot, WorldRobot):
         return error("step: this robot is no simulation.")
-    return robot.step(arguments.get("n_steps", arguments.get("steps", 1)))
+    return for_request(request, robot.step)(arguments.get("n_steps", arguments.get("steps", 1)))
 
 
-def reset_world(robot: Robot, arguments: Arguments) -> Envelope:
+def reset_world(robot: Robot, arguments: Arguments, request: MotionRequest | None = None) -> Envelope:
     """Restore the initial state of a world; refused by any other robot."""
-    return robot.reset() if isinstance(robot, WorldRobot) else error("reset: this robot is no simulation.")
+    if not isinstance(robot, WorldRobot):
+        return error("reset: this robot is no simulation.")
+    return for_request(request, robot.reset)()
 
 
 def status(robot: Robot, arguments: Arguments) -> Envelope:
@@ -154,21 +167,24 @@ def _world_status(world: WorldRobot, arguments: Arguments) -> Envelope:
     return {**world.get_state(), "task_status": "running" if running else "idle"}
 
 
-def start(robot: Robot, arguments: Arguments) -> Envelope:
+def start(robot: Robot, arguments: Arguments, request: MotionRequest | None = None) -> Envelope:
     """Start a policy with a mesh peer's options, on ``robot_name`` of a world."""
     options = {name: value for name, value in arguments.items() if name != "robot_name"}
     if options.get("policy_host") == "localhost":
         del options["policy_host"]
     instruction = options.pop("instruction", "")
     if isinstance(robot, WorldRobot):
-        return robot.start_policy(robot_of(robot, arguments.get("robot_name")), instruction, **options)
+        name = robot_of(robot, arguments.get("robot_name"))
+        return for_request(request, robot.start_policy)(name, instruction, **options)
     unknown = sorted(set(options) - _accepted(robot.start_task, options))
     if unknown:
         return error(f"start: this robot takes no {', '.join(unknown)}.")
-    return robot.start_task(instruction, **options)
+    return for_request(request, robot.start_task)(instruction, **options)
 
 
-def run_to_end(robot: Robot, arguments: Arguments, closing: Callable[[], bool]) -> Envelope:
+def run_to_end(
+    robot: Robot, arguments: Arguments, closing: Callable[[], bool], request: MotionRequest | None = None
+) -> Envelope:
     """Start a policy and wait for its end or for ``closing``."""
     name = None
     if isinstance(robot, WorldRobot):
@@ -181,7 +197,7 @@ def run_to_end(robot: Robot, arguments: Arguments, closing: Callable[[], bool]) 
 
     unsubscribe = robot.subscribe(observe)
     try:
-        started = start(robot, arguments)
+        started = start(robot, arguments, request)
         if is_error(started):
             return started
         deadline = time.monotonic() + arguments["duration"] + EXECUTE_GRACE_S
@@ -319,7 +335,7 @@ WORLD_VERBS = table(
             "Start a policy on a simulated robot and return at once; follow it with getStatus or policyComplete.",
             (INSTRUCTION, POLICY_PROVIDER, DURATION, ROBOT_NAME),
             returns="robot_name",
-            run=_execute,
+            begin=_execute,
             suits=takes_tasks,
         ),
         Verb(
@@ -345,7 +361,7 @@ WORLD_VERBS = table(
             "Step physics by hand, as fast as it computes.",
             (N_STEPS,),
             returns="sim_time, step_count",
-            run=step_world,
+            begin=step_world,
             suits=is_world,
             critical=False,
             of_world=True,
@@ -354,7 +370,7 @@ WORLD_VERBS = table(
             "reset",
             Kind.MOTION,
             "Halt everything and put the world back to its initial state.",
-            run=reset_world,
+            begin=reset_world,
             suits=is_world,
             critical=False,
             of_world=True,

@@ -9,8 +9,11 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from functools import partial
 from typing import Any
 
+from strands_robots.contract import for_request
+from strands_robots.safety.gate import MotionRequest
 from strands_robots.safety.resume import is_epoch
 from strands_robots.utils import DURATION_MAX_S, ValidationError, duration, identifier, number, shown, text, whole
 
@@ -22,6 +25,9 @@ Check = Callable[[str, object], Any]
 
 Run = Callable[[Any, Arguments], object]
 """Carries a verb out on a robot; returns an envelope. What it raises is reported as a failure inside the device."""
+
+Begin = Callable[[Any, Arguments, MotionRequest | None], object]
+"""Carries a verb out as :data:`Run` does, with the request that its motion begins for."""
 
 Suits = Callable[[Any], bool]
 """Says whether a robot can carry a verb out now."""
@@ -124,6 +130,7 @@ class Verb:
         suits: returns False for a robot that cannot carry the verb out; None leaves that to ``method``. It is asked
             often and on event loops, so it reads and waits for nothing.
         run: a function that calls it, or acts in place of it. A verb with neither is the network peer's own.
+        begin: the same for a verb that may begin a motion; it gets the command's request besides.
         critical: False for a motion that no bystander has to fear.
         drops_unknown: arguments that it does not have, or that are None, are left out instead of refused, and an
             optional one that was not given stays out: the mesh's wire has it so.
@@ -145,6 +152,7 @@ class Verb:
     returns: str = ""
     method: str = ""
     run: Run | None = None
+    begin: Begin | None = None
     suits: Suits | None = None
     critical: bool = True
     drops_unknown: bool = False
@@ -169,6 +177,20 @@ class Verb:
     def leased(self) -> bool:
         """True for a motion of the lease's holder alone; it takes :data:`OF_THE_LEASE`."""
         return self.kind is Kind.MOTION and not self.while_locked
+
+    def call(self, robot: Any, arguments: Arguments, request: MotionRequest | None = None) -> Callable[[], object]:
+        """Return the call that carries the verb out with a robot, and returns its answer.
+
+        Args:
+            robot: behind its contract.
+            arguments: checked.
+            request: what a motion begins for; a halt since it was made refuses the motion.
+        """
+        if self.begin is not None:
+            return partial(self.begin, robot, arguments, request)
+        if self.run is not None:
+            return partial(self.run, robot, arguments)
+        return partial(for_request(request, getattr(robot, self.method)), **arguments)
 
     def unfit(self, names: Collection[str]) -> str | None:
         """Return the reason why arguments of these names do not fit, or None."""

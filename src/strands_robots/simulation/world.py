@@ -31,7 +31,7 @@ from strands_robots.policies.rollout import (
     rollout_options,
     unfollowed,
 )
-from strands_robots.safety.gate import MotionGate, Permit, Waiting, answered
+from strands_robots.safety.gate import MotionGate, MotionRequest, Permit, Waiting, answered
 from strands_robots.safety.halted_verbs import halted_with_verbs, verbs_to_end
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stop_targets import note_motion
@@ -271,10 +271,10 @@ class Simulation(PicturesMixin, ArmMixin, TeleopMixin):
         )
 
     @answered
-    def reset(self) -> Envelope:
+    def reset(self, *, request: MotionRequest | None = None) -> Envelope:
         """Halt, then restore the initial state of the world; refused while it is locked."""
         self._require_open()
-        permit = self.gate.permit("reset")
+        permit = self.gate.permit("reset", request)
         with self.starting:
             # Nothing starts a rollout while this lock is held; a stop that comes meanwhile voids the fresh permit.
             permit = self.gate.renew(permit)
@@ -363,11 +363,13 @@ class Simulation(PicturesMixin, ArmMixin, TeleopMixin):
         return self.body().joint_units if self._bodies else {}
 
     @answered
-    def send_action(self, action: dict[str, float], robot_name: str | None = None) -> Envelope:
+    def send_action(
+        self, action: dict[str, float], robot_name: str | None = None, *, request: MotionRequest | None = None
+    ) -> Envelope:
         """Set targets of one robot; ``sent`` has them clamped to each actuator's range."""
         self._require_open()
         body = self.body(robot_name)
-        permit = self.gate.permit("send_action")
+        permit = self.gate.permit("send_action", request)
         with self._waiting.until_begun(permit, body.name):
             self._require_undriven(body.name)
             sent = body.send_action(action, permit)
@@ -380,6 +382,8 @@ class Simulation(PicturesMixin, ArmMixin, TeleopMixin):
         instruction: str,
         policy_provider: str = "mock",
         duration: float = 30.0,
+        *,
+        request: MotionRequest | None = None,
         **policy: Any,
     ) -> Envelope:
         """Start a rollout of one robot and return at once.
@@ -389,10 +393,11 @@ class Simulation(PicturesMixin, ArmMixin, TeleopMixin):
             instruction: the task, 1 to 2000 characters.
             policy_provider: a registered policy, such as mock.
             duration: seconds, above 0 up to a day.
+            request: what it begins for; made now by default.
             policy: arguments of that policy's constructor; besides, ``control_frequency`` (Hz, at most the robot's
                 rate) and ``n_steps`` (actions after which it ends).
         """
-        rollout = self._start_rollout(robot_name, instruction, policy_provider, duration, policy)
+        rollout = self._start_rollout(robot_name, instruction, policy_provider, duration, policy, request=request)
         problem = rollout.not_begun()
         if problem:
             return error(f"start_policy: {problem}.", **_row(rollout))
@@ -536,10 +541,17 @@ class Simulation(PicturesMixin, ArmMixin, TeleopMixin):
         """Return the objects of the world in the base frame of one robot."""
         return targets_of(self.physics.snapshot, self.body(robot_name).base_pose())
 
-    def start_motion(self, robot_name: str, verb: str, plan: Callable[[float, Permit], Motion]) -> Rollout:
+    def start_motion(
+        self,
+        robot_name: str,
+        verb: str,
+        plan: Callable[[float, Permit], Motion],
+        *,
+        request: MotionRequest | None = None,
+    ) -> Rollout:
         """Plan and start a motion of one robot."""
         hz = settings.number("STRANDS_CONTROL_HZ")
-        permit = self.gate.permit(verb)
+        permit = self.gate.permit(verb, request)
         with self._waiting.until_begun(permit, robot_name), self.starting:
             body = self._free_body(robot_name)
             motion = plan(hz, permit)
@@ -600,13 +612,20 @@ class Simulation(PicturesMixin, ArmMixin, TeleopMixin):
         return {name: rollout for name, rollout in list(self._rollouts.items()) if rollout.running}
 
     def _start_rollout(
-        self, robot_name: str, instruction: str, provider: str, duration: float, options: dict[str, Any]
+        self,
+        robot_name: str,
+        instruction: str,
+        provider: str,
+        duration: float,
+        options: dict[str, Any],
+        *,
+        request: MotionRequest | None = None,
     ) -> Rollout:
         profile, hz = profiles().get(provider), settings.number("STRANDS_CONTROL_HZ")
         if profile is not None:
             options = profile.loop_options(options, hz)
         chosen = rollout_options(instruction, duration, options, hz)
-        permit = self.gate.permit("start_policy")
+        permit = self.gate.permit("start_policy", request)
         with self._waiting.until_begun(permit, self.body(robot_name).name):
             policy = create_policy(provider, **options)
             with self.starting:

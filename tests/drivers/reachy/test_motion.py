@@ -10,7 +10,7 @@ import pytest
 from fixtures.waiting import eventually
 
 from strands_robots.drivers.reachy.motion import MotionController
-from strands_robots.safety.gate import MotionGate, MotionRefused, Permit
+from strands_robots.safety.gate import MotionGate, MotionRefused, MotionRequest, Permit
 
 
 class IdleConnection:
@@ -43,8 +43,8 @@ def test_halt_reports_a_torque_write_that_does_not_return_and_voids_the_motion_b
     permitted: list[str] = []
     permit = gate.permit
 
-    def recorded_permit(name: str) -> Permit:
-        given = permit(name)
+    def recorded_permit(name: str, request: MotionRequest | None = None) -> Permit:
+        given = permit(name, request)
         permitted.append(name)
         return given
 

@@ -31,7 +31,7 @@ from strands_robots.drivers.reachy.target import (
     from_action,
 )
 from strands_robots.envelope import Envelope, error, success, text_of
-from strands_robots.safety.gate import MotionGate
+from strands_robots.safety.gate import MotionGate, MotionRequest
 from strands_robots.safety.halted_verbs import halted_with_verbs
 from strands_robots.safety.stop_executor import RETURN_SHARE
 from strands_robots.safety.stopping import StopVerdict
@@ -122,18 +122,18 @@ class Motors:
         if now != mode:
             raise DaemonFaultError(f"the motors were to be {mode} and are {now}.")
 
-    def torque(self, on: bool, motor_ids: str, name: str) -> Envelope:
+    def torque(self, on: bool, motor_ids: str, name: str, *, request: MotionRequest | None = None) -> Envelope:
         """Switch the torque of all or some motors; ``name`` is the caller's verb."""
         names, mode = motor_names(motor_ids), "enabled" if on else "disabled"
         if not names:
-            self._motions.torque(lambda: self.set_mode(mode), name)
+            self._motions.torque(lambda: self.set_mode(mode), name, request)
             return success(f"All motors are {mode}.", motors="all", motor_mode=mode, verified=True)
 
         def change() -> None:
             self._connection.link().send_torque(on, names)
             self._set_singly = True
 
-        self._motions.torque(change, name)
+        self._motions.torque(change, name, request)
         return success(
             f"Asked for {', '.join(names)} {mode}; the daemon does not report the torque of a single motor.",
             motors=list(names),
@@ -162,7 +162,7 @@ class RecordedMoves:
         moves = list(self._known[checked][1])
         return success(f"{len(moves)} recorded moves in {checked}.", library=checked, moves=moves)
 
-    def play(self, move_name: str, library: str) -> Envelope:
+    def play(self, move_name: str, library: str, *, request: MotionRequest | None = None) -> Envelope:
         """Start a recorded move; an event reports its end."""
         name = identifier("move_name", move_name)
         checked = choice("library", library, tuple(LIBRARIES))
@@ -175,7 +175,7 @@ class RecordedMoves:
         if name not in self._known[checked][1]:
             return error(f"{checked} has no move {name!r}; listMoves has the names.")
         path = f"/api/move/play/recorded-move-dataset/{LIBRARIES[checked]}/{name}"
-        uuid = self._motions.daemon_move(name, path, arrived=str)
+        uuid = self._motions.daemon_move(name, path, request, arrived=str)
         return success(f"Playing {name}.", move=name, library=checked, uuid=uuid)
 
     def _fetch(self, library: str) -> Envelope | None:
@@ -335,7 +335,7 @@ class ReachyDriver:
             )
         return Target(pose, joints.body_yaw, joints.antennas).action()
 
-    def send_action(self, action: dict[str, Any]) -> dict[str, float]:
+    def send_action(self, action: dict[str, Any], *, request: MotionRequest | None = None) -> dict[str, float]:
         """Send one frame, at most 0.3 rad and 10 mm from the last, and return it.
 
         Raises:
@@ -343,7 +343,7 @@ class ReachyDriver:
             MotionRefused: halted, locked, not connected, or held by an application.
         """
         target = self.checked(from_action(action, self.motions.present()))
-        return self.motions.stream(target, "send_action").action()
+        return self.motions.stream(target, "send_action", request).action()
 
     def hold(self) -> None:
         """Stop every motion for a control loop around this driver; the pose is kept.
@@ -361,26 +361,30 @@ class ReachyDriver:
         """Return a reachable ``target``. Raises :class:`ValidationError` for any other."""
         return check(target, automatic_body_yaw=self._automatic, body_yaw=self.motions.present().body_yaw)
 
-    def go(self, target: Target, name: str = "go") -> Envelope:
+    def go(self, target: Target, name: str = "go", *, request: MotionRequest | None = None) -> Envelope:
         """Move to a target in one frame, or by a ramp that goes on after the return."""
-        ramped = self.motions.go(self.checked(target), name)
+        ramped = self.motions.go(self.checked(target), name, request)
         return success(f"{name}: {'moving there' if ramped else 'sent'}.", target=target.action(), ramp=ramped)
 
-    def gesture(self, name: str) -> Envelope:
+    def gesture(self, name: str, *, request: MotionRequest | None = None) -> Envelope:
         """Start ``nod``, ``shake`` or ``happy``."""
-        self.motions.gesture(GESTURES[name], name)
+        self.motions.gesture(GESTURES[name], name, request)
         return success(f"{name}: started.", motion=name)
 
-    def wake_up(self) -> Envelope:
+    def wake_up(self, *, request: MotionRequest | None = None) -> Envelope:
         """Enable the motors and start the daemon's wake-up; an event reports its end."""
         uuid = self.motions.daemon_move(
-            "wakeUp", "/api/move/play/wake_up", arrived=self._awake, before=lambda: self.motors.set_mode("enabled")
+            "wakeUp",
+            "/api/move/play/wake_up",
+            request,
+            arrived=self._awake,
+            before=lambda: self.motors.set_mode("enabled"),
         )
         return success("Motors enabled; waking up.", motor_mode="enabled", uuid=uuid)
 
-    def sleep(self) -> Envelope:
+    def sleep(self, *, request: MotionRequest | None = None) -> Envelope:
         """Start the daemon's way to sleep, which ends with motors off, and an event."""
-        uuid = self.motions.daemon_move("sleep", "/api/move/play/goto_sleep", arrived=self._asleep)
+        uuid = self.motions.daemon_move("sleep", "/api/move/play/goto_sleep", request, arrived=self._asleep)
         return success("Going to sleep.", uuid=uuid)
 
     def subscribe(self, observer: Observer) -> Unsubscribe:

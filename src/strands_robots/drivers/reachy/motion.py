@@ -25,7 +25,7 @@ from strands_robots.drivers.reachy.stop_rounds import StopRound, StopRounds
 from strands_robots.drivers.reachy.target import STREAM_HZ, Frames, Gesture, HeadPose, Target, ramp
 from strands_robots.envelope import error, success
 from strands_robots.policies.rollout import RolloutObservers
-from strands_robots.safety.gate import MotionGate, MotionRefused, Permit
+from strands_robots.safety.gate import MotionGate, MotionRefused, MotionRequest, Permit
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import StopVerdict, halt_each
 from strands_robots.utils import ValidationError
@@ -236,9 +236,9 @@ class MotionController:
         motion = self._current
         return (motion is not None and motion.running) or bool(self._moves.running(time.monotonic() + 1.0))
 
-    def stream(self, target: Target, name: str) -> Target:
+    def stream(self, target: Target, name: str, request: MotionRequest | None = None) -> Target:
         """Send one frame now, cut to one frame's way; return the target sent."""
-        with self._started(name) as motion:
+        with self._started(name, request) as motion:
             start = self.present()
             steps = target.step_from(start)
             sent = start.toward(target, 1 / steps) if steps > 1 else target
@@ -247,27 +247,34 @@ class MotionController:
             self._end(motion, "completed")
             return sent
 
-    def go(self, target: Target, name: str) -> bool:
+    def go(self, target: Target, name: str, request: MotionRequest | None = None) -> bool:
         """Go there by one frame now, or by a ramp that starts now; True for a ramp."""
-        with self._started(name) as motion:
+        with self._started(name, request) as motion:
             start = self.present()
             ramped = target.step_from(start) > 1
             self._play(motion, ramp(start, target) if ramped else iter((target,)))
             return ramped
 
-    def gesture(self, frames: Gesture, name: str) -> None:
+    def gesture(self, frames: Gesture, name: str, request: MotionRequest | None = None) -> None:
         """Play frames at 50 Hz; the first one is sent now."""
-        with self._started(name) as motion:
+        with self._started(name, request) as motion:
             self._play(motion, frames(self.present()))
 
     def daemon_move(
-        self, name: str, path: str, *, arrived: ArrivalCheck, before: Callable[[], None] | None = None
+        self,
+        name: str,
+        path: str,
+        request: MotionRequest | None = None,
+        *,
+        arrived: ArrivalCheck,
+        before: Callable[[], None] | None = None,
     ) -> str:
         """Let the daemon play a move and watch it end; returns its uuid at once.
 
         Args:
             name: of the motion, in events and answers.
             path: posted to the daemon.
+            request: what it begins for; made now by default.
             arrived: checked at the end, because the daemon reports `completed` for a move that did not arrive.
             before: runs once earlier motions are stopped; with it the motors may be off.
 
@@ -275,7 +282,7 @@ class MotionController:
             DaemonError: the daemon did not start it.
             MotionRefused: halted, locked, or the robot is not available.
         """
-        with self._started(name, of_daemon=True, motors_may_be_off=before is not None) as motion:
+        with self._started(name, request, of_daemon=True, motors_may_be_off=before is not None) as motion:
             updates = None
             try:
                 updates = MoveUpdates(self._connection.host, self._connection.port)
@@ -308,14 +315,14 @@ class MotionController:
             watch.start()
             return motion.uuid
 
-    def torque(self, change: Callable[[], None], name: str) -> None:
+    def torque(self, change: Callable[[], None], name: str, request: MotionRequest | None = None) -> None:
         """Run ``change``, a write of the motors' torque, after stopping every motion."""
 
         def change_now() -> None:
             motion.check()
             change()
 
-        with self._started(name, motors_may_be_off=True) as motion:
+        with self._started(name, request, motors_may_be_off=True) as motion:
             try:
                 # Under the lock, so that a halt waits for it as for a frame.
                 motion.permit.write(self._write, change_now)
@@ -356,13 +363,18 @@ class MotionController:
 
     @contextlib.contextmanager
     def _started(
-        self, name: str, *, of_daemon: bool = False, motors_may_be_off: bool = False
+        self,
+        name: str,
+        request: MotionRequest | None,
+        *,
+        of_daemon: bool = False,
+        motors_may_be_off: bool = False,
     ) -> Iterator[ReachyMotion]:
         """Start a motion once nothing else moves, with other starts waiting.
 
         The permit is taken first, so that a stop voids a start that still waits.
         """
-        permit = self._gate.permit(name)
+        permit = self._gate.permit(name, request)
         with self._turn:
             permit.check()
             refusal = self._connection.refusal()

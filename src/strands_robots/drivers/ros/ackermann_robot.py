@@ -13,7 +13,7 @@ from strands_robots.ros.gate import CommandGate
 from strands_robots.ros.link import RosLink
 from strands_robots.ros.names import graph_name, interface
 from strands_robots.ros.ros2 import Ros2Link
-from strands_robots.safety.gate import MotionRefused, Permit
+from strands_robots.safety.gate import MotionRefused, MotionRequest, Permit
 from strands_robots.utils import ValidationError, mapping, number, shown
 
 SERVO = "deepracer_interfaces_pkg/msg/ServoCtrlMsg"
@@ -134,19 +134,19 @@ class AckermannRosRobot(MobileBaseRobot):
             "throttle": max(-1.0, min(1.0, linear / self.max_speed)),
         }
 
-    def enable(self, tool_context: Any = None) -> Envelope:
+    def enable(self, tool_context: Any = None, *, request: MotionRequest | None = None) -> Envelope:
         """Run the handshake up to its first failure, unless it succeeded before.
 
         An answer with ``success`` false or an ``error`` that is not zero is a call that failed.
         """
         try:
-            permit = self.gate.permit("enable")
+            permit = self.gate.permit("enable", request)
         except MotionRefused as locked:
             return locked.envelope
         return self._run_handshake(permit, tool_context) or success(f"{self.node_name} takes commands.", enabled=True)
 
-    def handshake(self, tool_context: Any = None) -> Envelope | None:
-        answer = self.enable(tool_context)
+    def handshake(self, tool_context: Any = None, *, request: MotionRequest | None = None) -> Envelope | None:
+        answer = self.enable(tool_context, request=request)
         return answer if answer["status"] == "error" else None
 
     def _run_handshake(self, permit: Permit, tool_context: Any) -> Envelope | None:

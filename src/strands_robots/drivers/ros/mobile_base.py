@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
+import inspect
 import threading
 import time
 from collections.abc import Callable
@@ -10,7 +12,7 @@ from dataclasses import replace
 from typing import Any, TypeVar
 
 from strands_robots import settings
-from strands_robots.contract import Observer, Unsubscribe
+from strands_robots.contract import Observer, Unsubscribe, for_request
 from strands_robots.drivers.ros.motion import COUNT_MAX, BaseMotion, Drive, DriveOrder, messages_for
 from strands_robots.drivers.ros.odometry import OdometryMonitor
 from strands_robots.drivers.ros.velocity_publisher import CurrentHold, VelocityPublisher, ZeroVelocityHold
@@ -19,7 +21,7 @@ from strands_robots.policies.rollout import RolloutObservers
 from strands_robots.ros.gate import CommandGate
 from strands_robots.ros.link import RosError, RosLink
 from strands_robots.ros.names import bare_kind, graph_name, interface
-from strands_robots.safety.gate import MotionGate, MotionRefused, Permit
+from strands_robots.safety.gate import MotionGate, MotionRefused, MotionRequest, Permit
 from strands_robots.safety.halted_verbs import halted_with_verbs
 from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import PendingVerdict, StopVerdict, halts_in_parts
@@ -135,8 +137,8 @@ class MobileBaseRobot:
     def check_motion(self, linear: float, angular: float) -> None:
         """Raise :class:`ValidationError` where the platform cannot execute this motion."""
 
-    def handshake(self, tool_context: Any = None) -> Envelope | None:
-        """Make the vehicle ready for commands; return the error, or None."""
+    def handshake(self, tool_context: Any = None, *, request: MotionRequest | None = None) -> Envelope | None:
+        """Make the vehicle ready for commands of a request; return the error, or None."""
         return None
 
     def motion_note(self) -> str:
@@ -182,7 +184,15 @@ class MobileBaseRobot:
         drive = self._begin_drive(linear, angular, duration, count, tool_context)
         return self._run(drive) if isinstance(drive, Drive) else drive
 
-    def start_drive(self, linear: float, angular: float, duration: float, tool_context: Any = None) -> Envelope:
+    def start_drive(
+        self,
+        linear: float,
+        angular: float,
+        duration: float,
+        tool_context: Any = None,
+        *,
+        request: MotionRequest | None = None,
+    ) -> Envelope:
         """Start a timed drive; :meth:`get_task_status` and observers report its end.
 
         Args:
@@ -190,12 +200,13 @@ class MobileBaseRobot:
             angular: Turning rate in rad/s; positive turns left.
             duration: Seconds until the robot is stopped again, above 0.
             tool_context: Context of an agent's call, through which the operator is asked.
+            request: What it begins for; made now by default.
         """
         try:
             seconds = number("duration", duration, above=0, high=self.max_duration)
         except ValidationError as refused:
             return error(str(refused))
-        drive = self._begin_drive(linear, angular, seconds, 1, tool_context)
+        drive = self._begin_drive(linear, angular, seconds, 1, tool_context, request=request)
         if not isinstance(drive, Drive):
             return drive
         order = drive.order
@@ -265,7 +276,7 @@ class MobileBaseRobot:
 
         suffix = tool_suffix(self.node_name)
         return [
-            tool(name=f"{verb}_{suffix}", description=description, context=True)(method)
+            tool(name=f"{verb}_{suffix}", description=description, context=True)(_without_request(method))
             for verb, (method, description) in self.agent_verbs().items()
         ]
 
@@ -341,7 +352,12 @@ class MobileBaseRobot:
     # One motion at a time, for this class and its subclasses.
 
     def _begin(
-        self, verb: str, target: tuple[str, str], tool_context: Any, make: Callable[[Permit], _Motion]
+        self,
+        verb: str,
+        target: tuple[str, str],
+        tool_context: Any,
+        make: Callable[[Permit], _Motion],
+        request: MotionRequest | None = None,
     ) -> _Motion | Envelope:
         """Return a motion that may begin and has the base's one slot, or the refusal.
 
@@ -350,16 +366,16 @@ class MobileBaseRobot:
             target: name and type of the topic or action that the operator has to approve.
             tool_context: context of an agent's call, through which the operator is asked.
             make: makes the motion of its permit.
+            request: what it begins for; made now by default.
         """
         if not self._slot.acquire(blocking=False):
             return error("The base is being driven; stop it first, or wait for its end.")
         motion = None
         try:
-            permit = self.gate.permit(verb)
+            permit = self.gate.permit(verb, request)
             refusal = self.command_gate.refusal(*target, verb, tool_context)
             # The operator may take minutes to answer: a stop meanwhile also ends the handshake, which would arm.
-            with self.gate.within(permit.request):
-                refusal = refusal or self.handshake(tool_context)
+            refusal = refusal or for_request(permit.request, self.handshake)(tool_context)
             if refusal is not None:
                 return refusal
             self._left = False
@@ -399,14 +415,21 @@ class MobileBaseRobot:
             self._observers.notify(motion.event("finished", self.tool_name_str))
 
     def _begin_drive(
-        self, linear: object, angular: object, duration: object, count: object, tool_context: Any
+        self,
+        linear: object,
+        angular: object,
+        duration: object,
+        count: object,
+        tool_context: Any,
+        *,
+        request: MotionRequest | None = None,
     ) -> Drive | Envelope:
         try:
             order = self._checked(linear, angular, duration, count)
         except ValidationError as refused:
             return error(str(refused))
         target = (self._topic, self._kind)
-        return self._begin("drive", target, tool_context, lambda permit: Drive(order, self._publisher, permit))
+        return self._begin("drive", target, tool_context, lambda permit: Drive(order, self._publisher, permit), request)
 
     def _checked(self, linear: object, angular: object, duration: object, count: object) -> DriveOrder:
         requested = number("linear", linear), number("angular", angular)
@@ -524,6 +547,19 @@ class PosedBaseRobot(MobileBaseRobot):
         if "get_pose" in self.reads:
             verbs["get_pose"] = (self.get_pose, f"Read where {self.node_name} is and how it moves.")
         return verbs
+
+
+def _without_request(method: Callable[..., Envelope]) -> Callable[..., Envelope]:
+    """Return a method without its argument ``request``, which no agent gives."""
+
+    @functools.wraps(method)
+    def verb(*values: Any, **named: Any) -> Envelope:
+        return method(*values, **named)
+
+    signature = inspect.signature(method)
+    given = [each for name, each in signature.parameters.items() if name != "request"]
+    vars(verb)["__signature__"] = signature.replace(parameters=given)
+    return verb
 
 
 def _optional(check: Callable[[str, object], str], name: str, value: str | None) -> str | None:

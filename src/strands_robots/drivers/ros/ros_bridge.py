@@ -13,7 +13,7 @@ from strands_robots.ros.gate import CommandGate
 from strands_robots.ros.link import RosLink
 from strands_robots.ros.names import graph_name, interface
 from strands_robots.ros.ros2 import Ros2Link
-from strands_robots.safety.gate import Permit
+from strands_robots.safety.gate import MotionRequest, Permit
 from strands_robots.safety.stopping import PendingVerdict, StopVerdict
 from strands_robots.utils import ValidationError, number, text
 
@@ -124,9 +124,11 @@ class RosBridgedRobot(PosedBaseRobot):
         frame_id: str = "map",
         timeout: float = 120.0,
         tool_context: Any = None,
+        *,
+        request: MotionRequest | None = None,
     ) -> Envelope:
         """Start a goal; :meth:`get_task_status` and observers report its end."""
-        goal = self._begin_navigation(x, y, yaw, frame_id, timeout, tool_context)
+        goal = self._begin_navigation(x, y, yaw, frame_id, timeout, tool_context, request)
         if not isinstance(goal, Navigation):
             return goal
         refusal = self._run_in_background(goal)
@@ -161,7 +163,14 @@ class RosBridgedRobot(PosedBaseRobot):
         return verbs
 
     def _begin_navigation(  # noqa: PLR0917 - as above
-        self, x: object, y: object, yaw: object, frame_id: object, timeout: object, tool_context: Any
+        self,
+        x: object,
+        y: object,
+        yaw: object,
+        frame_id: object,
+        timeout: object,
+        tool_context: Any,
+        request: MotionRequest | None = None,
     ) -> Navigation | Envelope:
         try:
             to = Destination(
@@ -181,7 +190,7 @@ class RosBridgedRobot(PosedBaseRobot):
             self._navigation = Navigation(self.link, *target, to, permit)
             return self._navigation
 
-        return self._begin("navigate_to", target, tool_context, make)
+        return self._begin("navigate_to", target, tool_context, make, request)
 
     def _cancel_again(self, goal: Navigation) -> str:
         """Cancel a lost goal again; return what to add to its doubt, or "".
