@@ -29,6 +29,8 @@ FLOORS: list[set[str]] = [
         "utils",
         "bounded_json",
         "identity_map",
+        "state_files",
+        "stop_log",
         "agent_tool",
         "_mesh_switch",
         "zenoh_sockets",

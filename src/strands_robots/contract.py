@@ -21,7 +21,6 @@ from strands_robots.identity_map import IdentityMap
 from strands_robots.safety.gate import MotionGate, MotionRefused
 from strands_robots.safety.halted_verbs import halted_with_verbs
 from strands_robots.safety.kept_gates import gate_of
-from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import (
     PendingVerdict,
     StopVerdict,
@@ -32,6 +31,7 @@ from strands_robots.safety.stopping import (
     read_verdict,
 )
 from strands_robots.safety.verbs_under_way import VerbCall
+from strands_robots.stop_log import stop_logger
 from strands_robots.utils import ValidationError, shown
 from strands_robots.verb_declaration import declared_verbs
 

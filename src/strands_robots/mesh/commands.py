@@ -19,7 +19,6 @@ from strands_robots.mesh.transport import Sample, TransportError
 from strands_robots.mesh.wire_identity import IdentityError
 from strands_robots.safety.identity import SigningIdentity
 from strands_robots.safety.peer_answers import with_stop_statement
-from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import Outcome, StopVerdict, explain, grade
 from strands_robots.serving.peer_verbs import PEER_VERBS
 from strands_robots.serving.pipeline import Command, Own, Pipeline, RefusalReason, Refused, Result, busy
@@ -29,6 +28,7 @@ from strands_robots.serving.stop_requests import StopRequests
 from strands_robots.serving.verbs import Arguments, Kind, Verb
 from strands_robots.serving.workers import ShareFullError
 from strands_robots.serving.world_stops import robot_stop, stop_within
+from strands_robots.stop_log import stop_logger
 from strands_robots.utils import RESERVED_IDS, ValidationError, shown
 
 logger = stop_logger(__name__)

@@ -25,13 +25,13 @@ from strands_robots.safety.persistence import LockoutStore, ResumedEpochs, Store
 from strands_robots.safety.reporting import UNPACED, OnReport, Reporter, StopRun
 from strands_robots.safety.resume import REJECTED, Admitted, ResumeVerifier
 from strands_robots.safety.sightings import sightings
-from strands_robots.safety.state_files import uptime
 from strands_robots.safety.stop_count import StopCount
 from strands_robots.safety.stop_executor import StopExecutor, stop_executor
-from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stop_targets import note_motion
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.safety.turns import undisturbed
+from strands_robots.state_files import uptime
+from strands_robots.stop_log import stop_logger
 from strands_robots.utils import ValidationError, identifier, shown
 
 logger = stop_logger(__name__)

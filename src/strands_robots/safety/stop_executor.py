@@ -26,7 +26,6 @@ from strands_robots import settings
 from strands_robots.contract import Haltable, body_of
 from strands_robots.safety.halted_verbs import HaltedVerbs, void_calls
 from strands_robots.safety.ready_threads import ReadyThreads
-from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stop_targets import (
     HaltsInParts,
     Target,
@@ -38,6 +37,7 @@ from strands_robots.safety.stop_targets import (
 )
 from strands_robots.safety.stopping import PendingVerdict, StopVerdict
 from strands_robots.safety.submitted_stops import Answered, PendingStops, SubmittedStop, TargetSlot
+from strands_robots.stop_log import stop_logger
 
 logger = stop_logger(__name__)
 

@@ -8,8 +8,8 @@ from typing import Any, Protocol, TypeGuard, cast, runtime_checkable
 
 from strands_robots.contract import Haltable, body_of
 from strands_robots.safety.gate import MotionGate
-from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import PendingVerdict, StopVerdict
+from strands_robots.stop_log import stop_logger
 
 logger = stop_logger(__name__)
 

@@ -32,7 +32,6 @@ from strands_robots.identity_map import IdentityMap
 from strands_robots.safety.authorization import ANONYMOUS, caller_name
 from strands_robots.safety.resume import configured_keys
 from strands_robots.safety.stop_executor import stop_executor
-from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.admissions import Admission, Admissions
 from strands_robots.serving.control_changes import ControlChange, Observers, OnChange
@@ -41,6 +40,7 @@ from strands_robots.serving.lease_watch import LeaseWatch
 from strands_robots.serving.take_assertion import outdated, unproven
 from strands_robots.serving.workers import BoundedCall, Share, ShareFullError
 from strands_robots.serving.world_stops import RobotStop, stop_within
+from strands_robots.stop_log import stop_logger
 
 logger = stop_logger(__name__)
 

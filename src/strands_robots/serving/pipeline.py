@@ -22,12 +22,12 @@ from strands_robots.errors import StrandsRobotsError
 from strands_robots.identity_map import IdentityMap
 from strands_robots.safety.approval import Approval, Claim, digest
 from strands_robots.safety.gate import REFUSALS, Asked, MotionGate, MotionRefused, refusal_envelope
-from strands_robots.safety.stop_log import stop_logger
 from strands_robots.serving.admissions import Admission
 from strands_robots.serving.control import ControlLeases, NotHolderError, leases_of
 from strands_robots.serving.policy_arguments import MOCK, mock_refusal
 from strands_robots.serving.verbs import LEASE_ID, LEASE_NAMES, LEASE_TTL_S, Arguments, Kind, Verb
 from strands_robots.serving.workers import Share, Shares, shares_of
+from strands_robots.stop_log import stop_logger
 from strands_robots.utils import ValidationError
 
 logger = stop_logger(__name__)
