@@ -53,6 +53,9 @@ FLOORS: list[set[str]] = [
     {"cli", "tools", "mcp", "dashboard", "evaluation", "robot"},
 ]
 
+MUTUAL_IMPORTS: set[frozenset[str]] = {frozenset({"cli", "dashboard"}), frozenset({"cli", "mcp"})}
+"""Folders that still import each other."""
+
 SIBLING_NAMES: dict[str, str] = {}
 """Public class names that stand for the same idea in sibling backends."""
 
@@ -116,6 +119,15 @@ def imports(module: str) -> frozenset[str]:
     return frozenset(found - {module})
 
 
+def siblings_of(importer: str, imported: str) -> tuple[str, str] | None:
+    """Return the files or folders beside each other that two modules belong to, or None inside one of them."""
+    ours, theirs = importer.split("."), imported.split(".")
+    for depth, (own, other) in enumerate(zip(ours, theirs, strict=False), 1):
+        if own != other:
+            return ".".join(ours[:depth]), ".".join(theirs[:depth])
+    return None
+
+
 def circle_through(start: str) -> list[str] | None:
     """Return the shortest way along imports from a module back to itself, or None."""
     ways = [[start]]
@@ -169,6 +181,13 @@ def test_no_two_modules_import_each_other_directly_or_through_others() -> None:
         if circle:
             found[frozenset(circle)] = " -> ".join(circle)
     assert not found, "\n".join(sorted(found.values()))
+
+
+def test_no_two_files_or_folders_beside_each_other_import_each_other() -> None:
+    ways = {siblings_of(module, imported) for module in filter(None, MODULES) for imported in imports(module)}
+    pairs = [way for way in ways if way is not None]
+    assert ("serving", "safety") in pairs
+    assert {frozenset(way) for way in pairs if way[::-1] in pairs} == MUTUAL_IMPORTS
 
 
 def test_device_connect_and_the_mesh_never_import_one_another() -> None:

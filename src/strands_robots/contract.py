@@ -21,6 +21,9 @@ from strands_robots.identity_map import IdentityMap
 from strands_robots.safety.gate import MotionGate, MotionRefused
 from strands_robots.safety.halted_verbs import halted_with_verbs
 from strands_robots.safety.kept_gates import gate_of
+from strands_robots.safety.stop_targets import Haltable as Haltable  # noqa: PLC0414 - part of the contract
+from strands_robots.safety.stop_targets import RobotWrapper
+from strands_robots.safety.stop_targets import body_of as body_of  # noqa: PLC0414 - part of the contract
 from strands_robots.safety.stopping import (
     PendingVerdict,
     StopVerdict,
@@ -86,14 +89,6 @@ Unsubscribe = Callable[[], None]
 
 VERB = "verb"
 """The ``policy`` of a verb of a robot's own, in its events; its ``instruction`` is the verb's name."""
-
-
-@runtime_checkable
-class Haltable(Protocol):
-    """A robot with the one verb that halts every motion source and returns a verdict."""
-
-    def halt(self, reason: str = "") -> StopVerdict:
-        """Stop everything that moves this robot; returns within the halt deadline."""
 
 
 @runtime_checkable
@@ -234,11 +229,6 @@ def adapt(robot: Any, joints: JointReader | None = None) -> TaskRobot:
     return AdaptedRobot(robot, joints)
 
 
-def body_of(robot: Any) -> Any:
-    """Return the robot that :func:`adapt` wrapped, else ``robot`` itself."""
-    return robot.wrapped if isinstance(robot, AdaptedRobot) else robot
-
-
 def observe(robot: Robot, observer: Observer) -> Unsubscribe:
     """Call ``observer`` with the events of rollouts and of the robot's own verbs."""
 
@@ -314,7 +304,7 @@ def stops_motions(robot: object) -> bool:
     return any(callable(getattr(robot, name, None)) for name in ("halt", "stop_task"))
 
 
-class AdaptedRobot:
+class AdaptedRobot(RobotWrapper):
     """Foreign robot behind the contract; its own optional verbs are used."""
 
     def __init__(self, robot: Any, joints: JointReader | None = None) -> None:

@@ -23,12 +23,13 @@ from concurrent.futures import Future
 from typing import cast
 
 from strands_robots import settings
-from strands_robots.contract import Haltable, body_of
 from strands_robots.safety.halted_verbs import HaltedVerbs, void_calls
 from strands_robots.safety.ready_threads import ReadyThreads
 from strands_robots.safety.stop_targets import (
+    Haltable,
     HaltsInParts,
     Target,
+    body_of,
     has_parts,
     is_direct,
     note_motion,
