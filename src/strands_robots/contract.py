@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
 from strands_robots import settings
 from strands_robots.envelope import Envelope, error, success
@@ -37,6 +37,9 @@ from strands_robots.safety.verbs_under_way import VerbCall
 from strands_robots.stop_log import stop_logger
 from strands_robots.utils import ValidationError, shown
 from strands_robots.verb_declaration import declared_verbs
+
+if TYPE_CHECKING:
+    from typing_extensions import TypeIs
 
 logger = stop_logger(__name__)
 
@@ -124,7 +127,7 @@ class TaskRobot(Haltable, Protocol):
 
 @runtime_checkable
 class WorldRobot(Haltable, Protocol):
-    """A simulated world that holds several robots, each with its own rollout."""
+    """A simulated world: a collection of robots, each with its own rollout."""
 
     tool_name_str: str
     gate: MotionGate
@@ -227,6 +230,46 @@ def adapt(robot: Any, joints: JointReader | None = None) -> TaskRobot:
             f"{', '.join(missing)}. Expected: {shapes}."
         )
     return AdaptedRobot(robot, joints)
+
+
+def behind_contract(robot: Any, joints: JointReader | None = None) -> Robot:
+    """Return a world as it is, and any other robot as :func:`adapt` makes it fit.
+
+    Raises:
+        ValidationError: as :func:`adapt`.
+    """
+    return robot if holds_robots(robot) else adapt(robot, joints)
+
+
+_worlds: IdentityMap[bool] = IdentityMap()
+
+
+def holds_robots(robot: object) -> TypeIs[WorldRobot]:
+    """Return True for a world, which holds robots or may be given some."""
+    if not callable(getattr(robot, "list_robots", None)):
+        return False
+    # Asked for every heartbeat and command; to check the whole contract takes 20 us.
+    return _worlds.get(robot) or (isinstance(robot, WorldRobot) and _worlds.of(robot, lambda: True))
+
+
+def robots_in(robot: object) -> list[str]:
+    """Return the names of the robots of a world now; none for any other robot."""
+    return robot.list_robots() if holds_robots(robot) else []
+
+
+def task_runs(robot: Robot, name: str = "") -> bool | None:
+    """Return whether a task moves the robot, or the named robot of a world.
+
+    None where its status is unknown.
+    """
+    if holds_robots(robot):
+        return any(row.get("robot") == name for row in robot.list_policies_running())
+    # A robot whose motions are gestures has no task.
+    status = getattr(robot, "get_task_status", None)
+    if not callable(status):
+        return False
+    state = str(status().get("task_status", "")).lower()
+    return state in RUNNING if state in RUNNING | AT_REST else None
 
 
 def observe(robot: Robot, observer: Observer) -> Unsubscribe:

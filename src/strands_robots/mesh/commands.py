@@ -8,7 +8,7 @@ from functools import partial
 from types import MappingProxyType
 from typing import Any
 
-from strands_robots.contract import Haltable, Robot, WorldRobot
+from strands_robots.contract import Haltable, Robot, holds_robots
 from strands_robots.envelope import is_error
 from strands_robots.mesh import topics, wire
 from strands_robots.mesh.console_keys import MOTION
@@ -132,9 +132,7 @@ def stop_target(robot: Robot | None, name: str = "") -> Haltable | None:
     Raises:
         ValidationError: the world has no robot of this name.
     """
-    if robot is None or not name or not isinstance(robot, WorldRobot):
-        return robot
-    return robot_stop(robot, name)
+    return robot_stop(robot, name) if name and holds_robots(robot) else robot
 
 
 def execute_on(robot: Robot, context: Context, closed: Callable[[], bool] = lambda: False) -> Own:

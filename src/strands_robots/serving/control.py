@@ -25,7 +25,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Protocol, cast
 
-from strands_robots.contract import AT_REST, RUNNING, Robot, WorldRobot, body_of
+from strands_robots.contract import Robot, WorldRobot, body_of, holds_robots, robots_in, task_runs
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.identity_map import IdentityMap
@@ -527,12 +527,9 @@ class ControlLeases:
     def of(self, name: str = "") -> ControlLease:
         """Return the lease of the robot, or of the named robot of the world."""
         robot = self._robot()
-        if not isinstance(robot, WorldRobot):
-            name = ""
-        else:
-            # Kept: an expiry asks the world for nothing.
-            self._first_robot = next(iter(robot.list_robots()), "")
-            name = name or self._first_robot
+        # Kept: an expiry asks the world for nothing.
+        self._first_robot = next(iter(robots_in(robot)), "")
+        name = (name or self._first_robot) if holds_robots(robot) else ""
         with self._changing:
             lease = self._by_name.get(name)
             if lease is None:
@@ -565,9 +562,8 @@ class ControlLeases:
     def facts(self) -> dict[str, Any]:
         """Return the holder of the robot; by name for the robots of a world."""
         robot = self._robot()
-        if not isinstance(robot, WorldRobot) or len(robot.list_robots()) < 2:
-            return self.of().facts()
-        return {name: self.of(name).facts() for name in robot.list_robots()}
+        names = robots_in(robot)
+        return {name: self.of(name).facts() for name in names} if len(names) > 1 else self.of().facts()
 
     def _robot(self) -> Robot | None:
         return next((robot for each in self._served if (robot := each()) is not None), None)
@@ -591,14 +587,7 @@ class ControlLeases:
         if any(each.leading() for each in self._streams_of(name)):
             return True
         robot = self._robot()
-        if isinstance(robot, WorldRobot):
-            return any(row.get("robot") == name for row in robot.list_policies_running())
-        # A robot whose motions are gestures has no task; its motion ends the lease with the call that began it.
-        status = getattr(robot, "get_task_status", None)
-        if not callable(status):
-            return False
-        state = str(status().get("task_status", "")).lower()
-        return state in RUNNING if state in RUNNING | AT_REST else None
+        return False if robot is None else task_runs(robot, name)
 
     def _halt(self, name: str, shown_as: str, reason: str) -> Future[StopVerdict] | None:
         """Order the halt of the robot, or of the named robot of the world."""

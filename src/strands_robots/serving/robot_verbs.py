@@ -12,7 +12,17 @@ from dataclasses import replace
 from typing import Any
 
 from strands_robots.bus_access import read_joints
-from strands_robots.contract import RUNNING, SETTLE, Robot, RolloutEvent, TaskRobot, WorldRobot, adapt, body_of
+from strands_robots.contract import (
+    SETTLE,
+    Robot,
+    RolloutEvent,
+    WorldRobot,
+    behind_contract,
+    body_of,
+    holds_robots,
+    robots_in,
+    task_runs,
+)
 from strands_robots.envelope import Envelope, error, is_error, success
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS, WORLD_MOTION_VERBS, for_robot
@@ -55,7 +65,7 @@ def served(robot: Any) -> Robot:
     Raises:
         ValidationError: it is neither a world nor a robot that :func:`~strands_robots.contract.adapt` makes fit.
     """
-    return robot if isinstance(robot, WorldRobot) else adapt(robot, read_joints)
+    return behind_contract(robot, read_joints)
 
 
 def served_world(robot: Any) -> WorldRobot:
@@ -64,7 +74,7 @@ def served_world(robot: Any) -> WorldRobot:
     Raises:
         ValidationError: naming the members that it lacks.
     """
-    if isinstance(robot, WorldRobot):
+    if holds_robots(robot):
         return robot
     lacking = [name for name in WORLD_MEMBERS if not hasattr(robot, name)]
     needs = ", ".join(WORLD_MEMBERS)
@@ -125,19 +135,19 @@ def _execute(world: WorldRobot, arguments: Arguments) -> Envelope:
 
 def step_world(robot: Robot, arguments: Arguments) -> Envelope:
     """Advance the physics of a world; refused by any other robot."""
-    if not isinstance(robot, WorldRobot):
+    if not holds_robots(robot):
         return error("step: this robot is no simulation.")
     return robot.step(arguments.get("n_steps", arguments.get("steps", 1)))
 
 
 def reset_world(robot: Robot, arguments: Arguments) -> Envelope:
     """Restore the initial state of a world; refused by any other robot."""
-    return robot.reset() if isinstance(robot, WorldRobot) else error("reset: this robot is no simulation.")
+    return robot.reset() if holds_robots(robot) else error("reset: this robot is no simulation.")
 
 
 def status(robot: Robot, arguments: Arguments) -> Envelope:
     """Return the task of a robot, or the policies that run in a world."""
-    if not isinstance(robot, WorldRobot):
+    if not holds_robots(robot):
         return robot.get_task_status()
     running = robot.list_policies_running()
     return success(
@@ -160,7 +170,7 @@ def start(robot: Robot, arguments: Arguments) -> Envelope:
     if options.get("policy_host") == "localhost":
         del options["policy_host"]
     instruction = options.pop("instruction", "")
-    if isinstance(robot, WorldRobot):
+    if holds_robots(robot):
         return robot.start_policy(robot_of(robot, arguments.get("robot_name")), instruction, **options)
     unknown = sorted(set(options) - _accepted(robot.start_task, options))
     if unknown:
@@ -170,9 +180,7 @@ def start(robot: Robot, arguments: Arguments) -> Envelope:
 
 def run_to_end(robot: Robot, arguments: Arguments, closing: Callable[[], bool]) -> Envelope:
     """Start a policy and wait for its end or for ``closing``."""
-    name = None
-    if isinstance(robot, WorldRobot):
-        name = arguments.get("robot_name") or (robot.list_robots() or [""])[0]
+    name = (arguments.get("robot_name") or next(iter(robots_in(robot)), "")) if holds_robots(robot) else None
     ends: list[RolloutEvent] = []
 
     def observe(event: RolloutEvent) -> None:
@@ -198,7 +206,7 @@ def _awaited_end(  # noqa: PLR0917 - one call, for the length of run_to_end
     deadline: float,
     closing: Callable[[], bool],
 ) -> Envelope:
-    while not ends and _moving(robot, name):
+    while not ends and task_runs(robot, name or ""):
         if closing():
             return error("execute: this peer left the mesh while the policy ran.", started=started)
         if time.monotonic() >= deadline:
@@ -206,21 +214,15 @@ def _awaited_end(  # noqa: PLR0917 - one call, for the length of run_to_end
         time.sleep(POLL_S)
     # A rollout that runs no more has told its end, or is about to.
     last = time.monotonic() + END_EVENT_S
-    while not ends and not isinstance(robot, TaskRobot) and time.monotonic() < last:
+    while not ends and holds_robots(robot) and time.monotonic() < last:
         time.sleep(POLL_S)
     if not ends:
-        return robot.get_task_status() if isinstance(robot, TaskRobot) else {**started, "state": "unknown"}
+        return {**started, "state": "unknown"} if holds_robots(robot) else robot.get_task_status()
     end = ends[-1]
     facts = {"state": end.state, "task_status": end.state, "step_count": end.step, "elapsed_s": end.elapsed_s}
     if end.state == "error":
         return error(f"execute: {end.error or 'the policy failed'}", robot=end.robot, **facts)
     return success(f"{end.robot} {end.state} after {end.step} steps.", robot=end.robot, **facts)
-
-
-def _moving(robot: Robot, name: str | None) -> bool:
-    if isinstance(robot, WorldRobot):
-        return any(row.get("robot") == name for row in robot.list_policies_running())
-    return str(robot.get_task_status().get("task_status", "")).lower() in RUNNING
 
 
 def _accepted(method: Callable[..., Any], options: dict[str, Any]) -> set[str]:
@@ -247,7 +249,7 @@ def releases_torque(robot: Any) -> bool:
 
 def takes_tasks(robot: Any) -> bool:
     """Return True for a robot that follows policies, and a world with one in it."""
-    if _holds_robots(robot):
+    if holds_robots(robot):
         return bool(robot.list_robots())
     body = body_of(robot)
     return callable(getattr(body, "start_task", None)) and getattr(body, "takes_tasks", True) is not False
@@ -255,12 +257,7 @@ def takes_tasks(robot: Any) -> bool:
 
 def is_world(robot: Any) -> bool:
     """Return True for a world, whose physics can be stepped and reset."""
-    return _holds_robots(robot) and getattr(robot, "whole", True) is not False
-
-
-def _holds_robots(robot: Any) -> bool:
-    # Asked for every heartbeat; to check the whole contract takes 20 us.
-    return callable(getattr(robot, "list_robots", None))
+    return holds_robots(robot) and getattr(robot, "whole", True) is not False
 
 
 GET_FEATURES = Verb(
