@@ -53,6 +53,9 @@ FLOORS: list[set[str]] = [
     {"cli", "tools", "mcp", "dashboard", "evaluation", "robot"},
 ]
 
+ASKS_KINDS = {"contract", "serving.control"}
+"""Modules that ask of which kind a robot is; serving.control does in ControlLeases.admit alone."""
+
 SIBLING_NAMES: dict[str, str] = {}
 """Public class names that stand for the same idea in sibling backends."""
 
@@ -185,6 +188,16 @@ def test_no_two_files_or_folders_beside_each_other_import_each_other() -> None:
     pairs = [way for way in ways if way is not None]
     assert ("serving", "safety") in pairs
     assert not [way for way in pairs if way[::-1] in pairs]
+
+
+def test_only_the_contract_asks_of_which_kind_a_robot_is() -> None:
+    asking = set()
+    for module, path in MODULES.items():
+        for node in ast.walk(tree_of(path)):
+            if isinstance(node, ast.Call) and ast.unparse(node.func) in ("isinstance", "issubclass"):
+                kinds = {each.id for each in ast.walk(node.args[1]) if isinstance(each, ast.Name)}
+                asking |= {module} if kinds & {"TaskRobot", "WorldRobot", "AdaptedRobot"} else set()
+    assert asking == ASKS_KINDS
 
 
 def test_device_connect_and_the_mesh_never_import_one_another() -> None:
