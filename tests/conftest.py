@@ -16,7 +16,7 @@ from fixtures.waiting import eventually
 from strands_robots import audit, settings
 from strands_robots.audit import flush_audit
 from strands_robots.policies import settling
-from strands_robots.safety.stop_log import flush_stop_log
+from strands_robots.stop_log import flush_stop_log
 
 # What is set in the shell that starts the tests would change what they say; how pictures are made stays as it is.
 for setting in settings.declared():

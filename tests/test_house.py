@@ -29,6 +29,8 @@ FLOORS: list[set[str]] = [
         "utils",
         "bounded_json",
         "identity_map",
+        "state_files",
+        "stop_log",
         "agent_tool",
         "_mesh_switch",
         "zenoh_sockets",
@@ -50,6 +52,9 @@ FLOORS: list[set[str]] = [
     {"fleet"},
     {"cli", "tools", "mcp", "dashboard", "evaluation", "robot"},
 ]
+
+ASKS_KINDS = {"contract"}
+"""The module that asks of which kind a robot is."""
 
 SIBLING_NAMES: dict[str, str] = {}
 """Public class names that stand for the same idea in sibling backends."""
@@ -114,6 +119,15 @@ def imports(module: str) -> frozenset[str]:
     return frozenset(found - {module})
 
 
+def siblings_of(importer: str, imported: str) -> tuple[str, str] | None:
+    """Return the files or folders beside each other that two modules belong to, or None inside one of them."""
+    ours, theirs = importer.split("."), imported.split(".")
+    for depth, (own, other) in enumerate(zip(ours, theirs, strict=False), 1):
+        if own != other:
+            return ".".join(ours[:depth]), ".".join(theirs[:depth])
+    return None
+
+
 def circle_through(start: str) -> list[str] | None:
     """Return the shortest way along imports from a module back to itself, or None."""
     ways = [[start]]
@@ -167,6 +181,23 @@ def test_no_two_modules_import_each_other_directly_or_through_others() -> None:
         if circle:
             found[frozenset(circle)] = " -> ".join(circle)
     assert not found, "\n".join(sorted(found.values()))
+
+
+def test_no_two_files_or_folders_beside_each_other_import_each_other() -> None:
+    ways = {siblings_of(module, imported) for module in filter(None, MODULES) for imported in imports(module)}
+    pairs = [way for way in ways if way is not None]
+    assert ("serving", "safety") in pairs
+    assert not [way for way in pairs if way[::-1] in pairs]
+
+
+def test_only_the_contract_asks_of_which_kind_a_robot_is() -> None:
+    asking = set()
+    for module, path in MODULES.items():
+        for node in ast.walk(tree_of(path)):
+            if isinstance(node, ast.Call) and ast.unparse(node.func) in ("isinstance", "issubclass"):
+                kinds = {each.id for each in ast.walk(node.args[1]) if isinstance(each, ast.Name)}
+                asking |= {module} if kinds & {"TaskRobot", "WorldRobot", "AdaptedRobot"} else set()
+    assert asking == ASKS_KINDS
 
 
 def test_device_connect_and_the_mesh_never_import_one_another() -> None:

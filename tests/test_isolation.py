@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from strands_robots import settings
-from strands_robots.safety.approval import state_dir
+from strands_robots.state_files import state_dir
 
 USERS = Path("~/.strands_robots").expanduser()
 

@@ -21,7 +21,7 @@ from strands_robots.policies.base import Action
 from strands_robots.policies.rollout import Body, Rollout
 from strands_robots.recording.cameras import frames_of
 from strands_robots.safety.gate import MotionRequest, Permit, answered
-from strands_robots.safety.stop_log import stop_logger
+from strands_robots.stop_log import stop_logger
 from strands_robots.utils import WAIT_S as WAIT_S  # noqa: PLC0414 - part of what callers of the motions import
 from strands_robots.utils import ValidationError, choice, identifier, missing_extra, number, shown
 

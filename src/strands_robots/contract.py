@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from types import CodeType
-from typing import Any, Literal, ParamSpec, Protocol, TypeVar, runtime_checkable
+from typing import TYPE_CHECKING, Any, Literal, ParamSpec, Protocol, TypeVar, runtime_checkable
 
 from strands_robots import settings
 from strands_robots.envelope import Envelope, error, success
@@ -23,7 +23,9 @@ from strands_robots.identity_map import IdentityMap
 from strands_robots.safety.gate import MotionGate, MotionRefused, MotionRequest
 from strands_robots.safety.halted_verbs import halted_with_verbs
 from strands_robots.safety.kept_gates import gate_of
-from strands_robots.safety.stop_log import stop_logger
+from strands_robots.safety.stop_targets import Haltable as Haltable  # noqa: PLC0414 - part of the contract
+from strands_robots.safety.stop_targets import RobotWrapper
+from strands_robots.safety.stop_targets import body_of as body_of  # noqa: PLC0414 - part of the contract
 from strands_robots.safety.stopping import (
     PendingVerdict,
     StopVerdict,
@@ -34,8 +36,12 @@ from strands_robots.safety.stopping import (
     read_verdict,
 )
 from strands_robots.safety.verbs_under_way import VerbCall
+from strands_robots.stop_log import stop_logger
 from strands_robots.utils import ValidationError, shown
 from strands_robots.verb_declaration import declared_verbs
+
+if TYPE_CHECKING:
+    from typing_extensions import TypeIs
 
 logger = stop_logger(__name__)
 
@@ -94,14 +100,6 @@ VERB = "verb"
 
 
 @runtime_checkable
-class Haltable(Protocol):
-    """A robot with the one verb that halts every motion source and returns a verdict."""
-
-    def halt(self, reason: str = "") -> StopVerdict:
-        """Stop everything that moves this robot; returns within the halt deadline."""
-
-
-@runtime_checkable
 class TaskRobot(Haltable, Protocol):
     """A robot with one body: real hardware, or anything that :func:`adapt` made fit."""
 
@@ -134,7 +132,7 @@ class TaskRobot(Haltable, Protocol):
 
 @runtime_checkable
 class WorldRobot(Haltable, Protocol):
-    """A simulated world that holds several robots, each with its own rollout."""
+    """A simulated world: a collection of robots, each with its own rollout."""
 
     tool_name_str: str
     gate: MotionGate
@@ -239,9 +237,44 @@ def adapt(robot: Any, joints: JointReader | None = None) -> TaskRobot:
     return AdaptedRobot(robot, joints)
 
 
-def body_of(robot: Any) -> Any:
-    """Return the robot that :func:`adapt` wrapped, else ``robot`` itself."""
-    return robot.wrapped if isinstance(robot, AdaptedRobot) else robot
+def behind_contract(robot: Any, joints: JointReader | None = None) -> Robot:
+    """Return a world as it is, and any other robot as :func:`adapt` makes it fit.
+
+    Raises:
+        ValidationError: as :func:`adapt`.
+    """
+    return robot if holds_robots(robot) else adapt(robot, joints)
+
+
+_worlds: IdentityMap[bool] = IdentityMap()
+
+
+def holds_robots(robot: object) -> TypeIs[WorldRobot]:
+    """Return True for a world, which holds robots or may be given some."""
+    if not callable(getattr(robot, "list_robots", None)):
+        return False
+    # Asked for every heartbeat and command; to check the whole contract takes 20 us.
+    return _worlds.get(robot) or (isinstance(robot, WorldRobot) and _worlds.of(robot, lambda: True))
+
+
+def robots_in(robot: object) -> list[str]:
+    """Return the names of the robots of a world now; none for any other robot."""
+    return robot.list_robots() if holds_robots(robot) else []
+
+
+def task_runs(robot: Robot, name: str = "") -> bool | None:
+    """Return whether a task moves the robot, or the named robot of a world.
+
+    None where its status is unknown.
+    """
+    if holds_robots(robot):
+        return any(row.get("robot") == name for row in robot.list_policies_running())
+    # A robot whose motions are gestures has no task.
+    status = getattr(robot, "get_task_status", None)
+    if not callable(status):
+        return False
+    state = str(status().get("task_status", "")).lower()
+    return state in RUNNING if state in RUNNING | AT_REST else None
 
 
 def for_request(request: MotionRequest | None, method: Callable[P, T]) -> Callable[P, T]:
@@ -347,7 +380,7 @@ def stops_motions(robot: object) -> bool:
     return any(callable(getattr(robot, name, None)) for name in ("halt", "stop_task"))
 
 
-class AdaptedRobot:
+class AdaptedRobot(RobotWrapper):
     """Foreign robot behind the contract; its own optional verbs are used."""
 
     def __init__(self, robot: Any, joints: JointReader | None = None) -> None:

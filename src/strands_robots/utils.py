@@ -1,4 +1,4 @@
-"""Value domains, identifiers, texts of others and quaternions.
+"""Value domains, identifiers, texts of others, canonical JSON and quaternions.
 
 Every check returns the value, typed, or raises :class:`ValidationError` with the argument, the value and the domain
 in its message. The edges (RPC handlers, constructors, wire decoders) call a check once; the code inside trusts its
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import getpass
 import ipaddress
+import json
 import math
 import os
 import re
@@ -155,6 +156,15 @@ def near(wanted: str, names: Iterable[str]) -> str:
         return f" Near it: {', '.join(resembling)}."
     more = f" and {len(known) - NAMED_MAX} more" if len(known) > NAMED_MAX else ""
     return f" There {'is' if len(known) == 1 else 'are'}: {', '.join(known[:NAMED_MAX])}{more}." if known else ""
+
+
+def canonical_json(fields: Mapping[str, Any]) -> bytes:
+    """Return the bytes that are signed: JSON with sorted keys and without blanks.
+
+    Raises:
+        ValueError: a number that JSON cannot carry.
+    """
+    return json.dumps(fields, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
 
 
 def field_values(instance: Any) -> dict[str, Any]:

@@ -16,7 +16,8 @@ from strands_robots.drivers.ros.ros_bridge import RosBridgedRobot
 from strands_robots.mesh.core import Mesh
 from strands_robots.ros.link import Goal
 from strands_robots.ros.memory import MemoryLink
-from strands_robots.safety.approval import Grants, state_dir
+from strands_robots.safety.approval import Grants
+from strands_robots.state_files import state_dir
 
 NAV = "/navigate_to_pose"
 STANDING = {"twist": {"twist": {"linear": {"x": 0.0}, "angular": {"z": 0.0}}}}

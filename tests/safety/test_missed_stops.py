@@ -37,7 +37,7 @@ from strands_robots.safety.network_key import DEVICE_CONNECT, NetworkKey
 from strands_robots.safety.orders import StopRules, new_epoch, params_of
 from strands_robots.safety.originals import ORIGINAL_MAX_BYTES, STOPS_MAX, Original, Originals
 from strands_robots.safety.persistence import LockoutStore, ResumedEpochs
-from strands_robots.safety.state_files import uptime
+from strands_robots.state_files import uptime
 
 Join = Callable[..., BusMachine]
 

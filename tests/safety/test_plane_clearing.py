@@ -22,7 +22,7 @@ from strands_robots.safety.orders import StopOrder, new_epoch
 from strands_robots.safety.persistence import LockoutStore
 from strands_robots.safety.plane import SafetyPlane
 from strands_robots.safety.resume import sign
-from strands_robots.safety.state_files import boot, uptime
+from strands_robots.state_files import boot, uptime
 
 Add = Callable[..., RecordingRobot]
 

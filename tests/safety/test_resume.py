@@ -22,7 +22,7 @@ from strands_robots.safety.resume import (
     configured_keys,
     sign,
 )
-from strands_robots.utils import ValidationError
+from strands_robots.utils import ValidationError, canonical_json
 
 EPOCH = "a" * 32
 OTHER = "b" * 32
@@ -58,7 +58,7 @@ def verifier(key: Any, clock: Clock, *names: str) -> ResumeVerifier:
 
 def resigned(key: Any, assertion: dict[str, Any], **changes: Any) -> dict[str, Any]:
     body = {k: v for k, v in {**assertion, **changes}.items() if k != "sig"}
-    return {**body, "sig": ed25519.encode(key.sign(ed25519.canonical(body)))}
+    return {**body, "sig": ed25519.encode(key.sign(canonical_json(body)))}
 
 
 def one(key: Any, clock: Clock, *targets: str) -> dict[str, Any]:

@@ -26,7 +26,7 @@ from strands_robots.safety.lockout import (
 from strands_robots.safety.orders import MISSED, StopOrder, new_epoch
 from strands_robots.safety.persistence import LockoutStore, ResumedEpochs, StoredLockout
 from strands_robots.safety.plane import SafetyPlane
-from strands_robots.safety.state_files import uptime
+from strands_robots.state_files import uptime
 
 Add = Callable[..., RecordingRobot]
 

@@ -14,7 +14,7 @@ from strands_robots.safety.network_key import DEVICE_CONNECT, MESH, NetworkKey
 from strands_robots.safety.roster import Known, Roster, RosterRow, bounded
 from strands_robots.safety.sighting_file import Note
 from strands_robots.safety.sightings import Sightings, this_moment
-from strands_robots.safety.state_files import uptime
+from strands_robots.state_files import uptime
 
 HERE = NetworkKey.of(DEVICE_CONNECT, ["nats://broker:4222"])
 THERE = NetworkKey.of(DEVICE_CONNECT, ["nats://elsewhere:4222"])

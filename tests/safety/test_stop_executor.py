@@ -427,3 +427,17 @@ def test_robot_that_cannot_note_its_motion_is_halted_all_the_same(executor: Stop
             return StopVerdict(("confused",))
 
     assert executor.halt(Confused(), "confused", "test", within=20).stopped
+
+
+def test_the_first_that_a_stop_asks_of_a_robot_is_its_halt(executor: StopExecutor) -> None:
+    asked: list[str] = []
+
+    class Watched(Wedged):
+        def __getattribute__(self, name: str) -> Any:
+            asked.append(name)
+            return super().__getattribute__(name)
+
+    robot = Watched(times=0)
+    asked.clear()
+    assert executor.halt(robot, "watched", "fire").stopped is True
+    assert asked[0] == "halt"

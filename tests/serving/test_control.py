@@ -20,6 +20,7 @@ from strands_robots.serving.leave import Command, RefusalReason
 from strands_robots.serving.pipeline import Pipeline, Result
 from strands_robots.serving.robot_verbs import ARM_VERBS, WORLD_VERBS
 from strands_robots.serving.take_assertion import PURPOSE, VERSION, sign_take
+from strands_robots.utils import canonical_json
 
 KEY = Ed25519PrivateKey.generate()
 SECRET = "a secret of agent-a"
@@ -75,7 +76,7 @@ class Bench:
     def take(self, who: str = "ann", **changed: Any) -> dict[str, Any]:
         """Take control with an assertion in which some fields were changed before it was signed."""
         body = {name: v for name, v in self.assertion().items() if name != "sig"} | changed
-        signed = {**body, "sig": ed25519.encode(KEY.sign(ed25519.canonical(body)))}
+        signed = {**body, "sig": ed25519.encode(KEY.sign(canonical_json(body)))}
         return self.lease.take(who, "because", "arm-1", signed)
 
     def assertion(self) -> dict[str, Any]:

@@ -27,8 +27,8 @@ from strands_robots.audit.head import Anchor, log_id
 from strands_robots.audit.journal import NAME, AuditEntry, Journal, storable
 from strands_robots.audit.lasting import LastingRecords, identity, lasting_journal, rotated_out, verify_both
 from strands_robots.audit.witness import WITNESS, compare, stated_head, witnessed
-from strands_robots.safety.approval import state_dir
-from strands_robots.safety.stop_log import stop_logger
+from strands_robots.state_files import state_dir
+from strands_robots.stop_log import stop_logger
 from strands_robots.utils import shown
 
 logger = stop_logger(__name__)

@@ -19,9 +19,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from strands_robots.safety.ed25519 import canonical
-from strands_robots.safety.state_files import make_private
-from strands_robots.utils import field_values
+from strands_robots.state_files import make_private
+from strands_robots.utils import canonical_json, field_values
 
 GENESIS = "0" * 64
 BREAKS_KEPT = 20
@@ -58,7 +57,9 @@ class Seal:
         """Return the fields of a file, or None unless :meth:`sign` made its bytes."""
         try:
             fields = json.loads(data)
-            if not isinstance(fields, dict) or canonical(fields) != data or (self.keyed and not self.valid(fields)):
+            if not isinstance(fields, dict) or canonical_json(fields) != data:
+                return None
+            if self.keyed and not self.valid(fields):
                 return None
         except (ValueError, TypeError, RecursionError):
             return None
@@ -66,7 +67,7 @@ class Seal:
         return fields
 
     def _signature(self, fields: Mapping[str, Any]) -> str:
-        return hmac.new(self._key or b"", canonical(fields), hashlib.sha256).hexdigest()
+        return hmac.new(self._key or b"", canonical_json(fields), hashlib.sha256).hexdigest()
 
 
 @dataclass(slots=True)
@@ -154,7 +155,7 @@ def write_head(path: Path, seal: Seal, head: Head, *, durable: bool) -> None:
     """Replace the head in ``path``; with ``durable``, return when it is on the disk."""
     draft = path.with_suffix(".draft")
     with opened(draft, os.O_WRONLY | os.O_CREAT | os.O_TRUNC) as descriptor:
-        write_all(descriptor, canonical(seal.sign(field_values(head))))
+        write_all(descriptor, canonical_json(seal.sign(field_values(head))))
         if durable:
             os.fsync(descriptor)
     draft.replace(path)
@@ -175,7 +176,7 @@ def read_anchor(path: Path, seal: Seal, log: str) -> Anchor | None:
 def write_anchor(path: Path, seal: Seal, anchor: Anchor) -> None:
     """Write the anchor in place, within one sector, and wait for the disk."""
     make_private(path.parent)
-    data = canonical(seal.sign(field_values(anchor)))
+    data = canonical_json(seal.sign(field_values(anchor)))
     with opened(path, os.O_WRONLY | os.O_CREAT) as descriptor:
         fresh = os.fstat(descriptor).st_size == 0
         write_all(descriptor, data)

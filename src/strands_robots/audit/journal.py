@@ -37,9 +37,8 @@ from strands_robots.audit.head import (
     write_anchor,
     write_head,
 )
-from strands_robots.safety.ed25519 import canonical
-from strands_robots.safety.stop_log import stop_logger
-from strands_robots.utils import shown
+from strands_robots.stop_log import stop_logger
+from strands_robots.utils import canonical_json, shown
 
 logger = stop_logger(__name__)
 
@@ -231,7 +230,7 @@ class Journal:
                 "prev": head.last,
             }
         )
-        line = canonical(record)
+        line = canonical_json(record)
         head.advance(line, record)
         return line + b"\n"
 
@@ -446,7 +445,7 @@ def parse(line: bytes) -> dict[str, Any] | None:
 def storable(payload: Any) -> Any:
     """Return ``payload`` as JSON can hold it, else a record that says so."""
     try:
-        text = canonical({"payload": payload})
+        text = canonical_json({"payload": payload})
         if len(text) <= PAYLOAD_MAX_BYTES:
             return payload
         reason = f"{len(text)} bytes, more than {PAYLOAD_MAX_BYTES}"

@@ -14,8 +14,8 @@ from typing import Any
 
 from strands_robots.audit.journal import AUDIT_PEER, BROKEN, NAME, AuditEntry, Journal
 from strands_robots.audit.verification import verify
-from strands_robots.safety.state_files import make_private
-from strands_robots.safety.stop_log import stop_logger
+from strands_robots.state_files import make_private
+from strands_robots.stop_log import stop_logger
 
 logger = stop_logger(__name__)
 

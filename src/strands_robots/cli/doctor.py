@@ -23,9 +23,9 @@ from strands_robots.cli.output import CliError, Screen, label, table
 from strands_robots.cli.owners import IMPORT_PACKAGE, other_owners, owner_remedy
 from strands_robots.cli.readiness import LOOPBACK, dial_problem, listen_problem, port_holder
 from strands_robots.fleet.link_flags import described
-from strands_robots.safety.approval import state_dir
 from strands_robots.safety.identity import robots_here
 from strands_robots.safety.orders import ALLOW, REQUIRE_SIGNED, StopRules
+from strands_robots.state_files import state_dir
 from strands_robots.utils import DISTRIBUTION, MissingExtraError, ValidationError, install_line, redacted
 
 if TYPE_CHECKING:

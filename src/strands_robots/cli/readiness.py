@@ -16,7 +16,7 @@ from tempfile import TemporaryFile
 from typing import TYPE_CHECKING
 
 from strands_robots import settings
-from strands_robots.safety.approval import state_dir
+from strands_robots.state_files import state_dir
 from strands_robots.utils import redacted
 
 if TYPE_CHECKING:

@@ -14,11 +14,12 @@ from strands_robots.cli.network import Network
 from strands_robots.cli.output import CliError, Exit, Screen, label, plain, table
 from strands_robots.cli.readiness import state_problem
 from strands_robots.fleet.lockout_report import LockoutReport
-from strands_robots.safety.approval import GRANT_S, Grants, state_dir
+from strands_robots.safety.approval import GRANT_S, Grants
 from strands_robots.safety.clearance import clear_here
 from strands_robots.safety.lockout import Lockout, utc
 from strands_robots.safety.persistence import LockoutStore, StoredLockout
 from strands_robots.safety.unheard import Unheard, unheard_now, unheard_since
+from strands_robots.state_files import state_dir
 from strands_robots.utils import device_id, number, operator
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from strands_robots.dashboard.access import OPERATOR, ROLES, VIEWER, Access, loopback_origins, new_token
 from strands_robots.mesh.keys import CA_CERT, CA_KEY, init, issue
-from strands_robots.safety.approval import state_dir
+from strands_robots.state_files import state_dir
 from strands_robots.utils import ValidationError, missing_extra, shown
 
 FOLDER = "dashboard-keys"

@@ -42,7 +42,6 @@ from strands_robots.safety.gate import MotionRequest
 from strands_robots.safety.lockout import LockoutLatch
 from strands_robots.safety.orders import REASON_MAX, epoch_of
 from strands_robots.safety.stop_executor import stop_executor
-from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.control_changes import ControlChange
 from strands_robots.serving.leave import Command, RefusalReason, Refused
@@ -54,6 +53,7 @@ from strands_robots.serving.verb_schema import described, labels_of, text_of
 from strands_robots.serving.verbs import REQUIRED, Arguments, Kind, Verb
 from strands_robots.serving.workers import ShareFullError, called, loop_future
 from strands_robots.serving.world_stops import stop_within
+from strands_robots.stop_log import stop_logger
 from strands_robots.utils import START_S, WAIT_S, ValidationError, shown, text
 
 logger = stop_logger(__name__)

@@ -22,7 +22,7 @@ from device_connect_edge.drivers import DeviceDriver
 from device_connect_edge.messaging import MessagingError
 
 from strands_robots import settings
-from strands_robots.contract import WorldRobot, body_of
+from strands_robots.contract import body_of, holds_robots
 from strands_robots.device_connect._compat import Runtime
 from strands_robots.device_connect.backends import LinkConfig
 from strands_robots.device_connect.backends.base import NoResponderError
@@ -345,7 +345,7 @@ def _driver_by_class(robot: Any) -> DeviceDriver | None:
     simulation = getattr(sys.modules.get("strands_robots.simulation"), "Simulation", None)
     if isinstance(simulation, type) and isinstance(robot, simulation):
         return SimulationDeviceDriver(robot)
-    if isinstance(robot, WorldRobot) and not callable(getattr(robot, "start_task", None)):
+    if holds_robots(robot) and not callable(getattr(robot, "start_task", None)):
         return SimulationDeviceDriver(robot)
     return None
 

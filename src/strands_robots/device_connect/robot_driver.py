@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Optional
 from device_connect_edge.types import DeviceIdentity
 
 from strands_robots.bus_access import read_joints
-from strands_robots.contract import RUNNING, AdaptedRobot, RolloutEvent, adapt
+from strands_robots.contract import RUNNING, RolloutEvent, adapt, body_of
 from strands_robots.device_connect._compat import Labels, emit
 from strands_robots.device_connect.base_driver import Activity, RobotDriver, stated_type
 from strands_robots.device_connect.telemetry import numbers
@@ -45,7 +45,7 @@ class RobotDeviceDriver(RobotDriver):
         super().__init__(task_robot, hardware=hardware, authorization=authorization, approval=approval)
         self.task_robot = task_robot
         self._model = task_robot.tool_name_str
-        wrapped = task_robot.wrapped if isinstance(task_robot, AdaptedRobot) else task_robot
+        wrapped = body_of(task_robot)
         self.device_type = stated_type(wrapped, self.device_type)
         self._tells = callable(getattr(wrapped, "subscribe", None))
         self._provider = ""

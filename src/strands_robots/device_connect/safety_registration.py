@@ -26,8 +26,8 @@ from strands_robots.safety.resume import is_epoch
 from strands_robots.safety.scope import own_cell
 from strands_robots.safety.sightings import sightings
 from strands_robots.safety.statements import Purpose, signed
-from strands_robots.safety.stop_log import stop_logger
 from strands_robots.serving.workers import Share
+from strands_robots.stop_log import stop_logger
 from strands_robots.utils import RESERVED_DEVICE_IDS, unreserved
 
 logger = stop_logger(__name__)

@@ -21,7 +21,7 @@ from strands_robots.safety.estop_listener import CHECK_IN_ANSWER, ESTOP, VERDICT
 from strands_robots.safety.missed_stops import ANSWER, QUESTION
 from strands_robots.safety.orders import PARSED_MAX_BYTES
 from strands_robots.safety.roster_report import STOP_ROSTER
-from strands_robots.safety.stop_log import stop_logger
+from strands_robots.stop_log import stop_logger
 
 if TYPE_CHECKING:
     from strands_robots.device_connect.backends.zenoh_session import LinkedSession

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 
 from strands_robots import settings
 from strands_robots.fleet.link_flags import LinkFlags
-from strands_robots.safety.state_files import WRITABLE
+from strands_robots.state_files import WRITABLE
 from strands_robots.utils import ValidationError, device_id, flag, identifier, near, port, shown, text
 
 BYTES_MAX = 64 * 1024

@@ -18,8 +18,8 @@ from strands_robots.hardware.device_facts import require_port
 from strands_robots.hardware.speed import default_speeds
 from strands_robots.policies.base import Action, checked_speeds, is_velocity, numbers
 from strands_robots.safety.gate import MotionsHeldError, Permit, PermitVoidError
-from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import StopLevel
+from strands_robots.stop_log import stop_logger
 from strands_robots.utils import ValidationError, number, shown
 
 logger = stop_logger(__name__)

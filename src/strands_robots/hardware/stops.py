@@ -9,8 +9,8 @@ from typing import Protocol
 from strands_robots.hardware.body import DeviceBody
 from strands_robots.policies.rollout import Rollout, RolloutsEnd
 from strands_robots.safety.halted_verbs import StopOfRobot
-from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import PendingVerdict, StopVerdict
+from strands_robots.stop_log import stop_logger
 
 logger = stop_logger(__name__)
 

@@ -9,8 +9,7 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
-from strands_robots.safety.approval import state_dir
-from strands_robots.safety.state_files import StateFileError, adopt, make_private, read_private
+from strands_robots.state_files import StateFileError, adopt, make_private, read_private, state_dir
 from strands_robots.utils import ValidationError, identifier, mapping, number
 
 Places = dict[str, dict[str, float]]

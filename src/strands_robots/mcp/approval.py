@@ -33,9 +33,9 @@ from pydantic import BaseModel, Field
 from strands_robots.envelope import Envelope, error, is_error
 from strands_robots.mcp.access import ClientAccess
 from strands_robots.mcp.results import jpeg_of, result
-from strands_robots.safety.approval import Approval, Grants, digest, state_dir
-from strands_robots.safety.state_files import StateFileError
+from strands_robots.safety.approval import Approval, Grants, digest
 from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS
+from strands_robots.state_files import StateFileError, state_dir
 from strands_robots.utils import ValidationError
 
 logger = logging.getLogger(__name__)

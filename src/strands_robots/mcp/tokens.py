@@ -13,8 +13,7 @@ import secrets
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from strands_robots.safety.approval import state_dir
-from strands_robots.safety.state_files import StateFileError, make_private, read_private
+from strands_robots.state_files import StateFileError, make_private, read_private, state_dir
 from strands_robots.utils import device_id
 
 FILE = "mcp-tokens.json"

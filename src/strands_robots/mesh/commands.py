@@ -8,7 +8,7 @@ from functools import partial
 from types import MappingProxyType
 from typing import Any
 
-from strands_robots.contract import Haltable, Robot, WorldRobot
+from strands_robots.contract import Haltable, Robot, holds_robots
 from strands_robots.envelope import is_error
 from strands_robots.mesh import topics, wire
 from strands_robots.mesh.console_keys import MOTION
@@ -19,7 +19,6 @@ from strands_robots.mesh.transport import Sample, TransportError
 from strands_robots.mesh.wire_identity import IdentityError
 from strands_robots.safety.identity import SigningIdentity
 from strands_robots.safety.peer_answers import with_stop_statement
-from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import Outcome, StopVerdict, explain, grade
 from strands_robots.serving.leave import Command, RefusalReason, Refused
 from strands_robots.serving.peer_verbs import PEER_VERBS
@@ -30,6 +29,7 @@ from strands_robots.serving.stop_requests import StopRequests
 from strands_robots.serving.verbs import Arguments, Kind, Verb
 from strands_robots.serving.workers import ShareFullError
 from strands_robots.serving.world_stops import robot_stop, stop_within
+from strands_robots.stop_log import stop_logger
 from strands_robots.utils import RESERVED_IDS, ValidationError, shown
 
 logger = stop_logger(__name__)
@@ -133,9 +133,7 @@ def stop_target(robot: Robot | None, name: str = "") -> Haltable | None:
     Raises:
         ValidationError: the world has no robot of this name.
     """
-    if robot is None or not name or not isinstance(robot, WorldRobot):
-        return robot
-    return robot_stop(robot, name)
+    return robot_stop(robot, name) if name and holds_robots(robot) else robot
 
 
 def execute_on(robot: Robot, context: Context, closed: Callable[[], bool] = lambda: False) -> Own:

@@ -19,7 +19,7 @@ from strands_robots.mesh import wire
 from strands_robots.safety import ed25519
 from strands_robots.safety.consoles import console_key, kept_consoles, stated_consoles
 from strands_robots.safety.identity import SigningIdentity
-from strands_robots.utils import MissingExtraError
+from strands_robots.utils import MissingExtraError, canonical_json
 
 logger = logging.getLogger(__name__)
 
@@ -117,4 +117,4 @@ class ConsoleTrust:
 
 def _covered(body: Mapping[str, Any], head: Mapping[str, Any], purpose: str) -> bytes:
     bare = {key: value for key, value in body.items() if key not in (FIELD, "sig")}
-    return ed25519.canonical({"body": bare, "head": dict(head), "purpose": purpose})
+    return canonical_json({"body": bare, "head": dict(head), "purpose": purpose})

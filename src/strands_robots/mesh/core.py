@@ -14,7 +14,7 @@ from typing import Any
 
 from strands_robots import settings
 from strands_robots._mesh_switch import mesh_env_request
-from strands_robots.contract import WorldRobot, body_of
+from strands_robots.contract import body_of, holds_robots
 from strands_robots.mesh import session, topics, wire
 from strands_robots.mesh.children import Children
 from strands_robots.mesh.commands import CommandReceiver, SenderCheck, execute_on, pong
@@ -130,7 +130,7 @@ class Mesh(SensorLoopsMixin):
     def _compose(self) -> None:
         """Make the parts of one stay on the mesh."""
         parts, robot, peer = self._parts, self.robot, self.peer_id
-        hardware = robot is not None and not isinstance(robot, WorldRobot) and self.peer_type != "sim"
+        hardware = robot is not None and not holds_robots(robot) and self.peer_type != "sim"
         self._context = context = Context(
             peer, parts.registry, parts.recorder(peer), Identity(), parts.clock, parts.monotonic
         )
@@ -182,7 +182,7 @@ class Mesh(SensorLoopsMixin):
             context, self._adapter, self._requester, self._pipeline.shares.urgent, robot=robot is not None
         )
         self.children: Children | None = None
-        if isinstance(robot, WorldRobot):
+        if holds_robots(robot):
             self.children = Children(
                 context,
                 robot,

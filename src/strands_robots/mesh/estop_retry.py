@@ -11,8 +11,8 @@ from typing import Any
 from strands_robots.mesh.context import Context
 from strands_robots.mesh.older_peers import SAFETY_S
 from strands_robots.mesh.rpc import Requester, stop_outcome
-from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import Outcome, explain
+from strands_robots.stop_log import stop_logger
 from strands_robots.utils import shown
 
 logger = stop_logger(__name__)

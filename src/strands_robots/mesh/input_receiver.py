@@ -20,7 +20,7 @@ from strands_robots.mesh.transport import Sample
 from strands_robots.policies.base import numbers
 from strands_robots.safety.gate import MotionGate, MotionRefused, MotionRequest, Permit
 from strands_robots.safety.stop_executor import stop_executor
-from strands_robots.safety.stop_log import stop_logger
+from strands_robots.stop_log import stop_logger
 from strands_robots.utils import ValidationError
 
 logger = stop_logger(__name__)

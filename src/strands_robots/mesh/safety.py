@@ -40,14 +40,14 @@ from strands_robots.safety.peer_answers import (
 from strands_robots.safety.resume import REJECTED, configured_keys, is_epoch, sign
 from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope, none_known
 from strands_robots.safety.statements import Proof, Purpose, proof_of
-from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import Outcome, StopVerdict
 from strands_robots.serving.peer_verbs import PEER_VERBS
 from strands_robots.serving.pipeline import Own
 from strands_robots.serving.robot_verbs import peer_stop_answer
 from strands_robots.serving.verbs import Arguments
 from strands_robots.serving.workers import Share, ShareFullError
-from strands_robots.utils import ValidationError, identifier
+from strands_robots.stop_log import stop_logger
+from strands_robots.utils import ValidationError, canonical_json, identifier
 
 logger = stop_logger(__name__)
 
@@ -537,7 +537,7 @@ class FleetSafety:
             return
         signature = ed25519.decode(assertion.get("sig"), 64)
         try:
-            covered = ed25519.canonical({key: value for key, value in assertion.items() if key != "sig"})
+            covered = canonical_json({key: value for key, value in assertion.items() if key != "sig"})
         except (ValueError, TypeError, RecursionError):
             return
         if signature is not None and ed25519.signed_by_one_of(configured_keys(), signature, covered):

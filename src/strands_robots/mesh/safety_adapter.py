@@ -19,8 +19,8 @@ from strands_robots.safety.resume import REJECTED
 from strands_robots.safety.scope import EVERY_ROBOT, SCOPE, Scope
 from strands_robots.safety.sightings import sightings
 from strands_robots.safety.statements import Purpose
-from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import StopVerdict
+from strands_robots.stop_log import stop_logger
 
 logger = stop_logger(__name__)
 

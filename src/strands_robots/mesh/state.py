@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-from strands_robots.contract import TaskRobot, WorldRobot, body_of
+from strands_robots.contract import Robot, body_of, holds_robots
 from strands_robots.envelope import is_error, text_of
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.mesh.throttle import TroubleLog
@@ -57,13 +57,10 @@ class _Degradation:
 class StateReader:
     """Reads a robot into state messages; a failed section is reported degraded."""
 
-    def __init__(
-        self, peer_id: str, robot: TaskRobot | WorldRobot | None, clock: Callable[[], float] = time.time
-    ) -> None:
+    def __init__(self, peer_id: str, robot: Robot | None, clock: Callable[[], float] = time.time) -> None:
         self._peer_id = peer_id
-        # Asking a protocol takes longer than a read of most robots.
-        self._world = robot if isinstance(robot, WorldRobot) else None
-        self._arm = robot if self._world is None and isinstance(robot, TaskRobot) else None
+        self._world = robot if holds_robots(robot) else None
+        self._arm = None if holds_robots(robot) else robot
         self._clock = clock
         self._degraded: dict[str, _Degradation] = {}
         self._positions: dict[str, tuple[float, float]] = {}
@@ -153,12 +150,12 @@ class StateReader:
 class Description:
     """Reads a robot for presence, field by field; failures are logged once."""
 
-    def __init__(self, peer_id: str, robot: TaskRobot | WorldRobot | None, own_verbs: Collection[str] = ()) -> None:
+    def __init__(self, peer_id: str, robot: Robot | None, own_verbs: Collection[str] = ()) -> None:
         self._peer_id = peer_id
         self._own_verbs = sorted(own_verbs)
         self._robot = robot
-        self._world = robot if isinstance(robot, WorldRobot) else None
-        self._arm = robot if self._world is None and isinstance(robot, TaskRobot) else None
+        self._world = robot if holds_robots(robot) else None
+        self._arm = None if holds_robots(robot) else robot
         self._kind = "" if robot is None else kind_of(robot)
         self._troubles = TroubleLog(logger)
 

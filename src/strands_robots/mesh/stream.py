@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from strands_robots.contract import RolloutEvent, Unsubscribe, WorldRobot
+from strands_robots.contract import RolloutEvent, Unsubscribe, robots_in
 from strands_robots.mesh import topics
 from strands_robots.mesh.context import Context
 from strands_robots.mesh.executor import BoundedExecutor
@@ -65,7 +65,7 @@ class StepPublisher:
         if not isinstance(event, RolloutEvent):
             return
         if event.kind == "started":
-            self._several = isinstance(self._robot, WorldRobot) and len(self._robot.list_robots()) > 1
+            self._several = len(robots_in(self._robot)) > 1
             self._rollouts.forget(event.robot)
         if event.kind == "step" and self._context.running() and self._rollouts.admit(event.robot):
             stamp, prefix = self._context.clock(), f"{event.robot}/" if self._several else ""

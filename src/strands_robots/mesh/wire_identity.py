@@ -26,8 +26,7 @@ from strands_robots.errors import StrandsRobotsError
 from strands_robots.mesh import wire
 from strands_robots.mesh.throttle import RecentKeys
 from strands_robots.mesh.transport.zenoh_config import Posture, TlsCredentials
-from strands_robots.safety.ed25519 import canonical
-from strands_robots.utils import ValidationError, identifier, missing_extra, shown
+from strands_robots.utils import ValidationError, canonical_json, identifier, missing_extra, shown
 
 if TYPE_CHECKING:
     from cryptography import x509
@@ -322,7 +321,7 @@ def _algorithm_of(public: Any) -> str:
 
 
 def _signed_bytes(body: Mapping[str, Any], head: Mapping[str, Any], digest: str) -> bytes:
-    return canonical({"body": body, "sig": {**head, "cert_sha256": digest}})
+    return canonical_json({"body": body, "sig": {**head, "cert_sha256": digest}})
 
 
 @lru_cache(maxsize=len(ALGORITHMS))

@@ -32,9 +32,9 @@ from strands_robots.policies.base import (
 )
 from strands_robots.policies.loop_counts import Counted
 from strands_robots.safety.gate import Permit, PermitVoidError
-from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import READ_EVERY_S, PendingVerdict, StopVerdict, halt_each
 from strands_robots.safety.turns import shorten_turns
+from strands_robots.stop_log import stop_logger
 from strands_robots.utils import ValidationError, number, text, whole
 from strands_robots.utils import duration as checked_duration
 

@@ -21,7 +21,7 @@ from strands_robots.errors import StrandsRobotsError
 from strands_robots.policies.base import Action, Ranges
 from strands_robots.policies.rollout import RolloutObservers
 from strands_robots.safety.gate import MotionGate, Permit, PermitVoidError
-from strands_robots.safety.stop_log import stop_logger
+from strands_robots.stop_log import stop_logger
 from strands_robots.utils import ValidationError, mapping, number, shown
 
 logger = stop_logger(__name__)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
 
-from strands_robots.contract import WorldRobot, body_of
+from strands_robots.contract import body_of, holds_robots
 from strands_robots.utils import ValidationError, missing_extra, shown
 
 QUALITY = 80
@@ -96,7 +96,7 @@ def chosen_frames(robot: Any, names: Sequence[str] | None) -> Frames | None:
 
 def _drawing(robot: Any) -> Draw | None:
     """Return what draws a picture of a simulated world, None for a real robot."""
-    if not isinstance(robot, WorldRobot):
+    if not holds_robots(robot):
         return None
     draw, render = getattr(robot, "camera_picture", None), getattr(robot, "render", None)
     if callable(draw):
@@ -182,7 +182,7 @@ def take_picture(robot: Any, camera: str, width: int, height: int) -> tuple[str,
 
 
 def _draws(robot: Any) -> bool:
-    return isinstance(robot, WorldRobot) and callable(getattr(robot, "camera_picture", None))
+    return holds_robots(robot) and callable(getattr(robot, "camera_picture", None))
 
 
 def _scaled(name: str, pixels: Any, width: int, height: int) -> Any:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, Self
 
-from strands_robots.contract import RolloutEvent, Unsubscribe, WorldRobot, adapt, observe
+from strands_robots.contract import RolloutEvent, Unsubscribe, behind_contract, holds_robots, observe
 from strands_robots.envelope import text_of
 from strands_robots.policies.base import numbers
 from strands_robots.recording.cameras import Frames, jpeg
@@ -55,7 +55,7 @@ class RobotRecording:
         joints_hz: float = JOINTS_HZ,
         cameras_hz: float = CAMERAS_HZ,
     ) -> None:
-        self._robot = robot if isinstance(robot, WorldRobot) else adapt(robot)
+        self._robot = behind_contract(robot)
         self._recorder = recorder
         self._device = device
         self._frames = frames
@@ -125,7 +125,7 @@ class RobotRecording:
 
     def _sample_joints(self) -> None:
         state = self._robot.get_state()
-        if isinstance(self._robot, WorldRobot):
+        if holds_robots(self._robot):
             for name, joints in (state.get("robots") or {}).items():
                 self._recorder.take_joints(f"{self._device}/{name}", numbers(joints))
             return
@@ -154,7 +154,7 @@ class RobotRecording:
 
     def _record(self, event: RolloutEvent) -> None:
         """Record a rollout's event with its name and fields on Device Connect."""
-        world = isinstance(self._robot, WorldRobot)
+        world = holds_robots(self._robot)
         robot = {"robot_name": event.robot} if world else {}
         kind = "policy" if world else "task"
         if event.kind == "step":

@@ -13,9 +13,8 @@ import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from strands_robots.safety.approval import state_dir
-from strands_robots.safety.state_files import StateFileError, make_private, require_private
-from strands_robots.safety.stop_log import stop_logger
+from strands_robots.state_files import StateFileError, make_private, require_private, state_dir
+from strands_robots.stop_log import stop_logger
 
 logger = stop_logger(__name__)
 

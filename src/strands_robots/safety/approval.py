@@ -24,10 +24,9 @@ from typing import Any
 
 from strands_robots import settings
 from strands_robots.safety.authorization import NAME_MAX
-from strands_robots.safety.ed25519 import canonical
-from strands_robots.safety.state_files import boot, make_private, read_private, require_private, uptime
-from strands_robots.safety.stop_log import stop_logger
-from strands_robots.utils import ValidationError, identifier, number, text
+from strands_robots.state_files import boot, make_private, read_private, require_private, state_dir, uptime
+from strands_robots.stop_log import stop_logger
+from strands_robots.utils import ValidationError, canonical_json, identifier, number, text
 
 logger = stop_logger(__name__)
 
@@ -37,12 +36,6 @@ GRANT_S = 300.0
 GRANT_MAX_S = 24 * 3600.0
 
 _CLAIMED = ".claimed"
-
-
-def state_dir() -> Path:
-    """Return the directory of grants and lockouts, ``STRANDS_STATE_DIR`` first."""
-    stated = settings.raw("STRANDS_STATE_DIR")
-    return Path(stated).expanduser() if stated else Path.home() / ".strands_robots"
 
 
 def listed(verb: str, peer: str, allow: Sequence[str], callers: Collection[str] = ()) -> bool:
@@ -60,7 +53,7 @@ def digest(arguments: Mapping[str, Any]) -> str:
     """
     try:
         given = {name: _plain(value) for name, value in arguments.items() if value is not None}
-        return hashlib.sha256(canonical(given)).hexdigest()
+        return hashlib.sha256(canonical_json(given)).hexdigest()
     except (TypeError, ValueError, RecursionError) as exc:
         raise ValidationError(f"arguments must be values that JSON can carry: {exc}.") from None
 

@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from fnmatch import fnmatchcase, translate
 
 from strands_robots import settings
-from strands_robots.safety.stop_log import stop_logger
+from strands_robots.stop_log import stop_logger
 from strands_robots.utils import shown
 
 logger = stop_logger(__name__)

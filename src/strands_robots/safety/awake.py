@@ -12,8 +12,8 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 
-from strands_robots.safety.state_files import uptime
-from strands_robots.safety.stop_log import stop_logger
+from strands_robots.state_files import uptime
+from strands_robots.stop_log import stop_logger
 
 logger = stop_logger(__name__)
 

@@ -17,17 +17,17 @@ from pathlib import Path
 from typing import Any
 
 from strands_robots.audit import log_safety_event
-from strands_robots.safety.approval import state_dir
 from strands_robots.safety.persistence import LockoutStore
-from strands_robots.safety.state_files import (
+from strands_robots.state_files import (
     StateFileError,
     boot,
     make_private,
     read_private,
     require_private,
+    state_dir,
     uptime,
 )
-from strands_robots.safety.stop_log import stop_logger
+from strands_robots.stop_log import stop_logger
 from strands_robots.utils import identifier, text
 
 logger = stop_logger(__name__)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from strands_robots import settings
 from strands_robots.safety import ed25519
-from strands_robots.safety.approval import state_dir
 from strands_robots.safety.identity import EnrolledKeys, KeyFile
+from strands_robots.state_files import state_dir
 
 PUBLIC_KEYS = "STRANDS_MESH_CONSOLE_PUBLIC_KEYS"
 

@@ -47,8 +47,8 @@ from strands_robots.safety.scope import (
 )
 from strands_robots.safety.silence import Sending
 from strands_robots.safety.statements import Proof, Purpose, proof_of
-from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.turns import shorten_turns
+from strands_robots.stop_log import stop_logger
 from strands_robots.utils import ValidationError, device_id, number, shown
 
 logger = stop_logger(__name__)

@@ -1,4 +1,4 @@
-"""Ed25519: canonical bytes, base64url, public keys from settings, key files.
+"""Ed25519: base64url, public keys from settings, key files.
 
 The only place that imports ``cryptography``, and only when a signature or a key is at hand.
 """
@@ -8,10 +8,9 @@ from __future__ import annotations
 import base64
 import binascii
 import functools
-import json
 import logging
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,15 +21,6 @@ logger = logging.getLogger(__name__)
 PASSPHRASE_MIN = 16
 PASSPHRASE_CLASSES = 3
 PASSPHRASE_DISTINCT = 10
-
-
-def canonical(fields: Mapping[str, Any]) -> bytes:
-    """The bytes that are signed: JSON with sorted keys and without blanks.
-
-    Raises:
-        ValueError: a number that JSON cannot carry.
-    """
-    return json.dumps(fields, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
 
 
 def encode(data: bytes) -> str:

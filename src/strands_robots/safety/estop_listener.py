@@ -37,8 +37,8 @@ from strands_robots.safety.plane import SafetyPlane, plane
 from strands_robots.safety.question_ports import Member, RobotsPort
 from strands_robots.safety.sighting_file import own_run
 from strands_robots.safety.statements import Purpose, signed
-from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.turns import shorten_turns
+from strands_robots.stop_log import stop_logger
 from strands_robots.utils import shown
 
 logger = stop_logger(__name__)

@@ -21,10 +21,9 @@ from typing import Any, TypeVar
 
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety import ed25519
-from strands_robots.safety.approval import state_dir
 from strands_robots.safety.network_key import NetworkKey
-from strands_robots.safety.state_files import OPEN, StateFileError, make_private, read_private, require_private
-from strands_robots.safety.stop_log import stop_logger
+from strands_robots.state_files import OPEN, StateFileError, make_private, read_private, require_private, state_dir
+from strands_robots.stop_log import stop_logger
 from strands_robots.utils import field_values, identifier
 
 logger = stop_logger(__name__)

@@ -16,7 +16,7 @@ from typing import Any
 
 from strands_robots.envelope import Envelope, error
 from strands_robots.safety.scope import EVERY_ROBOT, SCOPE, Scope
-from strands_robots.safety.state_files import uptime
+from strands_robots.state_files import uptime
 from strands_robots.utils import shown
 
 MAX_EPOCHS = 64

@@ -27,9 +27,9 @@ from strands_robots.safety.identity import SigningIdentity
 from strands_robots.safety.orders import params_of
 from strands_robots.safety.originals import ORIGINAL_MAX_BYTES, STOPS_MAX, Original, newest_within
 from strands_robots.safety.resume import is_epoch
-from strands_robots.safety.state_files import uptime
 from strands_robots.safety.statements import Purpose, own_key, signed
-from strands_robots.safety.stop_log import stop_logger
+from strands_robots.state_files import uptime
+from strands_robots.stop_log import stop_logger
 from strands_robots.utils import shown
 
 logger = stop_logger(__name__)

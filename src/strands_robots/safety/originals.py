@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from strands_robots.safety import ed25519
-from strands_robots.safety.state_files import boot, uptime
+from strands_robots.state_files import boot, uptime
 
 STOPS_MAX = 64
 """Originals kept, and told in one answer."""
@@ -31,7 +31,7 @@ class Original:
         source: who stops, as declared.
         payload: the message.
         network: where it was received; it is passed on nowhere else.
-        received: seconds since boot of its first receipt, see :func:`~.state_files.uptime`.
+        received: seconds since boot of its first receipt, see :func:`~strands_robots.state_files.uptime`.
         learnt: that moment is one that an answer to this process stated.
     """
 

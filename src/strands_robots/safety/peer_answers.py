@@ -10,7 +10,7 @@ from strands_robots.audit import audit_head, log_witness
 from strands_robots.safety.identity import EnrolledKeys, KeyFileError, SigningIdentity
 from strands_robots.safety.resume import is_epoch
 from strands_robots.safety.statements import Proof, Purpose, distrust, proof_of, signed
-from strands_robots.safety.stop_log import stop_logger
+from strands_robots.stop_log import stop_logger
 
 logger = stop_logger(__name__)
 

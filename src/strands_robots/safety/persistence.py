@@ -21,7 +21,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from strands_robots.safety.approval import state_dir
 from strands_robots.safety.lockout import (
     ANY_TIME,
     LONG_AGO,
@@ -36,16 +35,17 @@ from strands_robots.safety.lockout import (
 from strands_robots.safety.originals import STORED_MAX_BYTES, Original, moment, newest_within, since_boot
 from strands_robots.safety.resume import is_epoch
 from strands_robots.safety.scope import SCOPE, Scope
-from strands_robots.safety.state_files import (
+from strands_robots.state_files import (
     StateFileError,
     adopt,
     boot,
     make_private,
     read_private,
     require_private,
+    state_dir,
     uptime,
 )
-from strands_robots.safety.stop_log import stop_logger
+from strands_robots.stop_log import stop_logger
 from strands_robots.utils import field_values
 
 logger = stop_logger(__name__)

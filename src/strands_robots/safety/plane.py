@@ -13,7 +13,6 @@ from typing import Any, Protocol
 
 from strands_robots import settings
 from strands_robots.audit import queue_safety_event
-from strands_robots.contract import Haltable, WorldRobot, body_of
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.safety.checkin import CheckIn
 from strands_robots.safety.clearance import CLEARED, LEFT, NOT_KEPT, NOT_LOCKED, ClearanceInbox
@@ -25,13 +24,13 @@ from strands_robots.safety.persistence import LockoutStore, ResumedEpochs, Store
 from strands_robots.safety.reporting import UNPACED, OnReport, Reporter, StopRun
 from strands_robots.safety.resume import REJECTED, Admitted, ResumeVerifier
 from strands_robots.safety.sightings import sightings
-from strands_robots.safety.state_files import uptime
 from strands_robots.safety.stop_count import StopCount
 from strands_robots.safety.stop_executor import StopExecutor, stop_executor
-from strands_robots.safety.stop_log import stop_logger
-from strands_robots.safety.stop_targets import note_motion
+from strands_robots.safety.stop_targets import Haltable, body_of, holds_several, note_motion
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.safety.turns import undisturbed
+from strands_robots.state_files import uptime
+from strands_robots.stop_log import stop_logger
 from strands_robots.utils import ValidationError, identifier, shown
 
 logger = stop_logger(__name__)
@@ -98,7 +97,7 @@ class Registered:
         self._ready, self._readying = False, threading.Lock()
         # A world that has not moved yet shares the threads of the reserve, and so does every robot of a large process
         # until it moves: a hundred of them need no hundred threads.
-        if isinstance(robot, WorldRobot) or len(plane.robots) >= READY_MAX:
+        if holds_several(robot) or len(plane.robots) >= READY_MAX:
             plane.executor.prepare()
         else:
             self._stand_by()

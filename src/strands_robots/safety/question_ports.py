@@ -21,8 +21,8 @@ from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.orders import MISSED, RobotReport, StopOrder, StopRefused, StopRules, params_of, stated_epoch
 from strands_robots.safety.originals import ORIGINAL_MAX_BYTES, STOPS_MAX, Original, Originals
 from strands_robots.safety.plane import SafetyPlane
-from strands_robots.safety.state_files import uptime
-from strands_robots.safety.stop_log import stop_logger
+from strands_robots.state_files import uptime
+from strands_robots.stop_log import stop_logger
 
 logger = stop_logger(__name__)
 

@@ -15,8 +15,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from strands_robots.safety.orders import RobotReport, StopOrder
-from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import StopVerdict
+from strands_robots.stop_log import stop_logger
 
 logger = stop_logger(__name__)
 

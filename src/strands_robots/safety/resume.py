@@ -18,7 +18,7 @@ from typing import Any
 
 from strands_robots import settings
 from strands_robots.safety import ed25519
-from strands_robots.utils import ValidationError, identifier, shown
+from strands_robots.utils import ValidationError, canonical_json, identifier, shown
 
 VERSION = 1
 FIELDS = frozenset({"v", "epoch", "targets", "t", "nonce", "sig"})
@@ -104,7 +104,7 @@ def _signed(signing_key: Any, epoch: str, targets: list[str], now: float) -> dic
         "t": now,
         "nonce": secrets.token_hex(16),
     }
-    return {**body, "sig": ed25519.encode(signing_key.sign(ed25519.canonical(body)))}
+    return {**body, "sig": ed25519.encode(signing_key.sign(canonical_json(body)))}
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,7 +172,7 @@ class ResumeVerifier:
         if signature is None or not _shapes(assertion):
             return Denial.SHAPES
         body = {key: value for key, value in assertion.items() if key != "sig"}
-        if not ed25519.signed_by_one_of(keys, signature, ed25519.canonical(body)):
+        if not ed25519.signed_by_one_of(keys, signature, canonical_json(body)):
             return Denial.SIGNATURE
         if self._robot_ids.isdisjoint(assertion["targets"]):
             return Denial.TARGETS

@@ -15,7 +15,7 @@ from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.scope import Scope
 from strands_robots.safety.sighting_file import CROWDED
 from strands_robots.safety.sightings import Known, Sighting, Sightings, sightings, this_moment
-from strands_robots.safety.state_files import uptime
+from strands_robots.state_files import uptime
 from strands_robots.utils import field_values
 
 REPORTED_MAX = 64
@@ -147,8 +147,8 @@ class Roster:
 
         Args:
             network: of the stop.
-            pressed: :func:`~.state_files.uptime` at the press; now by default. Robots count that were heard from ten
-                minutes before it until now.
+            pressed: :func:`~strands_robots.state_files.uptime` at the press; now by default. Robots count that were
+                heard from ten minutes before it until now.
             store: in place of the state directory's.
         """
         store = store or sightings()

@@ -16,7 +16,7 @@ from strands_robots.safety.roster_report import (
     read_report,
     trusted_controllers,
 )
-from strands_robots.safety.stop_log import stop_logger
+from strands_robots.stop_log import stop_logger
 
 logger = stop_logger(__name__)
 

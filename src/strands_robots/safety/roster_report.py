@@ -13,7 +13,7 @@ from strands_robots.safety.resume import is_epoch
 from strands_robots.safety.roster import REPORTED_MAX, RosterRow, bounded
 from strands_robots.safety.sightings import Known
 from strands_robots.safety.statements import Purpose, own_key
-from strands_robots.safety.stop_log import stop_logger
+from strands_robots.stop_log import stop_logger
 from strands_robots.utils import ValidationError, identifier
 
 logger = stop_logger(__name__)

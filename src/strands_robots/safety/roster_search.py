@@ -12,8 +12,8 @@ from strands_robots.safety.controller import Progress, SafetyController, StopRep
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.roster_report import RosterReport
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
-from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stop_roster import StopRoster
+from strands_robots.stop_log import stop_logger
 from strands_robots.utils import plain_text
 
 logger = stop_logger(__name__)

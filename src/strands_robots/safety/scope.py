@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from strands_robots import settings
-from strands_robots.safety.stop_log import stop_logger
+from strands_robots.stop_log import stop_logger
 from strands_robots.utils import ValidationError, identifier
 
 logger = stop_logger(__name__)

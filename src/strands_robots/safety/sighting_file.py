@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING
 
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety.network_key import NetworkKey
-from strands_robots.safety.state_files import StateFileError, adopt, boot, make_private, require_private_file, uptime
-from strands_robots.safety.stop_log import stop_logger
+from strands_robots.state_files import StateFileError, adopt, boot, make_private, require_private_file, uptime
+from strands_robots.stop_log import stop_logger
 from strands_robots.utils import ValidationError
 
 if TYPE_CHECKING:

@@ -21,7 +21,6 @@ from weakref import WeakSet
 
 from strands_robots.audit import log_safety_event
 from strands_robots.errors import StrandsRobotsError
-from strands_robots.safety.approval import state_dir
 from strands_robots.safety.identity import ROBOTS, EnrolledKeys, KeyFile, local_name, of_tenant
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.sighting_file import (
@@ -38,7 +37,8 @@ from strands_robots.safety.sighting_file import (
     this_moment,
 )
 from strands_robots.safety.statements import STATED_WITHIN_S, Purpose, own_key
-from strands_robots.safety.stop_log import stop_logger
+from strands_robots.state_files import state_dir
+from strands_robots.stop_log import stop_logger
 
 __all__ = ["RECENT_S", "Known", "Moment", "Sighting", "Sightings", "flush_sightings", "sightings", "this_moment"]
 

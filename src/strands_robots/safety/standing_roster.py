@@ -21,8 +21,8 @@ from strands_robots.safety.roster_report import report_fields
 from strands_robots.safety.scope import EVERY_ROBOT, SCOPE, Scope
 from strands_robots.safety.sightings import Known
 from strands_robots.safety.statements import Purpose, signed
-from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stop_roster import counts
+from strands_robots.stop_log import stop_logger
 
 logger = stop_logger(__name__)
 

@@ -13,6 +13,7 @@ from typing import Any
 
 from strands_robots.safety import ed25519
 from strands_robots.safety.identity import SigningIdentity
+from strands_robots.utils import canonical_json
 
 UNCOVERED = frozenset({"sig", "purpose", "source", "event_id", "ts"})
 """Fields that are not signed as they stand: the signature, what the reader knows, and the envelope's own."""
@@ -39,7 +40,7 @@ def covered(purpose: Purpose, source: str, fields: Mapping[str, Any]) -> bytes:
         ValueError, TypeError, RecursionError: a field that JSON cannot carry.
     """
     stated = {name: value for name, value in fields.items() if name not in UNCOVERED}
-    return ed25519.canonical({**stated, "purpose": purpose.value, "source": source})
+    return canonical_json({**stated, "purpose": purpose.value, "source": source})
 
 
 STATED_WITHIN_S = 60.0

@@ -23,13 +23,13 @@ from concurrent.futures import Future
 from typing import cast
 
 from strands_robots import settings
-from strands_robots.contract import Haltable, body_of
 from strands_robots.safety.halted_verbs import HaltedVerbs, void_calls
 from strands_robots.safety.ready_threads import ReadyThreads
-from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stop_targets import (
+    Haltable,
     HaltsInParts,
     Target,
+    body_of,
     has_parts,
     is_direct,
     note_motion,
@@ -38,6 +38,7 @@ from strands_robots.safety.stop_targets import (
 )
 from strands_robots.safety.stopping import PendingVerdict, StopVerdict
 from strands_robots.safety.submitted_stops import Answered, PendingStops, SubmittedStop, TargetSlot
+from strands_robots.stop_log import stop_logger
 
 logger = stop_logger(__name__)
 

@@ -17,8 +17,8 @@ from strands_robots.safety.roster_report import RosterReport
 from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope
 from strands_robots.safety.sightings import Known, Sighting, sightings
 from strands_robots.safety.silence import Sending, reason_of
-from strands_robots.safety.state_files import uptime
 from strands_robots.safety.statements import Proof, Purpose, proof_of
+from strands_robots.state_files import uptime
 
 OTHERS_AWAITED = 64
 """Names that do not alter the exit code, and for whose answer a stop goes on all the same."""

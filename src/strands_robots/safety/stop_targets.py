@@ -6,12 +6,36 @@ from collections.abc import Hashable
 from dataclasses import fields
 from typing import Any, Protocol, TypeGuard, cast, runtime_checkable
 
-from strands_robots.contract import Haltable, body_of
 from strands_robots.safety.gate import MotionGate
-from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import PendingVerdict, StopVerdict
+from strands_robots.stop_log import stop_logger
 
 logger = stop_logger(__name__)
+
+
+@runtime_checkable
+class Haltable(Protocol):
+    """A robot with the one verb that halts every motion source and returns a verdict."""
+
+    def halt(self, reason: str = "") -> StopVerdict:
+        """Stop everything that moves this robot; returns within the halt deadline."""
+
+
+class RobotWrapper:
+    """Robot that stands for another one: their stops are stops of one target."""
+
+    wrapped: Any
+
+
+def body_of(robot: Any) -> Any:
+    """Return the robot that a wrapper stands for, else ``robot`` itself."""
+    # By its type: isinstance may ask a robot for its __class__.
+    return robot.wrapped if issubclass(type(robot), RobotWrapper) else robot
+
+
+def holds_several(target: object) -> bool:
+    """Return whether its class lists several robots, which its halt stops together."""
+    return hasattr(type(target), "list_robots")
 
 
 @runtime_checkable

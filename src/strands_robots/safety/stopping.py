@@ -16,7 +16,7 @@ from typing import Literal, TypeVar, cast
 
 from strands_robots import settings
 from strands_robots.envelope import Envelope, error, success
-from strands_robots.safety.stop_log import stop_logger
+from strands_robots.stop_log import stop_logger
 from strands_robots.utils import ValidationError, choice, shown
 
 logger = stop_logger(__name__)

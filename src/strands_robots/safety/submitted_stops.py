@@ -10,10 +10,10 @@ from collections.abc import Callable
 from concurrent.futures import Future, InvalidStateError
 from dataclasses import dataclass, field, replace
 
-from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stop_targets import Target, is_direct
 from strands_robots.safety.stopping import ForeignAnswer, PendingVerdict, StopVerdict, graded
 from strands_robots.safety.verbs_under_way import VerbCall
+from strands_robots.stop_log import stop_logger
 
 logger = stop_logger(__name__)
 

@@ -11,8 +11,8 @@ from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.persistence import StoredLockout
 from strands_robots.safety.roster import Roster, RosterRow
 from strands_robots.safety.sightings import sightings, this_moment
-from strands_robots.safety.state_files import uptime
 from strands_robots.safety.stop_roster import NAMED_MAX, counts
+from strands_robots.state_files import uptime
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,7 +25,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Protocol, cast
 
-from strands_robots.contract import AT_REST, RUNNING, Robot, WorldRobot, body_of
+from strands_robots.contract import Robot, WorldRobot, body_of, holds_robots, robots_in, task_runs
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.identity_map import IdentityMap
@@ -33,7 +33,6 @@ from strands_robots.safety.approval import Leave
 from strands_robots.safety.authorization import ANONYMOUS, caller_name
 from strands_robots.safety.resume import configured_keys
 from strands_robots.safety.stop_executor import stop_executor
-from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.control_changes import ControlChange, Observers, OnChange
 from strands_robots.serving.control_epochs import FirstEpoch
@@ -42,6 +41,7 @@ from strands_robots.serving.starting_motions import StartingMotions
 from strands_robots.serving.take_assertion import outdated, unproven
 from strands_robots.serving.workers import BoundedCall, Share, ShareFullError
 from strands_robots.serving.world_stops import RobotStop, stop_within
+from strands_robots.stop_log import stop_logger
 
 logger = stop_logger(__name__)
 
@@ -538,12 +538,9 @@ class ControlLeases:
     def of(self, name: str = "") -> ControlLease:
         """Return the lease of the robot, or of the named robot of the world."""
         robot = self._robot()
-        if not isinstance(robot, WorldRobot):
-            name = ""
-        else:
-            # Kept: an expiry asks the world for nothing.
-            self._first_robot = next(iter(robot.list_robots()), "")
-            name = name or self._first_robot
+        # Kept: an expiry asks the world for nothing.
+        self._first_robot = next(iter(robots_in(robot)), "")
+        name = (name or self._first_robot) if holds_robots(robot) else ""
         with self._changing:
             lease = self._by_name.get(name)
             if lease is None:
@@ -567,7 +564,7 @@ class ControlLeases:
         Raises:
             NotHolderError: another holds the robot, or the lease is over.
         """
-        if name is not None or not isinstance(self._robot(), WorldRobot):
+        if name is not None or not holds_robots(self._robot()):
             return self.of(name or "").admit(command, caller, lease_id, ttl_s, **how)
         for each in tuple(self._by_name.values()):
             each.refuse_others(command, caller, lease_id)
@@ -576,9 +573,8 @@ class ControlLeases:
     def facts(self) -> dict[str, Any]:
         """Return the holder of the robot; by name for the robots of a world."""
         robot = self._robot()
-        if not isinstance(robot, WorldRobot) or len(robot.list_robots()) < 2:
-            return self.of().facts()
-        return {name: self.of(name).facts() for name in robot.list_robots()}
+        names = robots_in(robot)
+        return {name: self.of(name).facts() for name in names} if len(names) > 1 else self.of().facts()
 
     def _robot(self) -> Robot | None:
         return next((robot for each in self._served if (robot := each()) is not None), None)
@@ -602,14 +598,7 @@ class ControlLeases:
         if any(each.leading() for each in self._streams_of(name)):
             return True
         robot = self._robot()
-        if isinstance(robot, WorldRobot):
-            return any(row.get("robot") == name for row in robot.list_policies_running())
-        # A robot whose motions are gestures has no task; its motion ends the lease with the call that began it.
-        status = getattr(robot, "get_task_status", None)
-        if not callable(status):
-            return False
-        state = str(status().get("task_status", "")).lower()
-        return state in RUNNING if state in RUNNING | AT_REST else None
+        return False if robot is None else task_runs(robot, name)
 
     def _halt(self, name: str, shown_as: str, reason: str) -> Future[StopVerdict] | None:
         """Order the halt of the robot, or of the named robot of the world."""

@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from strands_robots.safety.stop_log import stop_logger
+from strands_robots.stop_log import stop_logger
 
 logger = stop_logger(__name__)
 

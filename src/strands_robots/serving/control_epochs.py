@@ -15,10 +15,9 @@ import threading
 from collections.abc import Callable
 from contextlib import suppress
 
-from strands_robots.safety.approval import state_dir
-from strands_robots.safety.state_files import adopt, make_private, read_private, require_private
-from strands_robots.safety.stop_log import stop_logger
 from strands_robots.serving.workers import BoundedCall
+from strands_robots.state_files import adopt, make_private, read_private, require_private, state_dir
+from strands_robots.stop_log import stop_logger
 
 logger = stop_logger(__name__)
 

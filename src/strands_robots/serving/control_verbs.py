@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from strands_robots.contract import Robot, WorldRobot
+from strands_robots.contract import Robot, holds_robots
 from strands_robots.envelope import Envelope, is_error, success
 from strands_robots.serving.control import KINDS, TTL_S, ControlLease, ControlLeases
 from strands_robots.serving.verbs import (
@@ -76,7 +76,7 @@ def _take(robot: Robot, arguments: Arguments) -> Envelope:
 
 def _of_one(robot: Robot, arguments: Arguments, answer: Envelope) -> Envelope:
     """Name the robot of a world whose lease it is."""
-    if not isinstance(robot, WorldRobot) or is_error(answer):
+    if not holds_robots(robot) or is_error(answer):
         return answer
     return {**answer, "robot_name": arguments.get("robot_name") or next(iter(robot.list_robots()), "")}
 

@@ -11,9 +11,9 @@ import time
 from functools import partial
 from typing import Protocol
 
-from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.turns import undisturbed
 from strands_robots.serving.workers import UNBOUNDED
+from strands_robots.stop_log import stop_logger
 
 logger = stop_logger(__name__)
 

@@ -7,7 +7,7 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-from strands_robots.contract import body_of
+from strands_robots.contract import body_of, holds_robots
 from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS
 from strands_robots.serving.verbs import Verb
 
@@ -66,11 +66,10 @@ def _arm_verbs(robot: Any) -> frozenset[str] | None:
     own = getattr(body_of(robot), "arm_verbs", None)
     if not callable(own):
         return None
-    robots = getattr(robot, "list_robots", None)
-    if not callable(robots):
+    if not holds_robots(robot):
         return frozenset(own())
     found: frozenset[str] = frozenset()
-    for name in robots():
+    for name in robot.list_robots():
         found |= own(name)
         if len(found) == len(ARM_MOTION_VERBS):
             break

@@ -8,7 +8,7 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from strands_robots.contract import WorldRobot, body_of, stops_motions
+from strands_robots.contract import body_of, holds_robots, stops_motions
 from strands_robots.envelope import Envelope, jsonable, success
 from strands_robots.safety.gate import MotionRequest
 from strands_robots.serving.advertised import RobotDescription
@@ -137,7 +137,7 @@ def _served(body: object, declared: DeclaredVerb) -> Verb:
         begin=begin,
         lasts=declared.lasts > 0,
         # It may move any robot of a world, so a lease on one of them refuses it.
-        of_world=isinstance(body, WorldRobot),
+        of_world=holds_robots(body),
         note=UNPROVEN if declared.motion else "",
         own=True,
         lasts_s=declared.lasts,

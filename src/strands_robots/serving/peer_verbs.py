@@ -10,7 +10,7 @@ from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
 
-from strands_robots.contract import Robot, WorldRobot, body_of
+from strands_robots.contract import Robot, body_of, holds_robots
 from strands_robots.drivers.reachy import ReachyDriver
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.safety.gate import MotionRequest
@@ -200,7 +200,7 @@ def description_of(robot: Robot | None, own: Mapping[str, Verb] = MappingProxyTy
 def kind_of(robot: Robot) -> str:
     """Return the kind of a robot, one of :data:`KINDS`."""
     body = body_of(robot)
-    if isinstance(robot, WorldRobot):
+    if holds_robots(robot):
         return "world"
     if isinstance(body, ReachyDriver):
         return "reachy_mini"

@@ -13,15 +13,16 @@ from typing import Any
 
 from strands_robots.bus_access import read_joints
 from strands_robots.contract import (
-    RUNNING,
     SETTLE,
     Robot,
     RolloutEvent,
-    TaskRobot,
     WorldRobot,
-    adapt,
+    behind_contract,
     body_of,
     for_request,
+    holds_robots,
+    robots_in,
+    task_runs,
 )
 from strands_robots.envelope import Envelope, error, is_error, success
 from strands_robots.safety.gate import MotionRequest
@@ -66,7 +67,7 @@ def served(robot: Any) -> Robot:
     Raises:
         ValidationError: it is neither a world nor a robot that :func:`~strands_robots.contract.adapt` makes fit.
     """
-    return robot if isinstance(robot, WorldRobot) else adapt(robot, read_joints)
+    return behind_contract(robot, read_joints)
 
 
 def served_world(robot: Any) -> WorldRobot:
@@ -75,7 +76,7 @@ def served_world(robot: Any) -> WorldRobot:
     Raises:
         ValidationError: naming the members that it lacks.
     """
-    if isinstance(robot, WorldRobot):
+    if holds_robots(robot):
         return robot
     lacking = [name for name in WORLD_MEMBERS if not hasattr(robot, name)]
     needs = ", ".join(WORLD_MEMBERS)
@@ -136,21 +137,21 @@ def _execute(world: WorldRobot, arguments: Arguments, request: MotionRequest | N
 
 def step_world(robot: Robot, arguments: Arguments, request: MotionRequest | None = None) -> Envelope:
     """Advance the physics of a world; refused by any other robot."""
-    if not isinstance(robot, WorldRobot):
+    if not holds_robots(robot):
         return error("step: this robot is no simulation.")
     return for_request(request, robot.step)(arguments.get("n_steps", arguments.get("steps", 1)))
 
 
 def reset_world(robot: Robot, arguments: Arguments, request: MotionRequest | None = None) -> Envelope:
     """Restore the initial state of a world; refused by any other robot."""
-    if not isinstance(robot, WorldRobot):
+    if not holds_robots(robot):
         return error("reset: this robot is no simulation.")
     return for_request(request, robot.reset)()
 
 
 def status(robot: Robot, arguments: Arguments) -> Envelope:
     """Return the task of a robot, or the policies that run in a world."""
-    if not isinstance(robot, WorldRobot):
+    if not holds_robots(robot):
         return robot.get_task_status()
     running = robot.list_policies_running()
     return success(
@@ -173,7 +174,7 @@ def start(robot: Robot, arguments: Arguments, request: MotionRequest | None = No
     if options.get("policy_host") == "localhost":
         del options["policy_host"]
     instruction = options.pop("instruction", "")
-    if isinstance(robot, WorldRobot):
+    if holds_robots(robot):
         name = robot_of(robot, arguments.get("robot_name"))
         return for_request(request, robot.start_policy)(name, instruction, **options)
     unknown = sorted(set(options) - _accepted(robot.start_task, options))
@@ -186,9 +187,7 @@ def run_to_end(
     robot: Robot, arguments: Arguments, closing: Callable[[], bool], request: MotionRequest | None = None
 ) -> Envelope:
     """Start a policy and wait for its end or for ``closing``."""
-    name = None
-    if isinstance(robot, WorldRobot):
-        name = arguments.get("robot_name") or (robot.list_robots() or [""])[0]
+    name = (arguments.get("robot_name") or next(iter(robots_in(robot)), "")) if holds_robots(robot) else None
     ends: list[RolloutEvent] = []
 
     def observe(event: RolloutEvent) -> None:
@@ -214,7 +213,7 @@ def _awaited_end(  # noqa: PLR0917 - one call, for the length of run_to_end
     deadline: float,
     closing: Callable[[], bool],
 ) -> Envelope:
-    while not ends and _moving(robot, name):
+    while not ends and task_runs(robot, name or ""):
         if closing():
             return error("execute: this peer left the mesh while the policy ran.", started=started)
         if time.monotonic() >= deadline:
@@ -222,21 +221,15 @@ def _awaited_end(  # noqa: PLR0917 - one call, for the length of run_to_end
         time.sleep(POLL_S)
     # A rollout that runs no more has told its end, or is about to.
     last = time.monotonic() + END_EVENT_S
-    while not ends and not isinstance(robot, TaskRobot) and time.monotonic() < last:
+    while not ends and holds_robots(robot) and time.monotonic() < last:
         time.sleep(POLL_S)
     if not ends:
-        return robot.get_task_status() if isinstance(robot, TaskRobot) else {**started, "state": "unknown"}
+        return {**started, "state": "unknown"} if holds_robots(robot) else robot.get_task_status()
     end = ends[-1]
     facts = {"state": end.state, "task_status": end.state, "step_count": end.step, "elapsed_s": end.elapsed_s}
     if end.state == "error":
         return error(f"execute: {end.error or 'the policy failed'}", robot=end.robot, **facts)
     return success(f"{end.robot} {end.state} after {end.step} steps.", robot=end.robot, **facts)
-
-
-def _moving(robot: Robot, name: str | None) -> bool:
-    if isinstance(robot, WorldRobot):
-        return any(row.get("robot") == name for row in robot.list_policies_running())
-    return str(robot.get_task_status().get("task_status", "")).lower() in RUNNING
 
 
 def _accepted(method: Callable[..., Any], options: dict[str, Any]) -> set[str]:
@@ -263,7 +256,7 @@ def releases_torque(robot: Any) -> bool:
 
 def takes_tasks(robot: Any) -> bool:
     """Return True for a robot that follows policies, and a world with one in it."""
-    if _holds_robots(robot):
+    if holds_robots(robot):
         return bool(robot.list_robots())
     body = body_of(robot)
     return callable(getattr(body, "start_task", None)) and getattr(body, "takes_tasks", True) is not False
@@ -271,12 +264,7 @@ def takes_tasks(robot: Any) -> bool:
 
 def is_world(robot: Any) -> bool:
     """Return True for a world, whose physics can be stepped and reset."""
-    return _holds_robots(robot) and getattr(robot, "whole", True) is not False
-
-
-def _holds_robots(robot: Any) -> bool:
-    # Asked for every heartbeat; to check the whole contract takes 20 us.
-    return callable(getattr(robot, "list_robots", None))
+    return holds_robots(robot) and getattr(robot, "whole", True) is not False
 
 
 GET_FEATURES = Verb(

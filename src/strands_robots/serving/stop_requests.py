@@ -14,9 +14,9 @@ from functools import partial
 
 from strands_robots.contract import Haltable
 from strands_robots.safety.stop_executor import StopExecutor, stop_executor
-from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.workers import UNBOUNDED
+from strands_robots.stop_log import stop_logger
 
 logger = stop_logger(__name__)
 

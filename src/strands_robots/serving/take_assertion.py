@@ -12,7 +12,7 @@ from typing import Any
 
 from strands_robots.safety import ed25519
 from strands_robots.safety.resume import NEWEST_S, OLDEST_S
-from strands_robots.utils import shown
+from strands_robots.utils import canonical_json, shown
 
 PURPOSE = "take-control"
 TAKE_FIELDS = frozenset({"v", "purpose", "robot", "epoch", "t", "nonce", "sig"})
@@ -34,7 +34,7 @@ def sign_take(signing_key: Any, robot: str, epoch: int, *, clock: Callable[[], f
         "t": clock(),
         "nonce": secrets.token_hex(16),
     }
-    return {**body, "sig": ed25519.encode(signing_key.sign(ed25519.canonical(body)))}
+    return {**body, "sig": ed25519.encode(signing_key.sign(canonical_json(body)))}
 
 
 def unproven(assertion: object, robot: str, keys: Sequence[bytes]) -> str | None:
@@ -49,7 +49,7 @@ def unproven(assertion: object, robot: str, keys: Sequence[bytes]) -> str | None
     body = {name: value for name, value in assertion.items() if name != "sig"}
     signature = ed25519.decode(assertion["sig"], 64)
     try:
-        signed = signature is not None and ed25519.signed_by_one_of(keys, signature, ed25519.canonical(body))
+        signed = signature is not None and ed25519.signed_by_one_of(keys, signature, canonical_json(body))
     except ValueError:  # a number that JSON cannot carry
         signed = False
     if not signed:

@@ -13,8 +13,8 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 
-from strands_robots.safety.stop_log import stop_logger
 from strands_robots.simulation.physics import Physics
+from strands_robots.stop_log import stop_logger
 
 logger = stop_logger(__name__)
 

@@ -33,7 +33,6 @@ from strands_robots.policies.rollout import (
 )
 from strands_robots.safety.gate import MotionGate, MotionRequest, Permit, Waiting, answered
 from strands_robots.safety.halted_verbs import halted_with_verbs, verbs_to_end
-from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stop_targets import note_motion
 from strands_robots.safety.stopping import PendingVerdict, StopLevel, StopVerdict, halts_in_parts, read_verdict
 from strands_robots.simulation.body import PICTURE, RobotBody
@@ -45,6 +44,7 @@ from strands_robots.simulation.plan import ObjectPlan, Plan, RobotPlan
 from strands_robots.simulation.rendering import Renderer, camera_names
 from strands_robots.simulation.stage import compile_stage, in_floor, sunk_sentence
 from strands_robots.simulation.stop_torque import StopTorque
+from strands_robots.stop_log import stop_logger
 from strands_robots.teleop_mixin import TeleopMixin
 from strands_robots.utils import ValidationError, choice, flag, identifier, number, shown, text, whole
 

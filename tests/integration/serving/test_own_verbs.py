@@ -21,10 +21,11 @@ from strands_robots.device_connect import (
 )
 from strands_robots.device_connect.stop_link import stop_link
 from strands_robots.mesh import init_mesh, session
-from strands_robots.safety.approval import Grants, state_dir
+from strands_robots.safety.approval import Grants
 from strands_robots.safety.estop_listener import ESTOP, notification
 from strands_robots.safety.orders import new_epoch
 from strands_robots.safety.stopping import Outcome, grade
+from strands_robots.state_files import state_dir
 from strands_robots.utils import ValidationError
 
 NUMBERS = itertools.count(1)

@@ -27,7 +27,7 @@ from strands_robots.drivers.reachy.links import (
 from strands_robots.drivers.reachy.rest import DaemonError, DaemonNotFoundError, DaemonUnreachableError, RestClient
 from strands_robots.drivers.reachy.stop_rounds import prepare
 from strands_robots.drivers.reachy.target import HeadPose
-from strands_robots.safety.stop_log import stop_logger
+from strands_robots.stop_log import stop_logger
 from strands_robots.utils import ValidationError, choice, port
 
 logger = stop_logger(__name__)

@@ -28,7 +28,7 @@ from strands_robots.drivers.reachy.rest import (
     url_host,
 )
 from strands_robots.drivers.reachy.target import Target
-from strands_robots.safety.stop_log import stop_logger
+from strands_robots.stop_log import stop_logger
 from strands_robots.utils import ValidationError, identifier, missing_extra, shown
 from strands_robots.zenoh_sockets import close_in_background
 

@@ -26,8 +26,8 @@ from strands_robots.drivers.reachy.target import STREAM_HZ, Frames, Gesture, Hea
 from strands_robots.envelope import error, success
 from strands_robots.policies.rollout import RolloutObservers
 from strands_robots.safety.gate import MotionGate, MotionRefused, MotionRequest, Permit
-from strands_robots.safety.stop_log import stop_logger
 from strands_robots.safety.stopping import StopVerdict, halt_each
+from strands_robots.stop_log import stop_logger
 from strands_robots.utils import ValidationError
 
 logger = stop_logger(__name__)

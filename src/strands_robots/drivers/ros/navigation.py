@@ -12,7 +12,7 @@ from strands_robots.drivers.ros.motion import BaseMotion
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.ros.link import Goal, GoalReport, Message, RosError, RosLink, run_goal
 from strands_robots.safety.gate import Permit
-from strands_robots.safety.stop_log import stop_logger
+from strands_robots.stop_log import stop_logger
 from strands_robots.utils import MissingExtraError
 
 logger = stop_logger(__name__)

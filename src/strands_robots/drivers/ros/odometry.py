@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from strands_robots.ros.link import Message, RosError, RosLink, Unwatch
-from strands_robots.safety.stop_log import stop_logger
+from strands_robots.stop_log import stop_logger
 from strands_robots.utils import MissingExtraError
 
 logger = stop_logger(__name__)

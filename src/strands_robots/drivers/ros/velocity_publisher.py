@@ -17,7 +17,7 @@ from strands_robots.ros.link import (
     UrgentLink,
 )
 from strands_robots.safety.gate import MotionsHeldError, Permit, PermitVoidError
-from strands_robots.safety.stop_log import stop_logger
+from strands_robots.stop_log import stop_logger
 
 logger = stop_logger(__name__)
 

@@ -1,4 +1,4 @@
-"""Owner, mode and age of the state files: lockouts, grants, clearances, keys.
+"""State directory, with owner, mode and age of its files: lockouts, grants, keys.
 
 A file counts only when it and every folder up to the state directory belong to this user and nobody else may write
 them. What a program does with a file that does not count is its own: a robot comes up locked, a grant is void. Ages are
@@ -13,8 +13,9 @@ import stat
 import time
 from pathlib import Path
 
+from strands_robots import settings
 from strands_robots.errors import StrandsRobotsError
-from strands_robots.safety.stop_log import stop_logger
+from strands_robots.stop_log import stop_logger
 
 logger = stop_logger(__name__)
 
@@ -27,6 +28,12 @@ _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
 class StateFileError(StrandsRobotsError, ValueError):
     """A state file that does not count; the message names it and says why."""
+
+
+def state_dir() -> Path:
+    """Return the directory of the state files, ``STRANDS_STATE_DIR`` first."""
+    stated = settings.raw("STRANDS_STATE_DIR")
+    return Path(stated).expanduser() if stated else Path.home() / ".strands_robots"
 
 
 def make_private(folder: Path) -> None:

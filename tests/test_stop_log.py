@@ -13,7 +13,7 @@ from fixtures.waiting import eventually
 from strands_robots.safety.orders import StopOrder, new_epoch
 from strands_robots.safety.plane import SafetyPlane
 from strands_robots.safety.stop_executor import StopExecutor
-from strands_robots.safety.stop_log import RECORDS_MAX, LogWriter, flush_stop_log, stop_logger
+from strands_robots.stop_log import RECORDS_MAX, LogWriter, flush_stop_log, stop_logger
 
 
 class PausedTerminal(logging.Handler):

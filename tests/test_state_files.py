@@ -10,11 +10,12 @@ from pathlib import Path
 import pytest
 from fixtures.waiting import eventually
 
-from strands_robots.safety import approval, clearance, state_files
+from strands_robots import state_files
+from strands_robots.safety import approval, clearance
 from strands_robots.safety.approval import Grants
 from strands_robots.safety.lockout import OVERFLOW, Lockout, LockoutState
 from strands_robots.safety.persistence import LockoutStore, StoredLockout
-from strands_robots.safety.state_files import StateFileError, adopt, read_private, uptime
+from strands_robots.state_files import StateFileError, adopt, read_private, uptime
 
 KEY = "hardware:so100:/dev/ttyACM0"
 FREE = StoredLockout(name="arm-1")
