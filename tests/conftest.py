@@ -18,6 +18,8 @@ from strands_robots.audit import flush_audit
 from strands_robots.policies import settling
 from strands_robots.safety.stop_log import flush_stop_log
 
+INTEGRATION = Path(__file__).parent / "integration"
+
 # What is set in the shell that starts the tests would change what they say; how pictures are made stays as it is.
 for setting in settings.declared():
     if setting.name not in {"DISPLAY", "MUJOCO_GL"}:
@@ -39,6 +41,15 @@ if find_spec("hypothesis"):
 # A shell starts background jobs with Ctrl-C ignored, and every process that a test starts would inherit that.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mix the files that start processes with those that do not, so that neither leaves the processors idle."""
+    groups: tuple[dict[Path, None], dict[Path, None]] = ({}, {})
+    for item in items:
+        groups[INTEGRATION in item.path.parents].setdefault(item.path)
+    place = {path: (n + 0.5) / len(group) for group in groups for n, path in enumerate(group)}
+    items.sort(key=lambda item: place[item.path])
 
 
 @pytest.fixture(autouse=True, scope="module")
