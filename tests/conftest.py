@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import os
 import signal
+import tempfile
 import threading
 from collections.abc import Iterator
 from importlib.util import find_spec
@@ -66,11 +67,16 @@ def state_directory_of_the_file(tmp_path_factory: pytest.TempPathFactory) -> Ite
         yield
 
 
+@pytest.fixture(scope="session")
+def state_directories(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The parent of all tests' state directories: pytest numbers what it makes, and looks at all of them for each."""
+    return tmp_path_factory.mktemp("states")
+
+
 @pytest.fixture(autouse=True)
-def state_directory(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def state_directory(state_directories: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """The directory of grants, lockouts and the audit of this test, mode 0700."""
-    directory = tmp_path_factory.mktemp("state")
-    directory.chmod(0o700)
+    directory = Path(tempfile.mkdtemp(prefix="state", dir=state_directories))
     monkeypatch.setenv("STRANDS_STATE_DIR", str(directory))
     # Whoever reads the audit waits for a slow disk.
     monkeypatch.setattr(audit, "FLUSH_S", 20.0)
