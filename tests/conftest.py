@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
+import tempfile
 import threading
 from collections.abc import Iterator
 from importlib.util import find_spec
@@ -17,6 +19,8 @@ from strands_robots import audit, settings
 from strands_robots.audit import flush_audit
 from strands_robots.policies import settling
 from strands_robots.stop_log import flush_stop_log
+
+INTEGRATION = Path(__file__).parent / "integration"
 
 # What is set in the shell that starts the tests would change what they say; how pictures are made stays as it is.
 for setting in settings.declared():
@@ -41,6 +45,20 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mix the files that start processes with those that do not, so that neither leaves the processors idle."""
+    groups: tuple[dict[Path, None], dict[Path, None]] = ({}, {})
+    for item in items:
+        groups[INTEGRATION in item.path.parents].setdefault(item.path)
+    place = {path: (n + 0.5) / len(group) for group in groups for n, path in enumerate(group)}
+    items.sort(key=lambda item: place[item.path])
+
+
+def pytest_collection_finish() -> None:
+    """Keep what collecting made from being looked at by each full garbage collection: a million objects that stay."""
+    gc.freeze()
+
+
 @pytest.fixture(autouse=True, scope="module")
 def state_directory_of_the_file(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """The state directory of what a whole file shares: its robots start before a test's own directory is set."""
@@ -49,11 +67,16 @@ def state_directory_of_the_file(tmp_path_factory: pytest.TempPathFactory) -> Ite
         yield
 
 
+@pytest.fixture(scope="session")
+def state_directories(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The parent of all tests' state directories: pytest numbers what it makes, and looks at all of them for each."""
+    return tmp_path_factory.mktemp("states")
+
+
 @pytest.fixture(autouse=True)
-def state_directory(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def state_directory(state_directories: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """The directory of grants, lockouts and the audit of this test, mode 0700."""
-    directory = tmp_path_factory.mktemp("state")
-    directory.chmod(0o700)
+    directory = Path(tempfile.mkdtemp(prefix="state", dir=state_directories))
     monkeypatch.setenv("STRANDS_STATE_DIR", str(directory))
     # Whoever reads the audit waits for a slow disk.
     monkeypatch.setattr(audit, "FLUSH_S", 20.0)

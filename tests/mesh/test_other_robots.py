@@ -14,7 +14,7 @@ from tests.mesh.peers import Fleet
 from strands_robots.drivers.reachy import ReachyDriver
 from strands_robots.drivers.ros.ros_bridge import RosBridgedRobot
 from strands_robots.mesh.core import Mesh
-from strands_robots.ros.link import Goal
+from strands_robots.ros.link import Goal, OnMessage, Unwatch
 from strands_robots.ros.memory import MemoryLink
 from strands_robots.safety.approval import Grants
 from strands_robots.state_files import state_dir
@@ -23,9 +23,19 @@ NAV = "/navigate_to_pose"
 STANDING = {"twist": {"twist": {"linear": {"x": 0.0}, "angular": {"z": 0.0}}}}
 
 
+class StandingBase(MemoryLink):
+    """A graph on which the odometry of a base that stands is told to each new reader."""
+
+    def watch(self, topic: str, kind: str | None, on_message: OnMessage) -> Unwatch:
+        unwatch = super().watch(topic, kind, on_message)
+        if topic == "/odom":
+            on_message(STANDING)
+        return unwatch
+
+
 @pytest.fixture
 def link() -> MemoryLink:
-    return MemoryLink()
+    return StandingBase()
 
 
 @pytest.fixture

@@ -280,7 +280,7 @@ def test_robot_never_locks_again_by_an_epoch_that_it_was_resumed_from(
     there.link.change(False)
     for _ in range(400):
         epoch = bus.stop()
-        eventually(lambda epoch=epoch: epoch in away.epochs())  # type: ignore[misc]
+        eventually(lambda epoch=epoch: epoch in away.epochs(), every=0.001)  # type: ignore[misc]
         away.plane.clear_local("test")
     there.link.change(True)
     away.listener.awake()

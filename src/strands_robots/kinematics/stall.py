@@ -65,6 +65,7 @@ class StallWatch:
     def __init__(self, lag: float) -> None:
         self._lag = lag
         self._seen: list[tuple[float, Floats, Floats]] = []
+        self._times: list[float] = []
         self._counts: Floats = np.zeros(0)
         self._lowest: Floats = np.zeros(0)
         self._reads = True
@@ -85,13 +86,14 @@ class StallWatch:
         if self._seen and now <= self._seen[-1][0]:
             return None
         self._seen.append((now, told, joints))
+        self._times.append(now)
         # The first look stays, for the distance at the start.
         while len(self._seen) > 2 and self._seen[1][0] < now - DELAY_S - SLOW_WINDOWS_S[-1] - 0.1:
-            del self._seen[1]
+            del self._seen[1], self._times[1]
         if not len(self._counts):
             self._counts = np.zeros(len(joints))
             self._lowest = np.full(len(joints), np.nan)
-        lags, steady = np.max([self._still(now, window) for window in (*WINDOWS_S, *SLOW_WINDOWS_S)], axis=0)
+        lags, steady = self._still(now)
         # Where the lag is enough, nothing is read.
         pressing = self._pressing(np.where(lags >= self._lag, -np.inf, steady), currents)
         self._counts = np.where((lags >= self._lag) | pressing, self._counts + 1, 0)
@@ -112,26 +114,31 @@ class StallWatch:
         result: np.ndarray[Any, np.dtype[np.bool_]] = (lags >= PRESS_LAG) & (rise >= np.fmax(RISE_A, self._lowest))
         return result
 
-    def _still(self, now: float, window: float) -> Floats:
+    def _still(self, now: float) -> Floats:
         """Return the lag of joints that do not follow, and of those that stand still.
 
-        Both are minus infinity for the other joints.
+        Both are the greatest of all windows, and minus infinity for the other joints.
         A joint that sinks under its payload as a motion begins draws more and more, and does not stand still.
         """
         first, last = self._seen[0], self._seen[-1]
-        if now - window < self._seen[1 if len(self._seen) > 1 else 0][0]:
+        oldest = self._seen[1 if len(self._seen) > 1 else 0][0]
+        windows = [window for window in (*WINDOWS_S, *SLOW_WINDOWS_S) if now - window >= oldest]
+        if not windows:
             return np.full((2, len(last[2])), -np.inf)
-        before, earlier, earliest = (self._at(now - back) for back in (window, DELAY_S, DELAY_S + window))
-        told, told_before = last[1] - before[1], earlier[1] - earliest[1]
+        # One row for each window: the control thread has no time for one after another.
+        before, earliest = ([self._at(now - delay - window) for window in windows] for delay in (0.0, DELAY_S))
+        told = last[1] - np.array([look[1] for look in before])
+        told_before = self._at(now - DELAY_S)[1] - np.array([look[1] for look in earliest])
         way = np.where(told * told_before > 0, np.sign(told) * np.minimum(np.abs(told), np.abs(told_before)), 0.0)
-        gone = (last[2] - before[2]) * np.sign(way)
+        gone = (last[2] - np.array([look[2] for look in before])) * np.sign(way)
         lag = ((last[1] - last[2]) - (first[1] - first[2])) * np.sign(way)
-        if window in SLOW_WINDOWS_S:
-            way = np.where(np.abs(way) >= SLOW_SHARE * np.abs(told).max(), way, 0.0)
+        fast = np.array([[window in WINDOWS_S] for window in windows])
+        way = np.where(fast | (np.abs(way) >= SLOW_SHARE * np.abs(told).max(axis=1, keepdims=True)), way, 0.0)
         most = np.minimum(FOLLOWED * np.abs(way), STILL)
         behind = (np.abs(way) >= TOLD) & (gone <= most)
-        return np.where([behind, behind & (gone >= -most)], lag, -np.inf)
+        found: Floats = np.where([behind, behind & (gone >= -most)], lag, -np.inf).max(axis=1)
+        return found
 
     def _at(self, when: float) -> tuple[float, Floats, Floats]:
         """Return the last look at or before a time, else the first."""
-        return self._seen[max(0, bisect_right(self._seen, when, key=lambda look: look[0]) - 1)]
+        return self._seen[max(0, bisect_right(self._times, when) - 1)]

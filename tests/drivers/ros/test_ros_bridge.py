@@ -185,9 +185,11 @@ def test_goal_with_an_interrupted_wait_is_in_doubt(
         robot.navigate_to(1.0, 2.0)
     assert (robot.get_task_status()["task_status"], stack.cancels) == ("error", 1)
     assert events == [("started", "running"), ("finished", "error")]
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.2")
     verdict = robot.halt("test")
     assert verdict.stopped is False
     assert "interrupted" in verdict.not_stopped["navigation"]
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "20")
     memory(robot).serve(NAV, begun)
     stack.at_once = 4
     assert robot.navigate_to(1.0, 2.0)["goal_state"] == "succeeded"

@@ -210,7 +210,7 @@ def test_robot_that_requires_check_ins_locks_when_the_controller_leaves(site: Si
             assert lockouts() == []
             terminal.press("q")
             assert terminal.process.wait(WITHIN_S) == 0
-            eventually(lockouts, within=60)
+            eventually(lockouts, within=60, every=0.5)
             assert "desk-3" in str(lockouts())
             assert site.wave("arm-6")[0] == 1
     assert site.json("resume", "--local", "arm-6")[0] == 0

@@ -278,7 +278,7 @@ def test_twenty_failed_bring_ups_leave_nothing(world: ToyWorld) -> None:
     before = open_things()
     for _ in range(10):
         with pytest.raises(OSError):
-            init_device_connect_sync(world, link=absent, bringup_timeout=1.0)
+            init_device_connect_sync(world, link=absent, bringup_timeout=0.4)
         with pytest.raises(OSError, match="no such bus"):
             init_device_connect_sync(Broken(world), link=link)
     settles(before, spare=2)

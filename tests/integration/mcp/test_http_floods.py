@@ -7,7 +7,7 @@ import resource
 import ssl
 import time
 from collections.abc import Iterator
-from contextlib import AsyncExitStack, ExitStack
+from contextlib import AsyncExitStack, ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
@@ -40,8 +40,21 @@ def tokens(site: McpSite) -> dict[str, str]:
 
 @pytest.fixture
 def url(site: McpSite, tokens: dict[str, str]) -> Iterator[str]:
+    with limited(site) as address:
+        yield address
+
+
+@pytest.fixture(scope="module")
+def standing(site: McpSite, tokens: dict[str, str]) -> Iterator[str]:
+    """The address of a server that outlives one flood after another."""
+    with limited(site) as address:
+        yield address
+
+
+@contextmanager
+def limited(site: McpSite) -> Iterator[str]:
+    """Run a server with as many descriptors as a process may have by default."""
     with site.http() as address:
-        # What a process may have by default.
         resource.prlimit(site.server.pid, resource.RLIMIT_NOFILE, (DESCRIPTORS, DESCRIPTORS))
         yield address
 
@@ -53,14 +66,14 @@ def bearer(token: str) -> dict[str, str]:
 @BOTH
 @pytest.mark.parametrize("kind", KINDS)
 async def test_half_sent_requests_delay_no_stop(
-    site: McpSite, url: str, tokens: dict[str, str], mode: str, kind: str
+    site: McpSite, standing: str, tokens: dict[str, str], mode: str, kind: str
 ) -> None:
-    async with site.http_client(url, tokens["desk"], mode=mode) as client:
+    async with site.http_client(standing, tokens["desk"], mode=mode) as client:
         for _ in range(2):
-            with half_sent(url, HALF_SENT, beginning(kind, tokens["desk"])):
+            with half_sent(standing, HALF_SENT, beginning(kind, tokens["desk"])):
                 began = time.monotonic()
                 assert not (await client.call_tool("stop", {"robot": "arm-1"})).is_error
-                async with site.http_client(url, tokens["desk"], mode=mode) as another:
+                async with site.http_client(standing, tokens["desk"], mode=mode) as another:
                     assert not (await another.call_tool("stop", {"robot": "arm-1"})).is_error
                 assert time.monotonic() - began < STOP_S
 

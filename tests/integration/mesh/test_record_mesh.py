@@ -33,6 +33,11 @@ def recorded_cameras(run: Path) -> set[str]:
     return {item.camera for item in read_items(run) if isinstance(item, RecordedPicture)}
 
 
+def has_joints(run: Path) -> bool:
+    """Return whether a robot's joints are in the recording so far."""
+    return any(isinstance(item, RecordedJoints) for item in read_items(run))
+
+
 def start_process(*arguments: str) -> Any:
     return subprocess.Popen([*COMMAND, *arguments, "--json"], stdout=subprocess.PIPE, text=True)
 
@@ -50,6 +55,7 @@ def test_states_pictures_and_stops_of_a_served_world_are_recorded(
         recording = start_process("record", "arm-1", "--out", str(run), "--mesh")
         try:
             eventually(lambda: run.exists() and run.stat().st_size > 20_000 and recorded_cameras(run) >= CAMERAS)
+            eventually(lambda: has_joints(run))
             console.ask("estop")
             eventually(
                 lambda: "emergencyStop" in {item.event for item in read_items(run) if isinstance(item, RecordedEvent)}
