@@ -10,7 +10,7 @@ DDS_TESTS := tests/integration/ros/test_dds.py tests/integration/ros/test_dds_se
   tests/integration/ros/test_rtps_bridge.py tests/ros/test_dds_types.py tests/ros/test_dds_security.py
 # Most tests wait for another process; a file stays on one worker, so that its own tests never meet. The files begin in
 # the order of tests/conftest.py: xdist's own begins with many that wait, and leaves those that compute for the end.
-WORKERS := --numprocesses 6 --dist loadfile --no-loadscope-reorder
+WORKERS := --numprocesses 4 --dist loadfile --no-loadscope-reorder
 # These start more of them, or a browser. Reachy Mini's daemons take one fixed port, so theirs run one after another.
 PAIR := --numprocesses 2 --dist loadfile
 GL_PACKAGES := libegl1 libgl1 libgl1-mesa-dri libosmesa6
