@@ -61,7 +61,8 @@ def test_robot_of_five_verbs_goes_to_ten_degrees(robot: HardwareRobot, device: P
 def test_joints_move_together_on_a_line_and_within_the_speed_limit() -> None:
     device = PanTilt()
     motions: list[Motion] = []
-    with served(device, speed_limit={"pan.pos": 60.0}) as robot:
+    # In the proportion of the two ways, so that what follows a pause is cut alike.
+    with served(device, speed_limit={"pan.pos": 60.0, "tilt.pos": 30.0}) as robot:
         start = robot.start_motion
 
         def noted(name: str, verb: str, plan: Callable[[float, Permit], Motion]) -> Rollout:
