@@ -114,6 +114,8 @@ def test_emergency_stop_locks_every_robot_until_the_operator_resumes_it(cell: Ce
 
 def test_one_robot_is_stopped_and_resumed_alone(cell: Cell) -> None:
     cell.move()
+    # Of a robot that nobody knows yet it is not sure on which network it is, so every robot of the others would stop.
+    assert [robot.id for robot in cell.fleet.robots()] == sorted(cell.toys)
     one, *others = sorted(cell.toys)
     stop = cell.fleet.estop(only=one)
     assert stop[one].stopped is True
