@@ -12,10 +12,10 @@ from fixtures.waiting import eventually
 from tests.cli.conftest import Run
 
 from strands_robots.cli import peers
+from strands_robots.fleet.mesh.joining import joined_mesh
 from strands_robots.mesh import Mesh
 from strands_robots.mesh.session import clear_peers
 from strands_robots.mesh.transport import zenoh_config
-from strands_robots.tools.networks import joined_mesh
 
 
 @pytest.fixture
