@@ -18,7 +18,7 @@ from strands_robots.envelope import Envelope, success
 from strands_robots.fleet.device_connect.network import DeviceConnectNetwork
 from strands_robots.fleet.mesh import network
 from strands_robots.fleet.mesh.joining import joined_mesh
-from strands_robots.mesh import init_mesh, safety
+from strands_robots.mesh import Mesh, init_mesh, safety
 from strands_robots.mesh.session import clear_peers
 from strands_robots.mesh.transport import zenoh_config
 from strands_robots.serving.advertised import AdvertisedVerb, find_verb
@@ -218,7 +218,16 @@ def barista(on_the_mesh: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bari
 def test_own_verb_of_a_mesh_peer_is_waited_for_as_long_as_it_lasts(barista: Barista) -> None:
     answer = networks.network().call("bar-1", "brewCoffee", {"cups": 2}, seconds=1e-6)
     assert answer["cups"] == 2
-    assert "did not answer" in networks.network().call("bar-1", "status", {}, seconds=1e-6)["reason"]
+
+
+def test_silent_peer_of_the_mesh_is_named(barista: Barista, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Mesh, "send", lambda *_: {"status": "timeout"})
+    assert robot_mesh(action="status", target="bar-1")["reason"] == "bar-1 did not answer."
+
+
+def test_refusal_of_a_peer_of_the_mesh_keeps_its_words(barista: Barista, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Mesh, "send", lambda *_: {"type": "error", "error": "validation: cups is missing."})
+    assert robot_mesh(action="status", target="bar-1")["reason"] == "bar-1: validation: cups is missing."
 
 
 def test_peers_of_the_mesh_are_listed_with_the_verbs_that_they_have(barista: Barista) -> None:
