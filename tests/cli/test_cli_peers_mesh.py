@@ -12,10 +12,12 @@ from fixtures.waiting import eventually
 from tests.cli.conftest import Run
 
 from strands_robots.cli import peers
+from strands_robots.fleet.adapter import FoundRobot
+from strands_robots.fleet.mesh.joining import joined_mesh
+from strands_robots.fleet.mesh.network import MeshNetwork
 from strands_robots.mesh import Mesh
 from strands_robots.mesh.session import clear_peers
 from strands_robots.mesh.transport import zenoh_config
-from strands_robots.tools.networks import joined_mesh
 
 
 @pytest.fixture
@@ -49,9 +51,55 @@ def test_argument_that_does_not_fit_an_own_verb_is_exit_2(run: Run, barista: Bar
     assert barista.writes == 0
 
 
+def test_peers_of_the_mesh_are_listed_and_what_one_can_do(run: Run, barista: Barista) -> None:
+    listed = json.loads(run("peers", "--mesh", "--timeout", "0.1", "--json").stdout)["peers"]
+    (bar,) = (row for row in listed if row["peer_id"] == "bar-1")
+    assert (bar["type"], bar["reachable"], bar["locked"]) == ("robot", True, False)
+    assert "bar-1" in run("peers", "--mesh", "--timeout", "0.1").stdout
+    assert "brewCoffee (its own)" in run("peers", "bar-1", "--mesh", "--timeout", "0.1").stdout
+
+
+@pytest.mark.parametrize(
+    ("facts", "said"),
+    [
+        ({"estop_unheard": True, "locked": True}, "CANNOT RECEIVE STOPS"),
+        ({"distrusted": "its key is another one", "locked": True}, "its key is another one"),
+        ({"locked": True}, "LOCKED"),
+        ({}, "idle"),
+    ],
+)
+def test_state_of_a_peer_that_matters_most_is_shown(
+    run: Run, barista: Barista, monkeypatch: pytest.MonkeyPatch, facts: dict[str, Any], said: str
+) -> None:
+    found = FoundRobot("arm-1", "robot", status="idle", age_s=0.1, facts=facts)
+    monkeypatch.setattr(MeshNetwork, "listed", lambda *_: [found])
+    assert said in run("peers", "--mesh").stdout
+
+
+def test_mesh_without_peers_is_exit_3(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STRANDS_MESH_BACKEND", "memory")
+    clear_peers()
+    result = run("peers", "--mesh", "--timeout", "0.1")
+    assert (result.exit_code, result.stderr) == (3, "No peer is on the mesh of this machine.\n")
+
+
+@pytest.mark.parametrize("command", [("stop", "arm-1"), ("stop", "--all"), ("estop",)])
+def test_stop_on_a_mesh_that_is_off_is_exit_3(
+    run: Run, monkeypatch: pytest.MonkeyPatch, command: tuple[str, ...]
+) -> None:
+    monkeypatch.setenv("STRANDS_MESH", "false")
+    result = run(*command, "--mesh", "--json")
+    said = json.loads(result.stdout)
+    assert (result.exit_code, said["stopped"]) == (3, None)
+    assert "native mesh is off" in said["reason"]
+
+
 @pytest.mark.parametrize(("device", "said"), [("bar-1", "bar-1 did not answer."), ("bar-2", "Near it: bar-1.")])
-def test_no_answer_is_exit_3(run: Run, barista: Barista, device: str, said: str) -> None:
-    result = run("call", "--mesh", device, "status", "--timeout", "0.000001")
+def test_no_answer_is_exit_3(
+    run: Run, barista: Barista, monkeypatch: pytest.MonkeyPatch, device: str, said: str
+) -> None:
+    monkeypatch.setattr(Mesh, "send", lambda *_: {"status": "timeout"})
+    result = run("call", "--mesh", device, "status")
     assert result.exit_code == 3
     assert said in result.stderr
 

@@ -9,7 +9,7 @@ from strands_robots.envelope import Envelope, error, success
 from strands_robots.errors import NoSuchRobotError, UnknownVerbError, UnreachableError
 from strands_robots.fleet.adapter import DEVICE_CONNECT, FIND_S, STOP_S, FoundRobot, OnEvent
 from strands_robots.fleet.lockout_report import LockoutReport, Resumed
-from strands_robots.fleet.stop_answers import measured
+from strands_robots.fleet.stop_answers import measured, roster_verdict, unanswered
 from strands_robots.safety.identity import SigningIdentity
 from strands_robots.safety.lockout import Lockout
 from strands_robots.safety.network_key import NetworkKey
@@ -17,6 +17,7 @@ from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope
 from strands_robots.safety.silence import Sending
 from strands_robots.safety.statements import Purpose, signed
 from strands_robots.safety.stop_roster import StopOutcome, StopRoster
+from strands_robots.serving.advertised import AdvertisedVerb, find_verb
 
 Answer = Callable[[Mapping[str, Any]], Envelope]
 
@@ -52,6 +53,7 @@ class ScriptedNetwork:
 
     announces_verbs = True
     reads: Mapping[str, str] = {"status": "getStatus", "state": "getState", "features": "getFeatures"}
+    starts = "execute"
 
     def __init__(self, name: str = DEVICE_CONNECT, robots: Mapping[str, object] | None = None) -> None:
         self.name = name
@@ -87,6 +89,12 @@ class ScriptedNetwork:
     def find(self, timeout: float = FIND_S) -> list[FoundRobot]:
         return [FoundRobot(name, "strands_robot", "so100") for name in self.robots]
 
+    def listed(self, timeout: float | None = None) -> list[FoundRobot]:
+        return self.find()
+
+    def known(self, robot: str) -> FoundRobot:
+        return FoundRobot(robot)
+
     def bears(self, robot: str) -> bool:
         return robot in self.robots
 
@@ -98,6 +106,12 @@ class ScriptedNetwork:
 
     def describe(self, robot: str, *, anew: bool = False) -> object:
         return self.robots[robot]
+
+    def describe_each(self, robots: Iterable[str]) -> Mapping[str, object]:
+        return {name: self.robots[name] for name in robots}
+
+    def verb(self, robot: str, name: str) -> AdvertisedVerb | None:
+        return find_verb(self.robots.get(robot), name)
 
     def call(self, robot: str, verb: str, arguments: Mapping[str, Any], timeout: float) -> Envelope:
         self.calls.append((robot, verb, dict(arguments), timeout))
@@ -113,9 +127,11 @@ class ScriptedNetwork:
             raise UnknownVerbError("Method not found")
         return success("done", verb=verb)
 
-    def stop(self, robot: str, timeout: float = STOP_S, robot_name: str = "") -> Envelope | None:
+    def stop(
+        self, robot: str, timeout: float = STOP_S, robot_name: str = "", *, insist: bool = False
+    ) -> Envelope | None:
         if robot not in self.robots:
-            return None
+            return unanswered(robot) if insist else None
         self.stopped.append(robot)
         if isinstance(self.stops, Exception):
             raise self.stops
@@ -153,6 +169,12 @@ class ScriptedNetwork:
         answers = {name: self.stop(name) or error("none") for name in self.robots if scope.covers(name, frozenset())}
         self.locked |= dict.fromkeys(answers, estop_id)
         return measured(answers, self._roster(scope), Sending(), estop_id)
+
+    def silence(self, robot: str) -> str:
+        return ""
+
+    def verdict(self, outcome: StopOutcome) -> Envelope:
+        return roster_verdict(outcome)
 
     def _roster(self, scope: Scope = EVERY_ROBOT) -> StopRoster:
         roster = StopRoster(self.key, scope=scope)

@@ -3,8 +3,8 @@ from __future__ import annotations
 import base64
 import subprocess
 import sys
-import threading
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,19 +14,16 @@ from fixtures.mesh_robots import Arm, World
 from fixtures.waiting import eventually
 
 from strands_robots.device_connect.discovery import Peer
-from strands_robots.envelope import Envelope, error, success
-from strands_robots.fleet.mesh import discovery, stops
-from strands_robots.fleet.mesh.standing import mesh_network
-from strands_robots.fleet.stop_answers import combined_verdict
-from strands_robots.mesh import init_mesh, safety
+from strands_robots.envelope import Envelope, success
+from strands_robots.fleet.device_connect.network import DeviceConnectNetwork
+from strands_robots.fleet.mesh import network
+from strands_robots.fleet.mesh.joining import joined_mesh
+from strands_robots.mesh import Mesh, init_mesh, safety
 from strands_robots.mesh.session import clear_peers
 from strands_robots.mesh.transport import zenoh_config
-from strands_robots.mesh.transport.zenoh_config import Posture
-from strands_robots.safety import stop_roster
-from strands_robots.safety.roster import Roster
 from strands_robots.serving.advertised import AdvertisedVerb, find_verb
 from strands_robots.tools import networks, robot_mesh
-from strands_robots.tools.networks import DeviceConnect, NativeMesh, joined_mesh
+from strands_robots.tools.networks import Robots
 
 
 class FakeNetwork:
@@ -155,40 +152,10 @@ def test_picture_of_a_motion_is_an_image_block_of_its_answer(monkeypatch: pytest
     assert "picture" not in shown
 
 
-def test_one_silent_robot_makes_a_stop_an_error_that_names_it() -> None:
-    answer = combined_verdict({"a": success("ok", stopped=True), "b": error("no answer in 5 s", stopped=None)})
-    assert answer["status"] == "error"
-    assert answer["silent"] == ["b"]
-    assert answer["stopped"] is None
-    assert "b" in answer["reason"]
-
-
-def test_moving_robot_outranks_a_silent_one() -> None:
-    answer = combined_verdict(
-        {
-            "a": success("ok", stopped=True),
-            "b": error("no answer", stopped=None),
-            "c": error("the bus is wedged", stopped=False),
-        }
-    )
-    assert answer["stopped"] is False
-    assert answer["not_stopped"] == ["c"]
-    assert "DID NOT STOP: c" in answer["reason"]
-
-
-def test_stop_without_any_answer_is_an_error() -> None:
-    assert combined_verdict({})["status"] == "error"
-
-
-def test_only_affirmative_answers_are_a_stop() -> None:
-    assert combined_verdict({"a": success("ok"), "b": success("ok", stopped=["arm"])})["status"] == "success"
-    assert combined_verdict({"a": {"result": "hm"}})["status"] == "error"
-
-
 @pytest.mark.parametrize("value", ["off", "OFF", "0", "false"])
 def test_native_mesh_is_used_when_device_connect_is_off(monkeypatch: pytest.MonkeyPatch, value: str) -> None:
     monkeypatch.setenv("STRANDS_ROBOT_MESH_DC", value)
-    assert isinstance(networks.network(), NativeMesh)
+    assert networks.network().joined is networks.on_mesh
 
 
 @pytest.fixture
@@ -249,9 +216,18 @@ def barista(on_the_mesh: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bari
 
 
 def test_own_verb_of_a_mesh_peer_is_waited_for_as_long_as_it_lasts(barista: Barista) -> None:
-    answer = NativeMesh().call("bar-1", "brewCoffee", {"cups": 2}, seconds=1e-6)
+    answer = networks.network().call("bar-1", "brewCoffee", {"cups": 2}, seconds=1e-6)
     assert answer["cups"] == 2
-    assert "did not answer" in NativeMesh().call("bar-1", "status", {}, seconds=1e-6)["reason"]
+
+
+def test_silent_peer_of_the_mesh_is_named(barista: Barista, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Mesh, "send", lambda *_: {"status": "timeout"})
+    assert robot_mesh(action="status", target="bar-1")["reason"] == "bar-1 did not answer."
+
+
+def test_refusal_of_a_peer_of_the_mesh_keeps_its_words(barista: Barista, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Mesh, "send", lambda *_: {"type": "error", "error": "validation: cups is missing."})
+    assert robot_mesh(action="status", target="bar-1")["reason"] == "bar-1: validation: cups is missing."
 
 
 def test_peers_of_the_mesh_are_listed_with_the_verbs_that_they_have(barista: Barista) -> None:
@@ -262,168 +238,19 @@ def test_peers_of_the_mesh_are_listed_with_the_verbs_that_they_have(barista: Bar
     assert "note" not in bar
 
 
-def test_silent_peers_hold_up_a_list_for_a_bounded_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked, given = list[str](), list[float]()
-
-    def send(peer: str, command: dict[str, Any], seconds: float) -> dict[str, Any]:
-        asked.append(peer)
-        given.append(seconds)
-        threading.Event().wait(seconds)
-        return {"status": "timeout"}
-
-    monkeypatch.setattr(networks, "LIST_S", 0.1)
-    names = [f"bar-{n}" for n in range(100)]
-    rows = [{"peer_id": name, "type": "robot", "reachable": True, "robot_kind": "mobile_base"} for name in names]
-    mesh = SimpleNamespace(peers=rows, send=send)
-    monkeypatch.setattr(networks, "_on_mesh", lambda work: work(mesh))
-    monkeypatch.setattr(networks, "discover", lambda mesh: None)
-    assert all("drive" in row["functions"] for row in NativeMesh().peers()["peers"])
-    assert len(asked) < len(names) and max(given) <= 0.1
-
-
 @pytest.mark.parametrize("verb", ["brewCoffee", "status", "stop"])
 def test_unknown_peer_is_answered_at_once_with_the_near_ones(
     barista: Barista, verb: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(networks, "STOP_S", 0.1)
+    monkeypatch.setattr(network, "STOP_S", 0.1)
     answer = robot_mesh(action="call", target="bar-2", verb=verb)
     assert answer["reason"] == "No peer 'bar-2' is on the mesh. Near it: bar-1."
-
-
-def test_discovery_of_a_stated_endpoint_outlasts_its_retry_pause() -> None:
-    pause = zenoh_config.explicit(Posture.from_settings())["connect"]["retry"]["period_max_ms"] / 1000
-    assert pause + zenoh_config.DISCOVERY_S < zenoh_config.LINK_DISCOVERY_S
-
-
-class TimedMesh:
-    """A mesh on a clock of its own: robots that come into reach at a time, and the times of its stops."""
-
-    def __init__(self, arrivals: dict[str, float], silent: frozenset[str] = frozenset()) -> None:
-        self.now, self.arrivals, self.silent = 0.0, arrivals, silent
-        self.peer_id, self.lockout_epoch, self.alive = "tool", "e" * 32, True
-        self.stops: list[float] = []
-        self.ids: set[str] = set()
-
-    @property
-    def peers(self) -> list[dict[str, Any]]:
-        return [{"peer_id": name, "reachable": True} for name, at in self.arrivals.items() if at <= self.now]
-
-    def emergency_stop(
-        self, signing_key: Any = None, *, estop_id: str = "", on_answers: Callable[[list[Any]], None]
-    ) -> list[dict[str, Any]]:
-        self.stops.append(self.now)
-        on_answers([])
-        # One press is one stop, however often it is sent.
-        self.ids.add(estop_id)
-        assert len(self.ids) == 1
-        answering = [row["peer_id"] for row in self.peers if row["peer_id"] not in self.silent]
-        return [{"responder_id": name, "result": {"ok": True, "stopped": True}} for name in answering]
-
-    def monotonic(self) -> float:
-        return self.now
-
-    def sleep(self, seconds: float) -> None:
-        self.now += seconds
-        for thread in threading.enumerate():
-            if thread.name == "stop roster":
-                # This clock is faster than the disk.
-                thread.join(0.05)
-
-    @property
-    def peers_by_id(self) -> dict[str, dict[str, Any]]:
-        return {row["peer_id"]: row for row in self.peers}
-
-    def listen(self, topic: str, heard: object, name: str) -> bool:
-        return True
-
-    def unsubscribe(self, name: str) -> None:
-        """Nothing to undo."""
-
-    def close(self) -> None:
-        self.alive = False
-
-
-@pytest.fixture
-def timed_mesh(monkeypatch: pytest.MonkeyPatch) -> Callable[..., TimedMesh]:
-    def make(arrivals: dict[str, float], **options: Any) -> TimedMesh:
-        made = TimedMesh(arrivals, **options)
-        monkeypatch.setattr("strands_robots.mesh.init_mesh", lambda *_: made)
-        monkeypatch.setattr(stops, "time", made)
-        monkeypatch.setattr(discovery, "time", made)
-        return made
-
-    return make
-
-
-def test_loopback_estop_is_sent_at_once_and_again_when_a_robot_appears(timed_mesh: Callable[..., TimedMesh]) -> None:
-    mesh = timed_mesh({"arm-1": 0.4, "arm-2": 0.5})
-    assert NativeMesh().emergency_stop("")["robots"] == {"arm-1": "stopped", "arm-2": "stopped"}
-    assert len(mesh.stops) == 2
-    assert mesh.stops[0] == 0.0
-    assert mesh.now < 1.5
-
-
-@pytest.mark.parametrize("hangs", ["roster", "keys"])
-def test_hung_disk_delays_no_further_sending(
-    timed_mesh: Callable[..., TimedMesh], monkeypatch: pytest.MonkeyPatch, hangs: str
-) -> None:
-    mesh, ended, waited = timed_mesh({"arm-1": 0.4}), threading.Event(), list[bool]()
-
-    def hang(*_: object) -> Any:
-        waited.append(ended.wait(10.0))
-        return {} if hangs == "keys" else Roster(mesh_network())
-
-    where, name = {"roster": (stop_roster.Roster, "of"), "keys": (stops, "enrolled_peers")}[hangs]
-    monkeypatch.setattr(where, name, hang)
-    try:
-        verdict = NativeMesh().emergency_stop("")
-        assert waited == []
-    finally:
-        ended.set()
-    assert len(mesh.stops) >= 2
-    assert verdict["status"] == "error"
-
-
-def test_robot_that_connects_late_to_a_listener_is_stopped(
-    timed_mesh: Callable[..., TimedMesh], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("ZENOH_LISTEN", "tcp/127.0.0.1:7447")
-    mesh = timed_mesh({"arm-1": 0.4, "arm-2": 5.0, "arm-3": 8.5})
-    assert NativeMesh().emergency_stop("")["robots"] == dict.fromkeys(("arm-1", "arm-2", "arm-3"), "stopped")
-    for arrival in mesh.arrivals.values():
-        assert any(0 <= at - arrival <= stops.AGAIN_S + discovery.LOOK_S for at in mesh.stops), mesh.stops
-    assert len(mesh.stops) == 4
-
-
-def test_connecting_peer_waits_for_its_listener(
-    timed_mesh: Callable[..., TimedMesh], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("ZENOH_CONNECT", "tcp/127.0.0.1:7447")
-    mesh = timed_mesh({"arm-1": 7.0})
-    assert NativeMesh().emergency_stop("")["stopped"] is True
-    assert mesh.now < 7.0 + 2 * zenoh_config.DISCOVERY_S
-
-
-def test_robot_that_left_without_an_answer_is_named(
-    timed_mesh: Callable[..., TimedMesh], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("ZENOH_LISTEN", "tcp/127.0.0.1:7447")
-    mesh = timed_mesh({"arm-1": 0.4, "arm-2": 0.4}, silent=frozenset({"arm-2"}))
-
-    def sleep(seconds: float) -> None:
-        mesh.now += seconds
-        if mesh.now > 4.0:
-            mesh.arrivals.pop("arm-2", None)
-
-    monkeypatch.setattr(mesh, "sleep", sleep)
-    verdict = NativeMesh().emergency_stop("")
-    assert (verdict["stopped"], verdict["silent"]) == (None, ["arm-2"])
 
 
 @pytest.mark.parametrize("value", ["auto", "on", "", "maybe"])
 def test_device_connect_is_the_default_network(monkeypatch: pytest.MonkeyPatch, value: str) -> None:
     monkeypatch.setenv("STRANDS_ROBOT_MESH_DC", value)
-    assert isinstance(networks.network(), DeviceConnect)
+    assert networks.network().joined is networks.on_device_connect
 
 
 def test_remote_network_needs_an_opt_in(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -466,7 +293,7 @@ class FakeFleet:
     def __init__(self) -> None:
         self.called: list[tuple[Any, ...]] = []
 
-    def peers(self) -> list[Peer]:
+    def peers(self, timeout: float) -> list[Peer]:
         resume = {"name": "resume", "parameters": {"properties": {"assertion": {"type": "object"}}}}
         ours = (resume, *({"name": f"{name}Control"} for name in ("acquire", "renew", "release")), {"name": "stop"})
         return [Peer("bar-1", functions=(BREW, *ours)), Peer("echo-1", functions=({"name": "echo"},))]
@@ -482,8 +309,8 @@ class FakeFleet:
 @pytest.fixture
 def fleet(monkeypatch: pytest.MonkeyPatch) -> FakeFleet:
     fake = FakeFleet()
-    monkeypatch.setattr(networks, "network", DeviceConnect)
-    monkeypatch.setattr(networks, "_on_fleet", lambda work: work(fake))
+    joined = DeviceConnectNetwork.joined(fake)  # type: ignore[arg-type]
+    monkeypatch.setattr(networks, "network", lambda: Robots(lambda: nullcontext(joined)))
     return fake
 
 
@@ -499,19 +326,3 @@ def test_peers_name_own_verbs_with_their_parameters_and_devices_that_cannot_be_s
     assert bar["own_verbs"] == {"brewCoffee": "(cups: integer, 1 to 8) Brew coffee."}
     assert "note" not in bar
     assert echo["note"] == "This device has no lockout, no lease and no stop."
-
-
-def test_verbs_of_an_older_mesh_peer_are_those_of_its_kind(monkeypatch: pytest.MonkeyPatch) -> None:
-    row = {
-        "peer_id": "bar-1",
-        "type": "robot",
-        "reachable": True,
-        "robot_kind": "robot",
-        "own_verbs": ["brewCoffee", 5],
-    }
-    older = {"type": "error", "error": "validation: action must be one of status, stop."}
-    mesh = SimpleNamespace(peers=[row], send=lambda *_: older)
-    monkeypatch.setattr(networks, "_on_mesh", lambda work: work(mesh))
-    monkeypatch.setattr(networks, "discover", lambda mesh: None)
-    (bar,) = NativeMesh().peers()["peers"]
-    assert "moveTo" in bar["functions"] and bar["functions"][-1] == "brewCoffee"

@@ -9,7 +9,7 @@ import typer
 
 from strands_robots.cli.command import Timeout, command
 from strands_robots.cli.keys import PassphraseFile, signing_key
-from strands_robots.cli.network import Network, call_device
+from strands_robots.cli.network import Network, call_robot
 from strands_robots.cli.output import CliError, Exit, Screen, plain
 from strands_robots.envelope import is_error, text_of
 from strands_robots.serving.take_assertion import sign_take
@@ -38,14 +38,14 @@ def take(
     name, seconds = device_id("DEVICE", device), number("--timeout", timeout, above=0, high=60)
     signer = None if key is None else signing_key(key, passphrase_file)
     which: dict[str, object] = {"robot_name": robot} if robot else {}
-    with network.fleet() as fleet:
-        before = call_device(fleet, name, "getControl", which, seconds)
+    with network.joined() as there:
+        before = call_robot(there, name, "getControl", which, seconds)
         if is_error(before):
             raise CliError(plain(text_of(before), 2000), Exit.REFUSED)
         asked = {"reason": reason, **which}
         if signer is not None:
             asked["assertion"] = sign_take(signer, f"{name}/{robot}" if robot else name, int(before["epoch"]))
-        answer = call_device(fleet, name, "takeControl", asked, seconds)
+        answer = call_robot(there, name, "takeControl", asked, seconds)
     if is_error(answer):
         raise CliError(plain(text_of(answer), 2000), Exit.REFUSED)
     screen.data(answer)

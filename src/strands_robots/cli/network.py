@@ -15,6 +15,7 @@ import typer
 from strands_robots import settings
 from strands_robots.cli.output import CliError, Exit, plain
 from strands_robots.envelope import Envelope
+from strands_robots.errors import ArgumentsError, NoSuchRobotError, RefusalError, UnknownVerbError, UnreachableError
 from strands_robots.fleet.link_flags import LinkFlags, as_flag
 from strands_robots.fleet.mesh_settings import put_settings
 from strands_robots.fleet.profiles import FleetProfile, mesh_at, profile_for, profile_name
@@ -27,9 +28,6 @@ if TYPE_CHECKING:
     from strands_robots.mesh import Mesh
 
 logger = logging.getLogger(__name__)
-
-NO_METHOD = -32601
-"""JSON-RPC's code of an unknown function."""
 
 SOURCE = "strands-robots"
 """Caller's name that goes with the calls of the command line."""
@@ -151,10 +149,17 @@ class Network:
                 yield fleet
         except MessagingError as exc:
             raise CliError(f"The network does not carry this: {exc}", Exit.SILENT) from exc
+        except UnreachableError as refusal:
+            raise CliError(plain(f"The network does not carry this: {refusal.why}", 2000), Exit.SILENT) from refusal
 
     @contextmanager
-    def joined(self, *, on_mesh: bool = False, source: str = SOURCE) -> Iterator[NetworkAdapter]:
+    def joined(self, *, on_mesh: bool = False, source: str = SOURCE, peer: str = "console") -> Iterator[NetworkAdapter]:
         """Join Device Connect, or the native mesh, for the length of the block.
+
+        Args:
+            on_mesh: the native mesh.
+            source: the caller's name on Device Connect.
+            peer: the first part of this peer's id on the mesh.
 
         Raises:
             CliError: the network cannot be reached, fails in use, or takes no such flag.
@@ -164,7 +169,7 @@ class Network:
                 from strands_robots.fleet.mesh.network import MeshNetwork  # noqa: PLC0415 - loaded when it is used
 
                 self.use_mesh()
-                mesh = stack.enter_context(mesh_peer(None, temporary_mesh_id("console"), "tool"))
+                mesh = stack.enter_context(mesh_peer(None, temporary_mesh_id(peer), "tool"))
                 network: NetworkAdapter = MeshNetwork.joined(mesh)
             else:
                 from strands_robots.fleet.device_connect.network import DeviceConnectNetwork  # noqa: PLC0415 - as above
@@ -224,54 +229,54 @@ def _mesh_beside(profile: FleetProfile) -> Mapping[str, str]:
 
 
 @contextmanager
-def answering(fleet: FleetClient, device: str) -> Iterator[None]:
-    """Ask a device while the block runs.
+def answering(there: NetworkAdapter, robot: str, verb: str) -> Iterator[None]:
+    """Ask a robot while the block runs.
 
     Raises:
-        CliError: no such device or no answer (exit code 3), or the call was refused as such (exit code 1).
+        CliError: no such robot or no answer (exit code 3), the call was refused as such (exit code 1), or was not sent
+            for its arguments (exit code 2).
     """
-    from strands_robots.device_connect.client import (  # noqa: PLC0415 - loaded when a network is used
-        CallRefusedError,
-        DeviceTimeoutError,
-        NoSuchDeviceError,
-    )
+    from strands_robots.fleet.refusals import said  # noqa: PLC0415 - only a call needs it
 
     try:
         yield
-    except NoSuchDeviceError as exc:
-        raise CliError(plain(f"{exc.args[0]}{near_devices(fleet, device)}", 2000), Exit.SILENT) from exc
-    except DeviceTimeoutError as exc:
-        raise CliError(plain(exc.args[0], 2000), Exit.SILENT) from exc
-    except CallRefusedError as exc:
-        raise CliError(plain(str(exc), 2000), Exit.REFUSED, jsonrpc_code=exc.code) from exc
+    except RefusalError as refusal:
+        answer = refusal.envelope
+        if isinstance(refusal, UnreachableError) and not answer:
+            raise
+        reason, code = said(refusal), Exit.REFUSED if answer else Exit.SILENT
+        fields: dict[str, Any] = {"answer": answer} if answer else {}
+        if isinstance(refusal, NoSuchRobotError) and not refusal.remedy:
+            reason += near_robots(there, robot)
+        elif isinstance(refusal, ArgumentsError) and not answer:
+            code = Exit.USAGE
+        elif "jsonrpc_code" in answer:
+            fields = {"jsonrpc_code": answer["jsonrpc_code"]}
+            verbs = _near_verbs(there, robot, verb) if isinstance(refusal, UnknownVerbError) else ""
+            reason = f"{reason.rstrip('.')}.{verbs}" if verbs else reason
+        raise CliError(plain(reason, 2000), code, **fields) from refusal
 
 
-def call_device(fleet: FleetClient, device: str, function: str, params: Mapping[str, Any], seconds: float) -> Envelope:
-    """Call a function of a device and return its answer; raises as :func:`answering`."""
-    try:
-        with answering(fleet, device):
-            return fleet.call(device, function, params, seconds)
-    except CliError as failure:
-        if failure.fields.get("jsonrpc_code") == NO_METHOD and (verbs := near_verbs(fleet, device, function)):
-            said = plain(f"{failure.reason.rstrip('.')}.{verbs}", 2000)
-            raise CliError(said, failure.code, **failure.fields) from failure
-        raise
+def call_robot(there: NetworkAdapter, robot: str, verb: str, params: Mapping[str, Any], seconds: float) -> Envelope:
+    """Call a verb of a robot and return its answer; raises as :func:`answering`."""
+    with answering(there, robot, verb):
+        return there.call(robot, verb, params, seconds)
 
 
-def near_verbs(fleet: FleetClient, device: str, function: str) -> str:
-    """Return a sentence with the verbs of a device that resemble an absent one."""
+def near_robots(there: NetworkAdapter, robot: str) -> str:
+    """Return a sentence with the ids that resemble an absent one."""
+    names = [each.id for each in there.find(1.0)]
+    return "" if robot in names else near(robot, names)
+
+
+def _near_verbs(there: NetworkAdapter, robot: str, verb: str) -> str:
+    """Return a sentence with the verbs of a robot that resemble an absent one."""
     from strands_robots.serving.advertised import verb_names  # noqa: PLC0415 - only a refusal needs it
 
     try:
-        return near(function, verb_names(fleet.describe(device).functions))
-    except (LookupError, TimeoutError, RuntimeError):
+        return near(verb, verb_names(there.describe(robot, anew=True)))
+    except RefusalError:
         return ""
-
-
-def near_devices(fleet: FleetClient, device: str) -> str:
-    """Return a sentence with the ids that resemble an absent one."""
-    names = [peer.id for peer in fleet.peers(1.0)]
-    return "" if device in names else near(device, names)
 
 
 def temporary_mesh_id(name: str) -> str:
@@ -288,7 +293,7 @@ def temporary_mesh_id(name: str) -> str:
 @contextmanager
 def mesh_peer(robot: Any, peer_id: str | None, peer_type: str) -> Iterator[Mesh]:
     """Join the native mesh while the block runs; raise :class:`CliError` if it fails."""
-    from strands_robots.tools.networks import MeshUnavailableError, joined_mesh  # noqa: PLC0415 - as above
+    from strands_robots.fleet.mesh.joining import MeshUnavailableError, joined_mesh  # noqa: PLC0415 - as above
 
     with ExitStack() as stack:
         try:

@@ -4,27 +4,25 @@ from __future__ import annotations
 
 import json
 from contextlib import contextmanager
-from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.text import Text
 
 from strands_robots.cli.command import OnMesh, Timeout, assignments, command
-from strands_robots.cli.network import SOURCE, Network, answering, call_device
+from strands_robots.cli.network import SOURCE, Network, answering
 from strands_robots.cli.output import LATE_S, CliError, Exit, Screen, label, plain, readable, table, with_tags
 from strands_robots.cli.readiness import other_user
 from strands_robots.envelope import is_error, text_of
-from strands_robots.fleet.link_flags import described
+from strands_robots.safety.statements import ALARM
 from strands_robots.serving.known_verbs import QUICK, TEXTS, VERBS, WAITING
+from strands_robots.tools.networks import SOURCE as PEER
 from strands_robots.utils import WAIT_S, ValidationError, device_id, number
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
-    from strands_robots.device_connect import FleetClient
-    from strands_robots.device_connect.discovery import Peer
-    from strands_robots.envelope import Envelope
+    from strands_robots.fleet.adapter import FoundRobot, NetworkAdapter
     from strands_robots.serving.advertised import AdvertisedVerb
 
 LEASE_ID = "lease_id"
@@ -48,30 +46,29 @@ def peers(
     on_mesh: OnMesh = False,
 ) -> None:
     """List the robots on the network, or what one of them can do."""
-    if on_mesh:
-        from strands_robots.cli.peers_mesh import list_peers  # noqa: PLC0415 - loaded when a network is used
-
-        network.use_mesh()
-        list_peers(screen, number("--timeout", timeout, above=0, high=60))
-        return
+    seconds = number("--timeout", timeout, above=0, high=60)
     wanted = None if device is None else device_id("DEVICE", device)
-    with network.fleet() as fleet:
-        found = fleet.peers(number("--timeout", timeout, above=0, high=60))
-    if device is not None:
-        found = [peer for peer in found if peer.id == wanted]
+    with network.joined(on_mesh=on_mesh) as there:
+        found = [each for each in there.listed(seconds) if wanted in (None, each.id)]
+        functions = there.describe(wanted) if wanted is not None and found else None
+    whose = _whose(network, on_mesh=on_mesh)
     if not found:
         who = "No robot" if device is None else f"No {device!r}"
-        said = f"{who} answered. {described(fleet.link)} {other_user(fleet.link)}".rstrip()
-        raise CliError(said, Exit.SILENT, peers=[], stale=fleet.stale)
-    whose = other_user(fleet.link)
-    screen.data({"status": "success", "peers": [_facts(peer) for peer in found], "stale": fleet.stale, "whose": whose})
+        absent = "No peer is on the mesh of this machine." if on_mesh and device is None else f"{who} answered."
+        where = "" if on_mesh else f"{there.reach} {whose}"
+        raise CliError(f"{absent} {where}".rstrip(), Exit.SILENT, peers=[], stale=there.stale)
+    screen.data({"status": "success", "peers": [each.facts for each in found], "stale": there.stale, "whose": whose})
     if whose:
         screen.say(whose, "yellow")
     if device is not None:
-        _show_functions(screen, found[0])
+        _show_functions(screen, found[0], functions)
         return
-    rows = [(each.id, each.type, each.model, each.status.get("availability", ""), _age(each)) for each in found]
-    heads = ("device", "type", "model", "status", "last heard")
+    if on_mesh:
+        named, kind, shown = "peer", "host", [str(each.facts.get("hostname", "")) for each in found]
+    else:
+        named, kind, shown = "device", "model", [each.model for each in found]
+    rows = [(each.id, each.type, one, _status(each), _age(each)) for each, one in zip(found, shown, strict=True)]
+    heads = (named, "type", kind, "status", "last heard")
     screen.show(table("", *with_tags(heads, rows, [each.tags for each in found])))
     screen.say("peers DEVICE, with the same flags, lists what it can do.")
 
@@ -97,52 +94,34 @@ def call(
     given = arguments or []
     params = assignments(given)
     stated = None if timeout is None else number("--timeout", timeout, above=0, high=3600)
-    whose = ""
-    if on_mesh:
-        if function is None:
-            raise CliError("call --mesh takes a function, such as status.", Exit.USAGE)
-        answer = _call_on_mesh(network, device, function, given, stated)
-    else:
-        with network.fleet(source) as fleet:
-            whose = other_user(fleet.link)
-            try:
+    if on_mesh and function is None:
+        raise CliError("call --mesh takes a function, such as status.", Exit.USAGE)
+    flags = f"{' --mesh' if on_mesh else ''}{network.flags}"
+    with network.joined(on_mesh=on_mesh, source=source, peer=PEER) as there:
+        try:
+            with answering(there, device, function or ""):
                 if function is None:
-                    _list_functions(screen, fleet, device)
+                    _list_functions(screen, there, device)
                     return
-                with answering(fleet, device):
-                    verb = fleet.verb(device, function) if _needs_description(function, given, params) else None
+                verb = there.verb(device, function) if _needs_description(function, given, params) else None
                 params = _typed(verb, given, params)
                 seconds = stated or _wait(function, verb)
-                with _interruptible(f"strands-robots stop {device}{network.flags}", lambda: _moves(function, verb)):
-                    answer = call_device(fleet, device, function, params, seconds)
-            except CliError as failure:
-                if failure.code is Exit.INTERRUPTED:
-                    raise
-                raise CliError(f"{failure.reason} {whose}".rstrip(), failure.code, **failure.fields) from failure
+                with _interruptible(f"strands-robots stop {device}{flags}", lambda: _moves(function, verb)):
+                    answer = there.call(device, function, params, seconds)
+        except CliError as failure:
+            if failure.code in (Exit.INTERRUPTED, Exit.USAGE):
+                raise
+            reason = f"{failure.reason} {_whose(network, on_mesh=on_mesh)}".rstrip()
+            raise CliError(reason, failure.code, **failure.fields) from failure
     if is_error(answer):
-        said = f"{text_of(answer) or f'{device} refused {function}.'} {whose}".rstrip()
-        raise CliError(plain(said, 2000), Exit.REFUSED, answer=answer)
+        reason = text_of(answer) or f"{device} refused {function}."
+        whose = _whose(network, on_mesh=on_mesh)
+        raise CliError(plain(f"{reason} {whose}".rstrip(), 2000), Exit.REFUSED, answer=answer)
     screen.data(answer)
     screen.say(readable(text_of(answer)) or f"{device} answered {function}.", "green")
     for key, value in readable(answer).items():
         if key not in ("status", "content", "reason"):
             screen.say(f"  {key}: {value if isinstance(value, str) else json.dumps(value, default=str)}")
-
-
-def _call_on_mesh(network: Network, device: str, function: str, given: Sequence[str], stated: float | None) -> Envelope:
-    from strands_robots.cli.peers_mesh import call_peer  # noqa: PLC0415 - loaded when a network is used
-
-    network.use_mesh()
-    params, moving = assignments(given), False
-
-    def wait(verb: AdvertisedVerb | None) -> float:
-        nonlocal moving
-        moving = _moves(function, verb)
-        return stated or _wait(function, verb)
-
-    with _interruptible(f"strands-robots stop {device} --mesh{network.flags}", lambda: moving):
-        command = {**_typed(None, given, params), "action": function}
-        return call_peer(device, command, wait, lambda verb: _typed(verb, given, params))
 
 
 @contextmanager
@@ -201,37 +180,47 @@ def _typed(verb: AdvertisedVerb | None, given: Sequence[str], params: Mapping[st
     return {**params, **given_types, **leased}
 
 
-def _list_functions(screen: Screen, fleet: FleetClient, device: str) -> None:
-    with answering(fleet, device):
-        peer = fleet.describe(device, CALL_S)
-    screen.data({"status": "success", "device": peer.id, "functions": peer.functions})
-    _show_functions(screen, peer)
+def _list_functions(screen: Screen, there: NetworkAdapter, device: str) -> None:
+    functions = there.describe(device, anew=True)
+    screen.data({"status": "success", "device": device, "functions": functions})
+    _show_functions(screen, there.known(device), functions)
 
 
-def _facts(peer: Peer) -> dict[str, Any]:
-    facts = {name: value for name, value in asdict(peer).items() if name not in ("location", "heard_at")}
-    age = peer.age_s
-    return {**facts, "tags": list(peer.tags), "age_s": None if age is None else round(age, 3)}
+def _whose(network: Network, *, on_mesh: bool) -> str:
+    """Return whose robots answer on Device Connect, where that is another user."""
+    return "" if on_mesh else other_user(network.link())
 
 
-def _age(peer: Peer) -> Text:
-    age = peer.age_s
+def _status(robot: FoundRobot) -> str | Text:
+    """Return what it does, or the lockout, or that emergency stops do not arrive."""
+    facts = robot.facts
+    if facts.get("estop_unheard"):
+        return label("CANNOT RECEIVE STOPS", "bold red")
+    if why := str(facts.get("distrusted", "")):
+        return label(why, "bold red" if why.startswith(ALARM) else "yellow")
+    return label("LOCKED", "bold red") if facts.get("locked") is True else robot.status
+
+
+def _age(robot: FoundRobot) -> Text:
+    age = robot.age_s
     if age is None:
         return label("only listed", "yellow")
     return label(f"{age:.1f} s", "bold red" if age > LATE_S else "")
 
 
-def _show_functions(screen: Screen, peer: Peer) -> None:
+def _show_functions(screen: Screen, robot: FoundRobot, functions: object) -> None:
     from strands_robots.serving.advertised import RobotDescription  # noqa: PLC0415 - loaded when a network is used
 
-    description = RobotDescription.of(peer.functions)
+    description = RobotDescription.of(functions)
     rows = [
         (f"{each.name} (its own)" if each.own else each.name, each.takes, each.summary)
         for each in description.verbs.values()
     ]
-    screen.show(table(f"{plain(peer.id)}, last heard {_age(peer)}", ("function", "parameters", "what it does"), rows))
+    screen.show(table(f"{plain(robot.id)}, last heard {_age(robot)}", ("function", "parameters", "what it does"), rows))
     if description.left_out:
         screen.say(f"Left out: {'; '.join(description.left_out)}.", "yellow")
     if description.absent:
         screen.say(description.absent, "yellow")
-    screen.say(f"Events: {', '.join(peer.events)}")
+    events = robot.facts.get("events")
+    if events is not None:
+        screen.say(f"Events: {', '.join(events)}")

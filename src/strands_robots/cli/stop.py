@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import wait
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from strands_robots.cli.command import OnMesh, Timeout, command
 from strands_robots.cli.keys import PassphraseFile, operator_key, signing_key
-from strands_robots.cli.network import SOURCE, Network, near_devices
+from strands_robots.cli.network import SOURCE, Network, near_robots
 from strands_robots.cli.output import POLL_S, CliError, Exit, Screen, captured_log, label, plain, table
 from strands_robots.cli.readiness import meeting_user
 from strands_robots.cli.stop_report import (
@@ -26,15 +26,18 @@ from strands_robots.cli.stop_report import (
     stop_table,
 )
 from strands_robots.envelope import Envelope, text_of
-from strands_robots.fleet.device_connect.stops import devices_on, network_key, silence_of, stop_found
+from strands_robots.fleet.device_connect.stops import devices_on, network_key
 from strands_robots.fleet.emergency_stop import EmergencyStop
 from strands_robots.fleet.link_flags import described
-from strands_robots.fleet.stop_answers import OnOutcome, stop_outcome
+from strands_robots.fleet.stop_answers import combined_verdict, roster_verdict, stop_outcome, unanswered
 from strands_robots.safety.controller import DEADLINE_S, Progress
 from strands_robots.safety.stop_roster import StopOutcome
 from strands_robots.serving.stop_arguments import robot_of_world, stop_reason, stop_robot, stop_scope
-from strands_robots.tools.networks import NativeMesh
+from strands_robots.tools.networks import SOURCE as PEER
 from strands_robots.utils import ValidationError, device_id, number
+
+if TYPE_CHECKING:
+    from strands_robots.fleet.adapter import NetworkAdapter
 
 LINK_WAIT_S = 2.0
 """Longest wait for the connection, after which the deadline counts."""
@@ -74,30 +77,32 @@ def stop(
     if one and not name:
         unread = unread or "--robot names no robot of a DEVICE's world, so all of it is stopped"
     _say_ignored(screen, unread)
-    if on_mesh:
-        network.use_mesh()
-        _stop_on_mesh(screen, lambda take: NativeMesh().stop(device or "", name, take))
-        return
     seconds = _seconds(screen, "--timeout", timeout, 60, 5.0)
+    with _stopping(screen, network, on_mesh=on_mesh) as there:
+        if device is None:
+            answers, outcome = there.stop_all(seconds)
+            facts = _facts(roster_verdict(outcome)) if on_mesh else {"devices": _devices(answers, outcome)}
+        else:
+            answer = there.stop(device, seconds, name, insist=True) or unanswered(device)
+            stopped, said = stop_outcome(answer)
+            alike = ""
+            if stopped is None and not on_mesh:
+                why = there.silence(device)
+                said, alike = (f"{said.rstrip('.')}: {why}", "") if why else (said, near_robots(there, device))
     if device is None:
-        with network.fleet() as fleet:
-            answers, outcome = stop_found(fleet, seconds)
-        _report_all(screen, outcome, {"devices": _devices(answers, outcome)}, described(fleet.link))
+        _report_all(screen, outcome, facts, there.reach)
         return
-    with network.fleet() as fleet:
-        stopped, said = stop_outcome(fleet.stop(device, seconds, name))
-        near = ""
-        if stopped is None:
-            why = silence_of(fleet, device)
-            said, near = (f"{said.rstrip('.')}: {why}", "") if why else (said, near_devices(fleet, device))
     # One robot of a world is named with it: the others may move on.
     robot = f"{device}/{name}" if name else device
     _show_answers(screen, {robot: (stopped, said)})
-    devices = {robot: {"stopped": stopped, "said": said}}
+    verdict = combined_verdict({robot: answer})
+    facts = _facts(verdict) if on_mesh else {"devices": {robot: {"stopped": stopped, "said": said}}}
     if not stopped:
         what, code = ("DID NOT STOP", Exit.REFUSED) if stopped is False else ("NO ANSWER", Exit.SILENT)
-        raise CliError(f"{what}: {robot}.{near}", code, devices=devices)
-    screen.data({"status": "success", "devices": devices})
+        raise CliError(plain(text_of(verdict), 2000) if on_mesh else f"{what}: {robot}.{alike}", code, **facts)
+    screen.data({"status": "success", **facts})
+    if on_mesh:
+        screen.say(text_of(verdict), "green")
 
 
 def estop(
@@ -147,9 +152,10 @@ def estop(
     if on_mesh:
         if devices:
             _say_ignored(screen, "estop --mesh stops every robot, and no DEVICE is waited for")
-        network.use_mesh()
         on_key = None if key is None else signing_key(key, passphrase_file)
-        _stop_on_mesh(screen, lambda take: NativeMesh().emergency_stop(reason, on_key, scope, take))
+        with _stopping(screen, network, on_mesh=True) as there:
+            outcome = there.emergency_stop(reason, scope=scope, signing_key=on_key)
+        _report_all(screen, outcome, _facts(there.verdict(outcome)), there.reach)
         show_resume(screen, key, f" --mesh{network.flags}")
         return
     # What is no device's id answers to nothing, so the report has it as silent.
@@ -200,6 +206,20 @@ def estop(
         screen.copyable(f"  sudo -u {user} {RESUME_HERE}" if user else f"  {RESUME_HERE}")
     else:
         show_resume(screen, key, network.flags)
+
+
+@contextmanager
+def _stopping(screen: Screen, network: Network, *, on_mesh: bool) -> Iterator[NetworkAdapter]:
+    """Join the network of a stop; where the mesh is off it ends with code 3."""
+    # The table of a stop on the mesh names what the log would report.
+    with captured_log() if on_mesh and screen.live else nullcontext():
+        try:
+            with network.joined(on_mesh=on_mesh, peer=PEER) as there:
+                yield there
+        except CliError as failure:
+            if on_mesh and failure.code is Exit.REFUSED:
+                raise CliError(failure.reason, Exit.SILENT, stopped=None) from failure
+            raise
 
 
 def _say_ignored(screen: Screen, note: str) -> None:
@@ -287,28 +307,6 @@ def _show_answers(screen: Screen, answers: Mapping[str, tuple[bool | None, str]]
     }
     rows = ((name, marks[stopped], said) for name, (stopped, said) in answers.items())
     screen.show(table("", ("robot", "answer", "what it said"), rows))
-
-
-def _stop_on_mesh(screen: Screen, stop_robots: Callable[[OnOutcome], Envelope]) -> None:
-    """Stop robots of the mesh, print answers; raise unless all confirmed."""
-    outcomes: list[StopOutcome] = []
-    # The table names what the log would report.
-    with captured_log() if screen.live else nullcontext():
-        answer = stop_robots(outcomes.append)
-    facts = _facts(answer)
-    if outcomes:
-        _report_all(screen, outcomes[0], facts, "They were looked for on the native mesh.")
-        return
-    moving, silent = answer.get("not_stopped", []), answer.get("silent", [])
-
-    def stopped(name: str) -> bool | None:
-        return False if name in moving else None if name in silent else True
-
-    _show_answers(screen, {name: (stopped(name), text) for name, text in answer.get("robots", {}).items()})
-    if answer["status"] != "success":
-        raise CliError(plain(text_of(answer), 2000), Exit.REFUSED if moving else Exit.SILENT, **facts)
-    screen.data({"status": "success", **facts})
-    screen.say(text_of(answer), "green")
 
 
 def _facts(answer: Envelope) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from strands_robots.cli.command import Seconds, command
-from strands_robots.cli.network import Network, call_device
+from strands_robots.cli.network import Network, call_robot
 from strands_robots.cli.output import LATE_S, CliError, Exit, Screen, label, plain
 from strands_robots.fleet.joint_features import Range, joint_limits
 from strands_robots.utils import number
@@ -64,10 +64,12 @@ def watch(
 ) -> None:
     """Show a device's joints and task as they change, until Ctrl-C. With --json: one event a line."""
     longest = None if seconds is None else number("--for", seconds, above=0, high=7 * 24 * 3600)
+    from strands_robots.fleet.device_connect.network import DeviceConnectNetwork  # noqa: PLC0415 - loaded when it is used
+
     with network.fleet() as fleet:
         limits: dict[str, Range] = {}
         try:
-            limits = joint_limits(call_device(fleet, device, "getFeatures", {}, 3.0))
+            limits = joint_limits(call_robot(DeviceConnectNetwork.joined(fleet), device, "getFeatures", {}, 3.0))
         except CliError as failure:
             # A device without getFeatures is drawn without its limits.
             if isinstance(failure.__cause__, LookupError):
@@ -294,9 +296,11 @@ def _present_state(fleet: FleetClient, device: str, limits: Mapping[str, Range])
 
 def _present_answers(fleet: FleetClient, device: str) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield its present state by function; an idle one sends none for 10 s."""
+    from strands_robots.fleet.device_connect.network import DeviceConnectNetwork  # noqa: PLC0415 - loaded when it is used
+
     for function in ("getState", "getStatus"):
         with contextlib.suppress(CliError):  # a device answers one of the two
-            yield function, call_device(fleet, device, function, {}, 3.0)
+            yield function, call_robot(DeviceConnectNetwork.joined(fleet), device, function, {}, 3.0)
 
 
 def _draw_live(screen: Screen, view: DeviceView, frames: Iterator[Frame]) -> None:

@@ -90,15 +90,11 @@ def envelope(report: StopReport, reasons: Mapping[str, str] | None = None) -> En
     return error(f"{'; '.join(failures) or 'No robot answered the emergency stop'}.", **fields)
 
 
-def outcome_envelope(outcome: StopOutcome, not_locked: Collection[str] = ()) -> Envelope:
-    """Return the outcome as an answer, an error unless all of the roster stand still.
-
-    Args:
-        not_locked: devices that did not act on the stop.
-    """
+def outcome_envelope(outcome: StopOutcome) -> Envelope:
+    """Return the outcome as an answer, an error unless all of the roster stand still."""
     answer = envelope(outcome.report, outcome.reasons)
     fields = {name: value for name, value in answer.items() if name not in ("status", "content", "reason")}
-    free = [f"Not locked: {', '.join(not_locked)}."] if not_locked else []
+    free = [f"Not locked: {', '.join(outcome.not_locked)}."] if outcome.not_locked else []
     said = " ".join([text_of(answer), outcome.sentence, *free, *stop_notes(outcome)])
-    fields |= {"not_locked": list(not_locked)} if not_locked else {}
+    fields |= {"not_locked": list(outcome.not_locked)} if outcome.not_locked else {}
     return (success if outcome.ok else error)(said, **fields, **outcome.facts())

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
-from typing import Any, Protocol
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Protocol
 
 from strands_robots.envelope import Envelope
 from strands_robots.fleet.lockout_report import LockoutReport, Resumed
@@ -13,6 +13,9 @@ from strands_robots.fleet.stop_button import StopSender
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope
 from strands_robots.safety.stop_roster import StopOutcome
+
+if TYPE_CHECKING:
+    from strands_robots.serving.advertised import AdvertisedVerb
 
 DEVICE_CONNECT, MESH = "device_connect", "mesh"
 
@@ -34,6 +37,12 @@ class FoundRobot:
     type: str = ""
     model: str = ""
     tags: tuple[str, ...] = ()
+    status: str = ""
+    """What it says it is doing."""
+    age_s: float | None = None
+    """Seconds since its last own message; None where only a registry names it."""
+    facts: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
+    """All that its network knows of it, for programs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,11 +65,13 @@ class NetworkAdapter(Protocol):
         name: :data:`DEVICE_CONNECT` or :data:`MESH`.
         announces_verbs: robots announce their verbs, so that :meth:`describe` asks no one.
         reads: the names on this network of the reads ``status``, ``state`` and ``features``.
+        starts: the name on this network of the verb that starts a task.
     """
 
     name: str
     announces_verbs: bool
     reads: Mapping[str, str]
+    starts: str
 
     def open(self) -> None:
         """Join the network.
@@ -71,6 +82,16 @@ class NetworkAdapter(Protocol):
 
     def find(self, timeout: float = FIND_S) -> list[FoundRobot]:
         """Return the robots in reach."""
+
+    def listed(self, timeout: float | None = None) -> list[FoundRobot]:
+        """Return all that are in reach, peers without a robot included.
+
+        Args:
+            timeout: seconds in which they are looked for; by default as long as this network takes to know them.
+        """
+
+    def known(self, robot: str) -> FoundRobot:
+        """Return what is known of a robot; asks no one."""
 
     def bears(self, robot: str) -> bool:
         """Return whether a robot of this id is known here; asks no one."""
@@ -84,21 +105,48 @@ class NetworkAdapter(Protocol):
     def describe(self, robot: str, *, anew: bool = False) -> object:
         """Return the robot's functions as they came over the wire.
 
-        ``anew`` asks the robot itself.
+        ``anew`` asks the robot itself; what is known is returned where it does not answer.
+
+        Raises:
+            RefusalError: it is not known, and does not answer.
+        """
+
+    def describe_each(self, robots: Iterable[str]) -> Mapping[str, object]:
+        """Return the functions of many robots, within a second; none of unknown ones."""
+
+    def verb(self, robot: str, name: str) -> AdvertisedVerb | None:
+        """Return a verb as its robot describes it.
+
+        None where it does not describe it in time, and for what takes energy away: a stop waits for no description.
+
+        Raises:
+            NoSuchRobotError: no robot in reach has this id.
         """
 
     def call(self, robot: str, verb: str, arguments: Mapping[str, Any], timeout: float) -> Envelope:
         """Call a verb and return the answer, also one of status error.
 
         Raises:
-            RefusalError: the call got no answer, or was refused as such.
+            RefusalError: the call got no answer, or was refused as such; ``envelope`` is empty where it was not sent.
         """
 
-    def stop(self, robot: str, timeout: float = STOP_S, robot_name: str = "") -> Envelope | None:
+    def stop(
+        self, robot: str, timeout: float = STOP_S, robot_name: str = "", *, insist: bool = False
+    ) -> Envelope | None:
         """Stop a robot and return its answer, None where it is not on this network.
 
-        ``robot_name`` stops one robot of a world alone. No answer in time is an envelope with ``stopped`` None.
+        No answer in time is an envelope with ``stopped`` None.
+
+        Args:
+            robot: its id.
+            timeout: seconds in which it has to answer.
+            robot_name: stops one robot of a world alone.
+            insist: the robot is on no other network. The stop is sent though it was not found, its answer is waited for
+                all the time, and None is never returned.
         """
+
+    def silence(self, robot: str) -> str:
+        """Return why a robot that did not answer a stop may be silent, or ""."""
 
     @property
     def key(self) -> NetworkKey:
@@ -139,6 +187,9 @@ class NetworkAdapter(Protocol):
             estop_id: 32 hex digits, the epoch of the lockout; a fresh one by default.
             remembers: says whether a robot of ``scope`` is known; by default by this network's roster.
         """
+
+    def verdict(self, outcome: StopOutcome) -> Envelope:
+        """Return the outcome of an emergency stop as one answer."""
 
     def standing(self, signing_key: Any, known: Callable[[], Collection[str]]) -> AbstractContextManager[StopSender]:
         """Return a controller that stands for the length of the block.

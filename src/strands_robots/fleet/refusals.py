@@ -17,9 +17,11 @@ from strands_robots.errors import (
     CallerError,
     ControlError,
     LockoutError,
+    NoSuchRobotError,
     RefusalError,
     RobotError,
     UnknownVerbError,
+    UnreachableError,
 )
 from strands_robots.serving.leave import RefusalReason
 from strands_robots.utils import plain_text
@@ -63,6 +65,21 @@ WORDS: tuple[tuple[str, type[RefusalError]], ...] = (
     (" is missing.", ArgumentsError),
 )
 """Words of a text, the first that is found counts."""
+
+
+def said(refusal: RefusalError) -> str:
+    """Return a refusal in words, without the remedies that are for Python.
+
+    The ids near an absent one stay.
+    """
+    if refusal.envelope:
+        return text_of(refusal.envelope)
+    if isinstance(refusal, UnreachableError):
+        return f"The network does not carry this: {refusal.why}"
+    if isinstance(refusal, ValueError):
+        return refusal.why
+    why = refusal.why if refusal.why.endswith((".", "!", "?")) else f"{refusal.why}."
+    return f"{why} {refusal.remedy}" if isinstance(refusal, NoSuchRobotError) and refusal.remedy else why
 
 
 def refusal_of(robot: str, verb: str, answer: Mapping[str, Any]) -> RefusalError:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -14,9 +14,6 @@ from strands_robots.safety.silence import Sending
 from strands_robots.safety.stop_notes import stop_notes
 from strands_robots.safety.stop_roster import StopOutcome, StopRoster
 from strands_robots.safety.stopping import explain, grade
-
-OnOutcome = Callable[[StopOutcome], object]
-"""Takes the outcome of a stop, for a face that prints more than its envelope."""
 
 
 def stop_outcome(answer: Envelope) -> tuple[bool | None, str]:
@@ -124,15 +121,13 @@ def unanswered(robot: str) -> Envelope:
     return error(f"{robot} did not answer.", stopped=None)
 
 
-def roster_verdict(answers: Mapping[str, Envelope], outcome: StopOutcome) -> Envelope:
-    """Return one answer: success when every robot of the roster was confirmed.
-
-    Args:
-        answers: by robot.
-        outcome: of these answers.
-    """
+def roster_verdict(outcome: StopOutcome) -> Envelope:
+    """Return one answer: success when every robot of the roster was confirmed."""
     report = outcome.report
-    rows = {name: answers[name] for name in answers if name in report.answered}
+    rows = {
+        name: success(each.why, stopped=True) if each.stopped else error(each.why, stopped=each.stopped)
+        for name, each in report.answered.items()
+    }
     for name in report.silent:
         why = outcome.reasons.get(name, "")
         rows[name] = error(f"{why}.", stopped=None) if why else unanswered(name)

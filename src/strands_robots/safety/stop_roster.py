@@ -51,6 +51,7 @@ class StopOutcome:
         reasons: of silent robots.
         problems: why the roster may lack robots; with one of them no exit code is 0.
         unsigned: the answers are those to a plain stop, which no robot signs on Device Connect.
+        not_locked: devices that did not act on the emergency stop, and got a plain stop.
     """
 
     report: StopReport
@@ -62,6 +63,7 @@ class StopOutcome:
     problems: tuple[str, ...] = ()
     sending: Sending = field(default_factory=Sending)
     unsigned: bool = False
+    not_locked: tuple[str, ...] = ()
 
     @property
     def ok(self) -> bool:

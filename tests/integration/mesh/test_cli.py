@@ -91,7 +91,7 @@ def test_unanswered_stop_is_no_success(machine: Machine) -> None:
 def test_network_flag_that_the_mesh_does_not_take_is_refused(command: list[str]) -> None:
     ended = CliRunner().invoke(build(), [*command, "--mesh", "--nats", "nats://127.0.0.1:4222"])
     assert ended.exit_code == 2
-    assert "--mesh takes no network flag but --port" in ended.output
+    assert "--mesh takes no network flag but --fleet and --port" in ended.output
 
 
 def test_keys_are_made_issued_and_named_for_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

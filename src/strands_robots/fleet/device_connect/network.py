@@ -5,9 +5,9 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
-from strands_robots.envelope import Envelope
+from strands_robots.envelope import Envelope, error
 from strands_robots.errors import (
     ArgumentsError,
     NoAnswerError,
@@ -19,7 +19,7 @@ from strands_robots.errors import (
 )
 from strands_robots.fleet.adapter import CLOSED, DEVICE_CONNECT, FIND_S, STOP_S, FoundRobot, OnEvent, RobotEvent
 from strands_robots.fleet.device_connect.lockouts import ask_robots, enrolled_keys, lockable_robots, resume_robots
-from strands_robots.fleet.device_connect.stops import network_key, stop_found, stopped_and_locked
+from strands_robots.fleet.device_connect.stops import network_key, silence_of, stop_found, stopped_and_locked
 from strands_robots.fleet.link_flags import described
 from strands_robots.fleet.lockout_report import LockoutReport, Resumed
 from strands_robots.fleet.stop_button import StopSender
@@ -33,7 +33,9 @@ if TYPE_CHECKING:
     from strands_robots.device_connect.backends import LinkConfig
     from strands_robots.device_connect.client import DeviceEvent, FleetClient
     from strands_robots.device_connect.discovery import Peer
+    from strands_robots.serving.advertised import AdvertisedVerb
 
+T = TypeVar("T")
 logger = logging.getLogger(__name__)
 
 UNKNOWN_METHOD, BAD_PARAMS = -32601, -32602
@@ -57,6 +59,7 @@ class DeviceConnectNetwork:
     name = DEVICE_CONNECT
     announces_verbs = True
     reads: Mapping[str, str] = {"status": "getStatus", "state": "getState", "features": "getFeatures"}
+    starts = "execute"
 
     def __init__(self, link: LinkConfig, source: str) -> None:
         from strands_robots.device_connect.client import FleetClient  # noqa: PLC0415 - loaded when it is used
@@ -90,10 +93,15 @@ class DeviceConnectNetwork:
         self._discoveries += 1
         with _carried():
             self._peers = {peer.id: peer for peer in self._connected.peers(timeout)}
-        return [
-            FoundRobot(peer.id, plain_text(peer.type, 100), plain_text(peer.model, 100), peer.tags)
-            for peer in self._peers.values()
-        ]
+        return [_found(peer) for peer in self._peers.values()]
+
+    def listed(self, timeout: float | None = None) -> list[FoundRobot]:
+        """Return the devices of the tenant: each of them is one to list."""
+        return self.find(FIND_S if timeout is None else timeout)
+
+    def known(self, robot: str) -> FoundRobot:
+        """Return what the device stated last."""
+        return _found(self._peers[robot]) if robot in self._peers else FoundRobot(robot)
 
     def bears(self, robot: str) -> bool:
         """Return whether a device of this id was found or has announced itself."""
@@ -120,28 +128,36 @@ class DeviceConnectNetwork:
                 refusal = _refusal(exc, robot, "requestRegistration")
                 if refusal is None:
                     raise
+                if robot not in self._peers:
+                    raise refusal from exc
                 logger.debug("%s: it does not describe itself anew: %s", robot, refusal)
         peer = self._peers.get(robot)
         return None if peer is None else peer.functions
 
+    def describe_each(self, robots: Iterable[str]) -> Mapping[str, object]:
+        """Return the functions that the devices announced."""
+        return {name: self._peers[name].functions for name in robots if name in self._peers}
+
+    def verb(self, robot: str, name: str) -> AdvertisedVerb | None:
+        """Return a function as the device itself describes it."""
+        return _answered(robot, name, lambda: self._connected.verb(robot, name))
+
     def call(self, robot: str, verb: str, arguments: Mapping[str, Any], timeout: float) -> Envelope:
         """Call a function of the device."""
-        try:
-            return self._connected.call(robot, verb, arguments, timeout)
-        except RefusalError:
-            raise
-        except Exception as exc:
-            refusal = _refusal(exc, robot, verb)
-            if refusal is None:
-                raise
-            raise refusal from exc
+        return _answered(robot, verb, lambda: self._connected.call(robot, verb, arguments, timeout))
 
-    def stop(self, robot: str, timeout: float = STOP_S, robot_name: str = "") -> Envelope | None:
+    def stop(
+        self, robot: str, timeout: float = STOP_S, robot_name: str = "", *, insist: bool = False
+    ) -> Envelope | None:
         """Stop the device by ``stop``, else by ``stopMotion``."""
-        within = timeout if self.bears(robot) else min(timeout, UNKNOWN_STOP_S)
+        within = timeout if insist or self.bears(robot) else min(timeout, UNKNOWN_STOP_S)
         answer = self._connected.stop(robot, within, robot_name)
         unknown = answer.get("status") == "error" and answer.get("stopped") is None
-        return None if unknown and not self.bears(robot) else answer
+        return None if unknown and not insist and not self.bears(robot) else answer
+
+    def silence(self, robot: str) -> str:
+        """Return what this machine remembers of the device's last messages."""
+        return silence_of(self._connected, robot)
 
     @property
     def key(self) -> NetworkKey:
@@ -177,7 +193,7 @@ class DeviceConnectNetwork:
         A device in reach that did not act on it gets a plain ``stop`` as well.
         """
         with _carried():
-            outcome, _ = stopped_and_locked(
+            return stopped_and_locked(
                 self._connected,
                 reason,
                 scope=scope,
@@ -185,7 +201,12 @@ class DeviceConnectNetwork:
                 estop_id=estop_id,
                 remembers=remembers,
             )
-        return outcome
+
+    def verdict(self, outcome: StopOutcome) -> Envelope:
+        """Return the outcome as a safety controller words it."""
+        from strands_robots.device_connect.safety_controller import outcome_envelope  # noqa: PLC0415 - as above
+
+        return outcome_envelope(outcome)
 
     @contextmanager
     def standing(self, signing_key: Any, known: Callable[[], Collection[str]]) -> Iterator[StopSender]:
@@ -253,6 +274,36 @@ def _carried() -> Iterator[None]:
         raise UnreachableError(plain_text(str(exc)) or "Device Connect did not answer in time") from exc
 
 
+def _found(peer: Peer) -> FoundRobot:
+    age = peer.age_s
+    return FoundRobot(
+        peer.id,
+        plain_text(peer.type, 100),
+        plain_text(peer.model, 100),
+        peer.tags,
+        status=plain_text(peer.status.get("availability"), 100),
+        age_s=age,
+        facts={
+            **{"id": peer.id, "type": peer.type, "model": peer.model, "status": peer.status},
+            **{"functions": peer.functions, "events": peer.events, "tags": list(peer.tags)},
+            "age_s": None if age is None else round(age, 3),
+        },
+    )
+
+
+def _answered(robot: str, verb: str, call: Callable[[], T]) -> T:
+    """Return what ``call`` returns; raise its exception as a :class:`RefusalError`."""
+    try:
+        return call()
+    except RefusalError:
+        raise
+    except Exception as exc:
+        refusal = _refusal(exc, robot, verb)
+        if refusal is None:
+            raise
+        raise refusal from exc
+
+
 def _refusal(exc: Exception, robot: str, verb: str) -> RefusalError | None:
     from device_connect_edge.messaging import MessagingError  # noqa: PLC0415 - loaded when it is used
 
@@ -264,10 +315,12 @@ def _refusal(exc: Exception, robot: str, verb: str) -> RefusalError | None:
 
     if isinstance(exc, ClientClosedError):
         return NoAnswerError(CLOSED, robot=robot, verb=verb)
-    why, cause = plain_text(str(exc)), None
+    why = plain_text(str(exc))
+    cause: type[RefusalError] | None = None
     if isinstance(exc, CallRefusedError):
-        cause = {UNKNOWN_METHOD: UnknownVerbError, BAD_PARAMS: ArgumentsError}.get(exc.code, RobotError)
-    elif isinstance(exc, NoSuchDeviceError):
+        refused = {UNKNOWN_METHOD: UnknownVerbError, BAD_PARAMS: ArgumentsError}.get(exc.code, RobotError)
+        return refused(why or "no answer", robot=robot, verb=verb, envelope=error(why, jsonrpc_code=exc.code))
+    if isinstance(exc, NoSuchDeviceError):
         cause = NoSuchRobotError
     elif isinstance(exc, ValidationError):
         cause = ArgumentsError

@@ -34,8 +34,7 @@ SEARCH_SHARE = 2 / 3
 
 def stop_everything(fleet: FleetClient) -> Envelope:
     """Stop each device that is found; answers by name, measured by the roster."""
-    answers, outcome = stop_found(fleet, STOP_S)
-    return roster_verdict(answers, outcome)
+    return roster_verdict(stop_found(fleet, STOP_S)[1])
 
 
 def stop_found(fleet: FleetClient, seconds: float) -> tuple[dict[str, Envelope], StopOutcome]:
@@ -65,8 +64,7 @@ def stop_and_lock(fleet: FleetClient, reason: str, scope: Scope = EVERY_ROBOT) -
     """
     from strands_robots.device_connect.safety_controller import outcome_envelope  # noqa: PLC0415 - the network is loaded when it is used
 
-    outcome, rest = stopped_and_locked(fleet, reason, scope=scope)
-    return outcome_envelope(outcome, rest)
+    return outcome_envelope(stopped_and_locked(fleet, reason, scope=scope))
 
 
 def stopped_and_locked(
@@ -77,8 +75,8 @@ def stopped_and_locked(
     signing_key: Any = None,
     estop_id: str = "",
     remembers: Remembers | None = None,
-) -> tuple[StopOutcome, list[str]]:
-    """Do as :func:`stop_and_lock`; return outcome and devices that are not locked.
+) -> StopOutcome:
+    """Do as :func:`stop_and_lock`; return the outcome.
 
     Args:
         fleet: a connected client.
@@ -115,7 +113,7 @@ def stopped_and_locked(
         report = with_plain_stops(report, outcome, answers)
         outcome = with_reasons(stop.measured(report), answers, plain=True)
     stop.record(outcome, report)
-    return outcome, rest
+    return replace(outcome, not_locked=tuple(rest))
 
 
 def devices_on(link: LinkConfig, deadline_s: float) -> Devices:

@@ -18,7 +18,13 @@ def in_reach(mesh: Mesh) -> list[str]:
     return [row["peer_id"] for row in mesh.peers if row["reachable"]]
 
 
-def discover(mesh: Mesh, meanwhile: Callable[[], object] = lambda: None, *, since: float | None = None) -> None:
+def discover(
+    mesh: Mesh,
+    meanwhile: Callable[[], object] = lambda: None,
+    *,
+    since: float | None = None,
+    within: float = math.inf,
+) -> None:
     """Wait until the peers in reach are known, calling ``meanwhile`` repeatedly.
 
     A link to a stated endpoint that failed is retried with back-off, so such a peer may be silent for up to 8 s.
@@ -27,6 +33,7 @@ def discover(mesh: Mesh, meanwhile: Callable[[], object] = lambda: None, *, sinc
         mesh: the peer that waits.
         meanwhile: called each time it has looked.
         since: when it joined, in monotonic seconds; just now by default.
+        within: seconds from now that are waited at most for such links.
     """
     from strands_robots.mesh.transport.zenoh_config import (  # noqa: PLC0415 - loaded when it is used
         DISCOVERY_S,
@@ -34,13 +41,32 @@ def discover(mesh: Mesh, meanwhile: Callable[[], object] = lambda: None, *, sinc
         stated_endpoints,
     )
 
-    began, found = time.monotonic() if since is None else since, math.inf
+    now, patient = time.monotonic(), math.isinf(within)
+    began = now if since is None else since
+    ends = min(began + LINK_DISCOVERY_S, max(began + DISCOVERY_S, now + within))
     connects, listens = stated_endpoints()
-    while (now := time.monotonic()) < began + LINK_DISCOVERY_S:
+    found = began if in_reach(mesh) and not patient else math.inf
+    while (now := time.monotonic()) < ends:
         if in_reach(mesh):
             found = min(found, now)
-        known = now >= found + DISCOVERY_S if connects else now >= began + DISCOVERY_S
-        if known and not listens:
+        # A listener cannot know how many will still connect to it.
+        known = now >= found + DISCOVERY_S if connects or (listens and not patient) else now >= began + DISCOVERY_S
+        if known and not (listens and patient):
             return
         meanwhile()
         time.sleep(LOOK_S)
+
+
+def awaited(mesh: Mesh, peer: str, until: float) -> bool:
+    """Wait for a peer until a monotonic time; return whether it is in reach."""
+    while not is_in_reach(mesh, peer):
+        if time.monotonic() >= until:
+            return False
+        time.sleep(LOOK_S)
+    return True
+
+
+def is_in_reach(mesh: Mesh, peer: str) -> bool:
+    """Return whether a peer is in reach."""
+    row = mesh.get_peer(peer)
+    return row is not None and bool(row["reachable"])

@@ -13,31 +13,39 @@ from contextlib import closing, contextmanager
 from itertools import count
 from typing import TYPE_CHECKING, Any, Self
 
-from strands_robots.envelope import Envelope
+from strands_robots.envelope import Envelope, error
 from strands_robots.errors import ArgumentsError, NoAnswerError, NoSuchRobotError, UnreachableError
 from strands_robots.fleet.adapter import CLOSED, FIND_S, MESH, STOP_S, FoundRobot, OnEvent, RobotEvent
 from strands_robots.fleet.lockout_report import LockoutReport, Resumed
 from strands_robots.fleet.mesh.controller import MeshController
-from strands_robots.fleet.mesh.discovery import LOOK_S, discover
+from strands_robots.fleet.mesh.descriptions import functions_of, functions_of_each, functions_of_kind
+from strands_robots.fleet.mesh.discovery import awaited, discover, in_reach, is_in_reach
 from strands_robots.fleet.mesh.lockouts import ask_peers, lockable_peers, resume_peers
 from strands_robots.fleet.mesh.standing import mesh_network, stand_on_mesh
 from strands_robots.fleet.mesh.stops import lock_peers, stop_answer, stop_peers
 from strands_robots.fleet.mesh_settings import MeshSettings
 from strands_robots.fleet.refusals import refusal_of_text
+from strands_robots.fleet.stop_answers import roster_verdict
 from strands_robots.fleet.stop_button import StopSender
 from strands_robots.safety.network_key import NetworkKey
-from strands_robots.safety.peer_answers import enrolled_peers
+from strands_robots.safety.peer_answers import enrolled_peers, lockout_distrust
 from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope
 from strands_robots.safety.stop_roster import StopOutcome
-from strands_robots.serving.verb_schema import described
 from strands_robots.tags import read_tags
-from strands_robots.utils import MissingExtraError, ValidationError, finite, plain_text
+from strands_robots.utils import MissingExtraError, ValidationError, finite, near, plain_text
 
 if TYPE_CHECKING:
     from strands_robots.mesh import Mesh
+    from strands_robots.serving.advertised import AdvertisedVerb
 
 DESCRIBE_S = 5.0
 """Seconds in which a peer has to describe its verbs."""
+
+VERB_S = 2.0
+"""Seconds in which a peer has to describe a verb of its own before that is called."""
+
+ALWAYS_SENT = ("stop", "releaseTorque")
+"""Actions that take energy away: they are sent to a peer that was not seen, too."""
 
 _ALIASES = {"getStatus": "status", "getState": "state", "getFeatures": "features"}
 """Reads of every robot by their names on Device Connect, which the mesh has always called otherwise."""
@@ -54,6 +62,7 @@ class MeshNetwork:
     name = MESH
     announces_verbs = False
     reads: Mapping[str, str] = {"status": "status", "state": "state", "features": "features"}
+    starts = "start"
 
     def __init__(self, source: str, stated: Mapping[str, str] | None = None) -> None:
         self._source = source
@@ -106,22 +115,31 @@ class MeshNetwork:
 
     def find(self, timeout: float = FIND_S) -> list[FoundRobot]:
         """Return the robots in reach, once they had the time to announce themselves."""
-        self._settle(timeout)
+        discover(self._joined_mesh, since=self._joined, within=timeout)
         self._discoveries += 1
-        return [
-            FoundRobot(
-                str(row["peer_id"]),
-                plain_text(row.get("type"), 100),
-                plain_text(row.get("tool_name"), 100),
-                read_tags(row.get("tags")),
-            )
-            for row in self._rows()
-        ]
+        return [_found(row) for row in self._rows() if _has_robot(row)]
+
+    def listed(self, timeout: float | None = None) -> list[FoundRobot]:
+        """Return every peer in reach; ``timeout`` is waited to its end."""
+        if timeout is None:
+            discover(self._joined_mesh, since=self._fresh)
+        else:
+            time.sleep(max(0.0, self._joined + timeout - time.monotonic()))
+        rows, keys = self._rows(), enrolled_peers()
+        for row in rows:
+            row["tags"] = list(read_tags(row.get("tags")))
+            if "locked" in row and (why := lockout_distrust(row["peer_id"], row, row.get("epochs") or [], keys)):
+                row["distrusted"] = why
+        return [_found(row) for row in rows]
+
+    def known(self, robot: str) -> FoundRobot:
+        """Return what the peer announced last."""
+        return _found(self._joined_mesh.get_peer(robot) or {"peer_id": robot})
 
     def bears(self, robot: str) -> bool:
         """Return whether a robot of this id is in reach."""
-        row = self._joined_mesh.get_peer(robot)
-        return row is not None and bool(row["reachable"]) and _has_robot(row)
+        mesh = self._joined_mesh
+        return is_in_reach(mesh, robot) and _has_robot(mesh.get_peer(robot) or {})
 
     def session(self, robot: str) -> object:
         """Return the session of the peer, and the number of discoveries."""
@@ -133,64 +151,83 @@ class MeshNetwork:
 
     def describe(self, robot: str, *, anew: bool = False) -> object:
         """Return the robot's functions, of an older one those of its kind."""
-        from strands_robots.serving.peer_verbs import KINDS, PEER_VERBS  # noqa: PLC0415 - loaded when it is used
-
         del anew  # the robot is always asked
         row = self._joined_mesh.get_peer(robot) or {}
-        reply = self._joined_mesh.send(robot, {"action": "describe"}, DESCRIBE_S)
-        result = reply.get("result")
-        functions = result.get("functions") if isinstance(result, Mapping) else None
-        if isinstance(functions, list):
+        functions = functions_of(self._joined_mesh, robot, DESCRIBE_S)
+        if functions is not None:
             return functions
-        kind = row.get("robot_kind")
-        actions = KINDS.get(
-            kind if isinstance(kind, str) else "", KINDS["world" if row.get("type") == "sim" else "robot"]
-        )
-        own = row.get("own_verbs")
-        named = [{"name": name, "labels": {"own": "true"}} for name in own] if isinstance(own, list) else []
-        return [*(described(PEER_VERBS[name]) for name in actions), *named]
+        return functions_of_kind(row, usual="world" if row.get("type") == "sim" else "robot")
+
+    def describe_each(self, robots: Iterable[str]) -> Mapping[str, object]:
+        """Ask many peers at once; of a silent one return the functions of its kind."""
+        rows = self._joined_mesh.peers_by_id
+        stated = {name: rows[name] for name in robots if "robot_kind" in rows.get(name, ())}
+        functions = functions_of_each(self._joined_mesh, stated)
+        return {name: functions[name] if name in functions else functions_of_kind(row) for name, row in stated.items()}
+
+    def verb(self, robot: str, name: str) -> AdvertisedVerb | None:
+        """Return a verb of the robot's own; the others are known without a description."""
+        if name in ALWAYS_SENT:
+            return None
+        from strands_robots.serving.advertised import find_verb  # noqa: PLC0415 - loaded when it is used
+        from strands_robots.serving.peer_verbs import PEER_VERBS  # noqa: PLC0415 - as above
+
+        if _ALIASES.get(name, name) in PEER_VERBS:
+            return None
+        if not self._waited_for(robot):
+            raise self._absent(robot, name)
+        return find_verb(functions_of(self._joined_mesh, robot, VERB_S), name)
 
     def call(self, robot: str, verb: str, arguments: Mapping[str, Any], timeout: float) -> Envelope:
         """Send the peer an action."""
-        try:
-            for name, value in arguments.items():
-                finite(name, value)
-            json.dumps(arguments, allow_nan=False)
-        except (ValidationError, TypeError, ValueError, RecursionError) as exc:
-            raise ArgumentsError(str(exc), robot=robot, verb=verb) from exc
-        if "action" in arguments:
-            raise ArgumentsError("the mesh cannot carry an argument called action", robot=robot, verb=verb)
+        if problem := _not_carried(arguments):
+            if verb != "stop":
+                raise ArgumentsError(problem, robot=robot, verb=verb)
+            # A stop is never refused for its arguments: without them it stops all that the robot has.
+            arguments = {}
         mesh = self._joined_mesh
         try:
-            if not self._waited_for(robot):
-                raise NoSuchRobotError(f"No robot {robot!r} is on the mesh", robot=robot, verb=verb)
+            there = self._waited_for(robot)
+            if not there and verb not in ALWAYS_SENT:
+                raise self._absent(robot, verb)
             action = self._action(robot, verb)
         except UnreachableError:
             if self._mesh is mesh:
                 raise
             raise NoAnswerError(CLOSED, robot=robot, verb=verb) from None
-        reply = mesh.send(robot, {**arguments, "action": action}, timeout)
+        reply = mesh.send(robot, {**arguments, "action": action}, timeout if there else min(timeout, STOP_S))
         if reply.get("type") == "response":
             result = reply.get("result")
             return dict(result) if isinstance(result, Mapping) else {"result": result}
-        if reply.get("type") == "error":
-            raise refusal_of_text(robot, verb, reply.get("error"))
         if self._mesh is None:
             raise NoAnswerError(CLOSED, robot=robot, verb=verb)
         if reply.get("status") == "timeout":
-            raise NoAnswerError(f"It did not answer within {timeout:g} s", robot=robot, verb=verb)
-        why = plain_text(reply.get("reason") or reply.get("error"))
-        if why.startswith("validation: "):
-            raise refusal_of_text(robot, verb, why)
-        raise UnreachableError(why or "the mesh did not carry the call", robot=robot, verb=verb)
+            if not there:
+                raise self._absent(robot, verb)
+            raise NoAnswerError(f"{robot} did not answer", robot=robot, verb=verb)
+        why = plain_text(reply.get("error") or reply.get("reason"))
+        said = error(f"{robot}: {why or 'refused'}")
+        if reply.get("type") == "error" or why.startswith("validation: "):
+            raise refusal_of_text(robot, verb, why, said)
+        raise UnreachableError(why or "the mesh did not carry the call", robot=robot, verb=verb, envelope=said)
 
-    def stop(self, robot: str, timeout: float = STOP_S, robot_name: str = "") -> Envelope | None:
+    def stop(
+        self, robot: str, timeout: float = STOP_S, robot_name: str = "", *, insist: bool = False
+    ) -> Envelope | None:
         """Stop the peer; *stopped* counts only where an enrolled robot has signed it."""
-        if not self._waited_for(robot, longest=FIND_S):
+        from strands_robots.mesh.transport.zenoh_config import DISCOVERY_S, discovery_timeout  # noqa: PLC0415 - loaded when it is used
+
+        longest = discovery_timeout(DISCOVERY_S)
+        if not self._waited_for(robot, longest if insist else min(longest, FIND_S)) and not insist:
             return None
         one = {"robot_name": robot_name} if robot_name else {}
         reply = self._joined_mesh.send(robot, {"action": "stop", **one}, timeout)
         return stop_answer(robot, reply, enrolled_peers())
+
+    def silence(self, robot: str) -> str:
+        """Return "": the mesh knows no reason before its roster was asked."""
+        del robot
+        return ""
 
     @property
     def key(self) -> NetworkKey:
@@ -216,7 +253,7 @@ class MeshNetwork:
     def stop_all(self, timeout: float = STOP_S) -> tuple[dict[str, Envelope], StopOutcome]:
         """Stop all peers in reach, and again while one has not confirmed it."""
         del timeout  # the mesh's own deadlines count
-        return stop_peers(self._joined_mesh, self._joined)
+        return stop_peers(self._joined_mesh, self._fresh)
 
     def emergency_stop(
         self,
@@ -229,10 +266,14 @@ class MeshNetwork:
     ) -> StopOutcome:
         """Stop and lock the peers; the mesh carries no reason."""
         del reason
-        _, outcome = lock_peers(
-            self._joined_mesh, signing_key, scope, estop_id=estop_id, since=self._joined, remembers=remembers
+        return lock_peers(
+            self._joined_mesh, signing_key, scope, estop_id=estop_id, since=self._fresh, remembers=remembers
         )
-        return outcome
+
+    def verdict(self, outcome: StopOutcome) -> Envelope:
+        """Return the outcome with the stop's id and scope."""
+        report = outcome.report
+        return {**roster_verdict(outcome), "estop_id": report.estop_id, **report.scope.field()}
 
     @contextmanager
     def standing(self, signing_key: Any, known: Callable[[], Collection[str]]) -> Iterator[StopSender]:
@@ -296,38 +337,49 @@ class MeshNetwork:
             raise UnreachableError("The mesh is not joined: use the fleet as a context manager")
         return self._mesh
 
+    @property
+    def _fresh(self) -> float | None:
+        """Time of joining, None where that was just now.
+
+        The first stop of a command then waits for the others from its own sending on.
+        """
+        from strands_robots.mesh.transport.zenoh_config import DISCOVERY_S  # noqa: PLC0415 - loaded when it is used
+
+        return None if self._given and time.monotonic() < self._joined + DISCOVERY_S else self._joined
+
     def _rows(self) -> list[dict[str, Any]]:
-        """Return the peers in reach that have a robot."""
-        return [row for row in self._joined_mesh.peers if row["reachable"] and _has_robot(row)]
+        """Return the peers in reach, with a robot or without one."""
+        return [row for row in self._joined_mesh.peers if row["reachable"]]
 
     def _action(self, robot: str, verb: str) -> str:
         row = self._joined_mesh.get_peer(robot) or {}
         own = row.get("own_verbs")
         return verb if isinstance(own, list) and verb in own else _ALIASES.get(verb, verb)
 
-    def _settle(self, timeout: float) -> None:
-        """Wait until peers that are linked to us have announced themselves."""
-        from strands_robots.mesh.transport.zenoh_config import (  # noqa: PLC0415 - as above
-            DISCOVERY_S,
-            LINK_DISCOVERY_S,
-            stated_endpoints,
-        )
-
-        linked_by = self._joined + LINK_DISCOVERY_S if any(stated_endpoints()) else self._joined
-        until = max(self._joined + DISCOVERY_S, min(linked_by, time.monotonic() + timeout))
-        while (now := time.monotonic()) < until and not (now >= self._joined + DISCOVERY_S and self._rows()):
-            time.sleep(LOOK_S)
-
     def _waited_for(self, robot: str, longest: float = math.inf) -> bool:
-        """Return whether the robot is in reach, once that can be known."""
+        """Return whether the peer is in reach, once that can be known."""
         from strands_robots.mesh.transport.zenoh_config import DISCOVERY_S, discovery_timeout  # noqa: PLC0415 - as above
 
-        until = self._joined + min(discovery_timeout(DISCOVERY_S), longest)
-        while not self.bears(robot):
-            if time.monotonic() >= until:
-                return False
-            time.sleep(LOOK_S)
-        return True
+        # A loaded machine gets twice the time.
+        usual = max(discovery_timeout(DISCOVERY_S), 2 * DISCOVERY_S)
+        return awaited(self._joined_mesh, robot, self._joined + min(usual, longest))
+
+    def _absent(self, robot: str, verb: str) -> NoSuchRobotError:
+        remedy = near(robot, in_reach(self._joined_mesh)).strip()
+        return NoSuchRobotError(f"No peer {robot!r} is on the mesh", robot=robot, verb=verb, remedy=remedy)
+
+
+def _not_carried(arguments: Mapping[str, Any]) -> str:
+    """Return why the mesh cannot carry these arguments, or ""."""
+    if "action" in arguments:
+        return "the mesh cannot carry an argument called action"
+    try:
+        for name, value in arguments.items():
+            finite(name, value)
+        json.dumps(arguments, allow_nan=False)
+    except (ValidationError, TypeError, ValueError, RecursionError) as exc:
+        return str(exc)
+    return ""
 
 
 def _forget_peers() -> None:
@@ -340,3 +392,15 @@ def _forget_peers() -> None:
 
 def _has_robot(row: Mapping[str, Any]) -> bool:
     return "locked" in row or "tool_name" in row or "robot_kind" in row
+
+
+def _found(row: Mapping[str, Any]) -> FoundRobot:
+    return FoundRobot(
+        str(row["peer_id"]),
+        plain_text(row.get("type"), 100),
+        plain_text(row.get("tool_name"), 100),
+        read_tags(row.get("tags")),
+        status=plain_text(row.get("task_status"), 100),
+        age_s=row.get("age"),
+        facts=row,
+    )

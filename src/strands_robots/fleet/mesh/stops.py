@@ -52,7 +52,7 @@ def lock_peers(
     estop_id: str = "",
     since: float | None = None,
     remembers: Remembers | None = None,
-) -> tuple[dict[str, Envelope], StopOutcome]:
+) -> StopOutcome:
     """Send the mesh's emergency stop, again while a peer has not confirmed it.
 
     A peer that was seen and did not answer is named. Every repetition is the same stop.
@@ -89,7 +89,7 @@ def lock_peers(
         reports.close()
     outcome = measured(answers, roster, Sending(signed=signing_key is not None), epoch)
     outcome.record(mesh.peer_id)
-    return answers, outcome
+    return outcome
 
 
 def stop_answer(

@@ -1,0 +1,144 @@
+"""Calls, lists and stops of mesh peers by the calling side."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import pytest
+
+from strands_robots.errors import ArgumentsError, NoSuchRobotError
+from strands_robots.fleet.mesh import descriptions, network
+from strands_robots.fleet.mesh.network import MeshNetwork
+from strands_robots.mesh.transport import zenoh_config
+from strands_robots.serving.advertised import RobotDescription
+
+Reply = Callable[[dict[str, Any]], dict[str, Any]]
+
+
+class FakeMesh:
+    """A mesh whose peers are rows of presence, and which notes what is sent."""
+
+    peer_id = "tool"
+
+    def __init__(self, rows: list[dict[str, Any]], reply: Reply) -> None:
+        self.rows, self.reply = rows, reply
+        self.sent: list[tuple[str, dict[str, Any], float]] = []
+
+    @property
+    def peers(self) -> list[dict[str, Any]]:
+        return [dict(row) for row in self.rows]
+
+    @property
+    def peers_by_id(self) -> dict[str, dict[str, Any]]:
+        return {row["peer_id"]: row for row in self.peers}
+
+    def get_peer(self, peer: str) -> dict[str, Any] | None:
+        return self.peers_by_id.get(peer)
+
+    def send(self, peer: str, command: dict[str, Any], seconds: float) -> dict[str, Any]:
+        self.sent.append((peer, command, seconds))
+        return self.reply(command)
+
+
+def row(name: str, kind: str = "robot", **more: Any) -> dict[str, Any]:
+    return {"peer_id": name, "type": "robot", "reachable": True, "age": 0.1, "robot_kind": kind, **more}
+
+
+def timeout(command: Mapping[str, Any]) -> dict[str, Any]:
+    return {"status": "timeout"}
+
+
+def done(command: Mapping[str, Any]) -> dict[str, Any]:
+    return {"type": "response", "result": {"status": "success", "stopped": True}}
+
+
+def joined(mesh: FakeMesh) -> MeshNetwork:
+    return MeshNetwork.joined(mesh)  # type: ignore[arg-type]
+
+
+@pytest.fixture(autouse=True)
+def quick_discovery(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(zenoh_config, "DISCOVERY_S", 0.05)
+
+
+def test_silent_peers_hold_up_a_list_for_a_bounded_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(descriptions, "LIST_S", 0.1)
+    names = [f"bar-{n}" for n in range(100)]
+
+    def send(peer: str, command: dict[str, Any], seconds: float) -> dict[str, Any]:
+        given.append(seconds)
+        threading.Event().wait(seconds)
+        return {"status": "timeout"}
+
+    mesh, given = FakeMesh([row(name, "mobile_base") for name in names], timeout), list[float]()
+    monkeypatch.setattr(mesh, "send", send)
+    described = joined(mesh).describe_each(names)
+    assert all("drive" in RobotDescription.of(described[name]).verbs for name in names)
+    assert len(given) < len(names) and max(given) <= 0.1
+
+
+def test_verbs_of_an_older_peer_are_those_of_its_kind() -> None:
+    older = {"type": "error", "error": "validation: action must be one of status, stop."}
+    mesh = FakeMesh([row("bar-1", own_verbs=["brewCoffee", 5])], lambda _: older)
+    verbs = [*RobotDescription.of(joined(mesh).describe_each(["bar-1"])["bar-1"]).verbs]
+    assert "moveTo" in verbs and verbs[-1] == "brewCoffee"
+
+
+def test_peer_without_a_robot_is_listed_and_not_found() -> None:
+    console = {"peer_id": "console", "type": "tool", "reachable": True, "age": 0.1}
+    there = joined(FakeMesh([row("arm-1"), console], timeout))
+    assert [each.id for each in there.listed()] == ["arm-1", "console"]
+    assert [each.id for each in there.find()] == ["arm-1"]
+    assert there.describe_each(["console"]) == {}
+
+
+@pytest.mark.parametrize("action", ["stop", "releaseTorque"])
+def test_action_that_takes_energy_away_is_sent_to_a_peer_that_was_not_seen(action: str) -> None:
+    mesh = FakeMesh([row("arm-1")], done)
+    there = joined(mesh)
+    assert there.verb("arm-2", action) is None
+    assert there.call("arm-2", action, {}, 60.0)["status"] == "success"
+    assert mesh.sent == [("arm-2", {"action": action}, network.STOP_S)]
+
+
+def test_motion_is_not_sent_to_a_peer_that_was_not_seen() -> None:
+    mesh = FakeMesh([row("arm-1")], done)
+    with pytest.raises(NoSuchRobotError, match="Near it: arm-1"):
+        joined(mesh).call("arm-2", "moveTo", {}, 60.0)
+    assert mesh.sent == []
+
+
+def test_stop_of_a_seen_peer_is_sent_at_once_and_asks_for_nothing_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(zenoh_config, "DISCOVERY_S", 60.0)
+    monkeypatch.delattr(time, "sleep")
+    mesh = FakeMesh([row("arm-1")], done)
+    there = joined(mesh)
+    assert there.verb("arm-1", "stop") is None
+    there.call("arm-1", "stop", {}, 1.0)
+    there.stop("arm-1", 1.0, insist=True)
+    assert [command for _, command, _ in mesh.sent] == [{"action": "stop"}, {"action": "stop"}]
+
+
+@pytest.mark.parametrize("arguments", [{"x": math.nan}, {"action": "start"}, {"x": object()}])
+def test_no_argument_refuses_a_stop(arguments: dict[str, Any]) -> None:
+    mesh = FakeMesh([row("arm-1")], done)
+    there = joined(mesh)
+    assert there.call("arm-1", "stop", arguments, 1.0)["status"] == "success"
+    assert [command for _, command, _ in mesh.sent] == [{"action": "stop"}]
+    with pytest.raises(ArgumentsError) as refused:
+        there.call("arm-1", "moveTo", arguments, 1.0)
+    assert not refused.value.envelope
+
+
+def test_stop_of_a_robot_that_was_not_found_is_sent_where_it_can_be_nowhere_else() -> None:
+    mesh = FakeMesh([], timeout)
+    there = joined(mesh)
+    assert there.stop("arm-1", 1.0) is None
+    assert mesh.sent == []
+    answer = there.stop("arm-1", 1.0, insist=True)
+    assert answer is not None and answer["stopped"] is None
+    assert [command for _, command, _ in mesh.sent] == [{"action": "stop"}]
