@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from strands_robots.envelope import Envelope
@@ -28,22 +28,49 @@ STOP_S = 5.0
 
 @dataclass(frozen=True, slots=True)
 class FoundRobot:
-    """A robot as its network announces it; the texts are plain and short."""
+    """A robot as its network announces it; the texts are plain and short.
+
+    Attributes:
+        must_answer: it can be stopped, so that a stop expects its answer.
+        world: id of the world that it is a part of, and stops with; empty for none.
+    """
 
     id: str
     type: str = ""
     model: str = ""
     tags: tuple[str, ...] = ()
+    must_answer: bool = False
+    world: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class RobotEvent:
-    """An event of a robot, as it arrived. The robot is the one that the topic names."""
+    """An event of a robot, as it arrived. The robot is the one that the topic names.
+
+    What it says of the robot is read by its network, in the same shape for all of them.
+
+    Attributes:
+        joints: positions by name, not yet checked; None where it has none.
+        part: the robot of a world that they belong to.
+        task: what the robot does, as :func:`~strands_robots.fleet.robot_task.task_of` returns it.
+        load: of the robot's host, 1 for all of its cores.
+        frequent: one of many of its kind, which report a state.
+        alive: False where a broker may have kept it, so that it proves no life.
+    """
 
     robot: str
     name: str
     payload: Mapping[str, Any]
+    joints: Mapping[str, Any] | None = field(default=None, repr=False, compare=False)
+    part: str = field(default="", repr=False, compare=False)
+    task: Mapping[str, Any] | None = field(default=None, repr=False, compare=False)
+    load: float | None = field(default=None, repr=False, compare=False)
+    frequent: bool = field(default=False, repr=False, compare=False)
+    alive: bool = field(default=True, repr=False, compare=False)
 
+
+EVERY = "*"
+"""Every robot of a network, where one is followed."""
 
 OnEvent = Callable[[RobotEvent], None]
 """Takes an event on a thread of the network: it returns at once and does not raise."""
@@ -72,6 +99,12 @@ class NetworkAdapter(Protocol):
     def find(self, timeout: float = FIND_S) -> list[FoundRobot]:
         """Return the robots in reach."""
 
+    def announced(self) -> Collection[str]:
+        """Return robots that have announced themselves; asks no one.
+
+        At least those since the last :meth:`find`.
+        """
+
     def bears(self, robot: str) -> bool:
         """Return whether a robot of this id is known here; asks no one."""
 
@@ -98,6 +131,15 @@ class NetworkAdapter(Protocol):
         """Stop a robot and return its answer, None where it is not on this network.
 
         ``robot_name`` stops one robot of a world alone. No answer in time is an envelope with ``stopped`` None.
+        """
+
+    async def call_async(self, robot: str, verb: str, arguments: Mapping[str, Any], within: float) -> Envelope:
+        """Call a verb from an event loop; every failure is an answer of status error."""
+
+    async def stop_async(self, robot: str, within: float = STOP_S) -> Envelope:
+        """Stop a robot from an event loop, and wait for no other call; never raises.
+
+        It is sent whether or not the robot is known. ``stopped`` is None without an answer.
         """
 
     @property
@@ -171,6 +213,12 @@ class NetworkAdapter(Protocol):
             KeyFileError: the enrolled keys cannot be used.
         """
 
+    async def lockout_async(self, robot: str, within: float) -> LockoutReport:
+        """Ask one robot for its lockouts from an event loop.
+
+        Every failure is a ``problem``.
+        """
+
     def resume(self, reports: Sequence[LockoutReport], signer: Any, timeout: float) -> dict[str, Resumed]:
         """Clear every lockout of these reports; return each robot's outcome.
 
@@ -181,7 +229,12 @@ class NetworkAdapter(Protocol):
         """
 
     def subscribe(self, robot: str, on_event: OnEvent) -> Callable[[], None]:
-        """Receive the robot's events; return the function that ends it."""
+        """Receive the robot's events; return the function that ends it.
+
+        Args:
+            robot: an id, or :data:`EVERY` for all robots: then also their states and signs of life.
+            on_event: takes each event.
+        """
 
     def close(self) -> None:
         """Leave the network; a second call does nothing."""
