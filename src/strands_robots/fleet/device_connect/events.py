@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 STATE, OBSERVATION, STEP = "stateUpdate", "observationUpdate", "streamStep"
 FREQUENT = frozenset({STATE, OBSERVATION, STEP})
+JOINTS = {OBSERVATION: "joints", STEP: "observation"}
+"""Fields with the joints, by event."""
 
 NAME_MAX = 100
 
@@ -22,7 +24,7 @@ NAME_MAX = 100
 def robot_event(event: DeviceEvent) -> RobotEvent:
     """Return a device's event with what it says of its joints and its task."""
     facts, part = event.payload, event.payload.get("robot_name")
-    joints = facts.get("joints" if event.name == OBSERVATION else "observation")
+    joints = facts.get(JOINTS.get(event.name, ""))
     return RobotEvent(
         event.device,
         _plain(event.name[: 2 * NAME_MAX]),
