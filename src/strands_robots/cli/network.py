@@ -15,6 +15,7 @@ import typer
 from strands_robots import settings
 from strands_robots.cli.output import CliError, Exit, plain
 from strands_robots.envelope import Envelope
+from strands_robots.errors import UnreachableError
 from strands_robots.fleet.link_flags import LinkFlags, as_flag
 from strands_robots.fleet.mesh_settings import put_settings
 from strands_robots.fleet.profiles import FleetProfile, mesh_at, profile_for, profile_name
@@ -149,8 +150,9 @@ class Network:
         try:
             with FleetClient(link, name) as fleet:
                 yield fleet
-        except MessagingError as exc:
-            raise CliError(f"The network does not carry this: {exc}", Exit.SILENT) from exc
+        except (MessagingError, UnreachableError) as exc:
+            why = exc.why if isinstance(exc, UnreachableError) else exc
+            raise CliError(f"The network does not carry this: {why}", Exit.SILENT) from exc
 
     @contextmanager
     def joined(self, *, on_mesh: bool = False, source: str = SOURCE) -> Iterator[NetworkAdapter]:

@@ -86,7 +86,7 @@ class FleetFeed:
             )
             thread = LoopThread(f"dashboard-{self.network}")
             self._stack.callback(thread.close)
-            self._stack.callback(_end, there.subscribe(EVERY, self._take))
+            self._stack.callback(there.subscribe(EVERY, self._take))
         except BaseException:
             self._stack.close()
             raise
@@ -272,8 +272,3 @@ class LoopThread:
 def poll_interval(robots: int) -> float:
     """Return the seconds between two questions to one of so many robots."""
     return max(POLL_MIN_S, robots / POLLS_PER_S)
-
-
-def _end(events: Callable[[], None]) -> None:
-    with contextlib.suppress(RefusalError, TimeoutError):  # a connection that is lost needs no farewell
-        events()

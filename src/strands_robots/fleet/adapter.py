@@ -229,7 +229,7 @@ class NetworkAdapter(Protocol):
         """
 
     def subscribe(self, robot: str, on_event: OnEvent) -> Callable[[], None]:
-        """Receive the robot's events; return the function that ends it.
+        """Receive the robot's events; return what ends it, which never fails.
 
         Args:
             robot: an id, or :data:`EVERY` for all robots: then also their states and signs of life.

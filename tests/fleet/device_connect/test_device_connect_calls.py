@@ -65,6 +65,19 @@ def test_failure_is_an_answer_a_verdict_and_a_problem(there: Any, failure: Excep
     assert (called["status"], stopped["stopped"], dict(report.facts)) == ("error", None, {})
 
 
+def test_end_of_the_events_of_a_lost_connection_does_not_fail(there: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+
+    class Lost:
+        def close(self) -> None:
+            asked.append("close")
+            raise MessagingError("the broker is gone")
+
+    monkeypatch.setattr(there._client, "subscription", lambda device, callback: Lost())
+    there.subscribe("*", asked.append)()
+    assert asked == ["close"]
+
+
 def test_lockouts_count_only_while_the_enrolled_keys_can_be_used(there: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     there._client.answer = success("idle", locked=False, lockout=[])
     assert asyncio.run(there.lockout_async("arm-1", 1.0)).problem == ""

@@ -268,8 +268,12 @@ class DeviceConnectNetwork:
             subscription = self._connected.subscription(robot, lambda event: on_event(robot_event(event)))
 
         def end() -> None:
-            with _carried():
-                subscription.close()
+            try:
+                with _carried():
+                    subscription.close()
+            except UnreachableError as exc:
+                # A connection that is lost needs no farewell.
+                logger.debug("Events of %s were not ended in good order: %s", robot, exc)
 
         return end
 
