@@ -22,6 +22,8 @@ from strands_robots.cli.watch import (
     print_changes,
 )
 from strands_robots.device_connect.client import DeviceEvent
+from strands_robots.fleet.adapter import RobotEvent
+from strands_robots.fleet.device_connect.events import robot_event
 
 
 def drawn(thing: object) -> str:
@@ -30,8 +32,8 @@ def drawn(thing: object) -> str:
     return sink.getvalue()
 
 
-def event(name: str, **payload: Any) -> DeviceEvent:
-    return DeviceEvent("arm-1", name, payload)
+def event(name: str, **payload: Any) -> RobotEvent:
+    return robot_event(DeviceEvent("arm-1", name, payload))
 
 
 @pytest.mark.parametrize(
@@ -47,7 +49,7 @@ def event(name: str, **payload: Any) -> DeviceEvent:
         (event("observationUpdate", joints={}), ""),
     ],
 )
-def test_event_is_described_as_the_device_task(seen: DeviceEvent, task: str) -> None:
+def test_event_is_described_as_the_device_task(seen: RobotEvent, task: str) -> None:
     assert describe_task(seen) == task
 
 

@@ -159,3 +159,17 @@ def test_changes_of_control_are_events_once() -> None:
     clock.now += 10
     fleet.report("dc", held_by(""))
     assert events(fleet)[3:] == ["control released"]
+
+
+def test_report_that_says_less_of_the_same_task_takes_nothing_away() -> None:
+    model = FleetModel()
+    model.update("mesh", "sim-1")
+    model.task("mesh", "sim-1", state="running", instruction="wave", step=3, who="left")
+    changed = model.changes(0)[0]
+    model.task("mesh", "sim-1", state="running", instruction="wave")
+    row = model.row("mesh:sim-1")
+    assert row is not None
+    assert row.task == {"state": "running", "instruction": "wave", "step": 3, "who": "left"}
+    assert row.changed <= changed, "nothing that the page shows at once has changed"
+    model.task("mesh", "sim-1", state="idle", instruction="")
+    assert row.task == {"state": "idle", "instruction": ""}

@@ -8,6 +8,8 @@ from typing import Any
 import pytest
 
 from strands_robots.dashboard.verb_forms import forms_of
+from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS
+from strands_robots.serving.verb_schema import described
 
 
 @pytest.mark.parametrize("default", [float("nan"), float("inf"), -float("inf"), [1], {}])
@@ -17,10 +19,7 @@ def test_default_that_a_page_cannot_be_told_is_left_out(default: Any) -> None:
 
 
 def test_form_names_units_choices_and_the_fields_that_are_shown_of_every_arm_verb() -> None:
-    from strands_robots.dashboard.verb_forms import peer_forms  # noqa: PLC0415 - beside what it holds to its words
-    from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS  # noqa: PLC0415 - the descriptions as they are
-
-    forms = {form["name"]: form for form in peer_forms(ARM_MOTION_VERBS.values())}
+    forms = {form["name"]: form for form in forms_of([described(verb) for verb in ARM_MOTION_VERBS.values()])}
     fields = {name: {each["name"]: each for each in form["parameters"]} for name, form in forms.items()}
     assert [name for name, each in fields["pick"].items() if each["shown"]] == ["object", "speed"]
     assert fields["pick"]["object"]["choices"] == fields["place"]["on"]["choices"] == "objects"

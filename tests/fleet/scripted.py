@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import asyncio
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 from strands_robots.envelope import Envelope, error, success
-from strands_robots.errors import NoSuchRobotError, UnknownVerbError, UnreachableError
-from strands_robots.fleet.adapter import DEVICE_CONNECT, FIND_S, STOP_S, FoundRobot, OnEvent
+from strands_robots.errors import NoSuchRobotError, RefusalError, UnknownVerbError, UnreachableError
+from strands_robots.fleet.adapter import DEVICE_CONNECT, FIND_S, STOP_S, FoundRobot, OnEvent, RobotEvent
 from strands_robots.fleet.lockout_report import LockoutReport, Resumed
 from strands_robots.fleet.stop_answers import measured, roster_verdict, unanswered
 from strands_robots.safety.identity import SigningIdentity
@@ -71,6 +74,12 @@ class ScriptedNetwork:
         self.locked: dict[str, str] = {}
         self.silent: list[str] = []
         self.remembered = False
+        self.children: dict[str, str] = {}
+        self.mute: set[str] = set()
+        self.controller: Any = object()
+        self.standing_for: list[Callable[[], Collection[str]]] = []
+        self.asked: list[str] = []
+        self.searches = 0
 
     def open(self) -> None:
         if self.unreachable:
@@ -87,7 +96,16 @@ class ScriptedNetwork:
         self.answers["getStatus"] = status
 
     def find(self, timeout: float = FIND_S) -> list[FoundRobot]:
-        return [FoundRobot(name, "strands_robot", "so100") for name in self.robots]
+        self.searches += 1
+        if self.unreachable:
+            raise UnreachableError(self.unreachable)
+        return [
+            FoundRobot(name, "strands_robot", "so100", must_answer=True, world=self.children.get(name, ""))
+            for name in self.robots
+        ]
+
+    def announced(self) -> Collection[str]:
+        return tuple(self.robots)
 
     def listed(self, timeout: float | None = None) -> list[FoundRobot]:
         return self.find()
@@ -137,6 +155,15 @@ class ScriptedNetwork:
             raise self.stops
         return self.stops
 
+    async def call_async(self, robot: str, verb: str, arguments: Mapping[str, Any], within: float) -> Envelope:
+        try:
+            return self.call(robot, verb, arguments, within)
+        except RefusalError as exc:
+            return error(exc.why)
+
+    async def stop_async(self, robot: str, within: float = STOP_S) -> Envelope:
+        return self.stop(robot, within) or error("none", stopped=None)
+
     @property
     def key(self) -> NetworkKey:
         return NetworkKey.of(self.name, ["scripted"])
@@ -183,8 +210,13 @@ class ScriptedNetwork:
         roster.read()
         return roster
 
-    def standing(self, signing_key: Any, known: Any) -> Any:
-        raise NotImplementedError
+    @contextmanager
+    def standing(self, signing_key: Any, known: Callable[[], Collection[str]]) -> Iterator[Any]:
+        self.standing_for.append(known)
+        try:
+            yield self.controller
+        finally:
+            self.standing_for.remove(known)
 
     def beats(self, robots: Iterable[str]) -> Mapping[str, float | None]:
         return dict.fromkeys(robots)
@@ -200,6 +232,15 @@ class ScriptedNetwork:
             for name in robots
         ]
 
+    async def lockout_async(self, robot: str, within: float) -> LockoutReport:
+        """Report the lockouts and the answer to ``getStatus``; a mute robot none."""
+        self.asked.append(robot)
+        if robot in self.mute:
+            await asyncio.sleep(within)
+            return LockoutReport(robot, problem="it did not answer")
+        facts = await self.call_async(robot, "getStatus", {}, within)
+        return replace(self.lockouts([robot], within)[0], facts=facts, round_trip_ms=1.0)
+
     def resume(self, reports: Sequence[LockoutReport], signer: Any, timeout: float) -> dict[str, Resumed]:
         for each in reports:
             self.locked.pop(each.name, None)
@@ -208,6 +249,11 @@ class ScriptedNetwork:
     def subscribe(self, robot: str, on_event: OnEvent) -> Callable[[], None]:
         self.subscribers.append(on_event)
         return lambda: self.subscribers.remove(on_event)
+
+    def say(self, robot: str, name: str, payload: Mapping[str, Any] | None = None, **said: Any) -> None:
+        """Have a robot send an event."""
+        for each in list(self.subscribers):
+            each(RobotEvent(robot, name, payload or {}, **said))
 
     def close(self) -> None:
         self.joined = False

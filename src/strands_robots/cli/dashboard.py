@@ -19,7 +19,7 @@ import typer
 from strands_robots import settings
 from strands_robots.cli.command import command
 from strands_robots.cli.keys import PassphraseFile, signing_key
-from strands_robots.cli.network import Network, mesh_peer, temporary_mesh_id
+from strands_robots.cli.network import Network, joined_mesh
 from strands_robots.cli.output import CliError, Exit, Screen
 from strands_robots.safety.ed25519 import keygen
 from strands_robots.utils import device_id, missing_extra
@@ -113,15 +113,12 @@ def _feeds(
     stack: ExitStack, model: FleetModel, network: Network, source: str, signer: Any, *, with_mesh: bool
 ) -> list[FleetFeed]:
     """Join the networks; they are left when the stack ends."""
-    from strands_robots.dashboard.device_connect_feed import DeviceConnectFeed  # noqa: PLC0415 - as above
+    from strands_robots.dashboard.feed import FleetFeed  # noqa: PLC0415 - as above
 
-    feeds: list[FleetFeed] = [DeviceConnectFeed(model, stack.enter_context(network.fleet(source)), signer)]
+    networks = [stack.enter_context(network.joined(source=source))]
     if with_mesh:
-        from strands_robots.dashboard.mesh_feed import MeshFeed  # noqa: PLC0415 - as above
-
-        mesh = stack.enter_context(mesh_peer(None, temporary_mesh_id(source), "controller"))
-        feeds.append(MeshFeed(model, mesh, signer))
-    return feeds
+        networks.append(stack.enter_context(joined_mesh(source, "controller")))
+    return [FleetFeed(model, each, signer) for each in networks]
 
 
 @contextmanager

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import shlex
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -164,18 +164,15 @@ class Network:
         Raises:
             CliError: the network cannot be reached, fails in use, or takes no such flag.
         """
-        with ExitStack() as stack:
-            if on_mesh:
-                from strands_robots.fleet.mesh.network import MeshNetwork  # noqa: PLC0415 - loaded when it is used
+        if on_mesh:
+            self.use_mesh()
+            with joined_mesh(peer, "tool") as mesh:
+                yield mesh
+            return
+        from strands_robots.fleet.device_connect.network import DeviceConnectNetwork  # noqa: PLC0415 - loaded when a network is used
 
-                self.use_mesh()
-                mesh = stack.enter_context(mesh_peer(None, temporary_mesh_id(peer), "tool"))
-                network: NetworkAdapter = MeshNetwork.joined(mesh)
-            else:
-                from strands_robots.fleet.device_connect.network import DeviceConnectNetwork  # noqa: PLC0415 - as above
-
-                network = DeviceConnectNetwork.joined(stack.enter_context(self.fleet(source)))
-            yield network
+        with self.fleet(source) as fleet:
+            yield DeviceConnectNetwork.joined(fleet)
 
     @property
     def stated_tenant(self) -> str:
@@ -226,6 +223,19 @@ def _mesh_beside(profile: FleetProfile) -> Mapping[str, str]:
         logger.warning("%s The mesh is left out.", unfit)
         stated = None
     return {"STRANDS_MESH": "false"} if stated is None else stated
+
+
+@contextmanager
+def joined_mesh(source: str, peer_type: str) -> Iterator[NetworkAdapter]:
+    """Join the native mesh under a fresh id while the block runs.
+
+    Raises:
+        CliError: it cannot be joined.
+    """
+    from strands_robots.fleet.mesh.network import MeshNetwork  # noqa: PLC0415 - loaded when a network is used
+
+    with mesh_peer(None, temporary_mesh_id(source), peer_type) as mesh, closing(MeshNetwork.joined(mesh)) as network:
+        yield network
 
 
 @contextmanager

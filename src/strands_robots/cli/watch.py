@@ -23,7 +23,7 @@ from strands_robots.utils import number
 
 if TYPE_CHECKING:
     from strands_robots.device_connect import FleetClient
-    from strands_robots.device_connect.client import DeviceEvent
+    from strands_robots.fleet.adapter import RobotEvent
 
 REDRAW_S = 0.07
 """Seconds between two redraws."""
@@ -46,7 +46,7 @@ JOINTS_MAX = 24
 
 NO_JOINTS = "It reports no joints: it has none, or sends them only while it moves."
 
-Frame = tuple[list["DeviceEvent"], float]
+Frame = tuple[list["RobotEvent"], float]
 FULL_TURN: Range = (-math.pi, math.pi)
 """Range of the bar of a joint without limits, in radians."""
 
@@ -74,15 +74,19 @@ def watch(
             # A device without getFeatures is drawn without its limits.
             if isinstance(failure.__cause__, LookupError):
                 raise
-        signs = SignsOfLife(lambda: fleet.last_heartbeat(device), lambda: fleet.beats_every(device))
-        with fleet.subscription(device, signs.take):
+        from strands_robots.fleet.device_connect.network import DeviceConnectNetwork  # noqa: PLC0415 - loaded when it is used
+
+        there = DeviceConnectNetwork.joined(fleet)
+        signs = SignsOfLife(lambda: there.beats([device])[device], lambda: fleet.beats_every(device))
+        with contextlib.ExitStack() as stack:
+            stack.callback(there.subscribe(device, signs.take))
             frames = follow(signs, longest, device)
             if screen.machine:
                 for function, answer in _present_answers(fleet, device):
                     screen.data({"device": device, "event": function, "payload": answer})
                 for events, _ in frames:
                     for event in events:
-                        screen.data({"device": event.device, "event": event.name, "payload": dict(event.payload)})
+                        screen.data({"device": event.robot, "event": event.name, "payload": dict(event.payload)})
             elif screen.live:
                 _draw_live(screen, _present_state(fleet, device, limits), frames)
             else:
@@ -105,16 +109,16 @@ class SignsOfLife:
     ) -> None:
         self._last_heartbeat = last_heartbeat
         self._beats_every = beats_every
-        self._events: deque[DeviceEvent] = deque(maxlen=EVENTS_MAX)
+        self._events: deque[RobotEvent] = deque(maxlen=EVENTS_MAX)
         self._began = time.monotonic()
         self._event_at: float | None = None
 
-    def take(self, event: DeviceEvent) -> None:
+    def take(self, event: RobotEvent) -> None:
         """Keep an event; on the client's thread."""
         self._event_at = time.monotonic()
         self._events.append(event)
 
-    def drain(self) -> list[DeviceEvent]:
+    def drain(self) -> list[RobotEvent]:
         """Return the events that have arrived since the last time."""
         return [self._events.popleft() for _ in range(len(self._events))]
 
@@ -154,12 +158,10 @@ class DeviceView:
             if isinstance(joints, Mapping):
                 self._joints[str(name)] = joints
 
-    def take(self, event: DeviceEvent) -> None:
+    def take(self, event: RobotEvent) -> None:
         """Update from one event."""
-        robot = str(event.payload.get("robot_name", ""))
-        joints = event.payload.get("joints" if event.name == "observationUpdate" else "observation")
-        if event.name in ("observationUpdate", "streamStep") and isinstance(joints, Mapping):
-            self._joints[robot] = joints
+        if event.joints is not None:
+            self._joints[event.part] = event.joints
         self.task = describe_task(event) or self.task
 
     @property
@@ -183,7 +185,7 @@ class DeviceView:
         return Group(*parts)
 
 
-def describe_task(event: DeviceEvent) -> str:
+def describe_task(event: RobotEvent) -> str:
     """Return the task that an event reports, or an empty text."""
     facts = event.payload
     if event.name in ("taskStarted", "policyStarted"):
@@ -228,14 +230,14 @@ def follow(signs: SignsOfLife, longest: float | None, device: str) -> Iterator[F
         time.sleep(min(REDRAW_S, max(0.0, ends - time.monotonic())))
 
 
-def print_changes(screen: Screen, device: str, now: str, events: Iterator[DeviceEvent]) -> None:
+def print_changes(screen: Screen, device: str, now: str, events: Iterator[RobotEvent]) -> None:
     """Print the present task, and one line for each change of it."""
     screen.say(f"{device}: {now}")
     last = now
     for event in events:
         task = describe_task(event)
         if task and task != last:
-            screen.say(f"{event.device}: {task}")
+            screen.say(f"{event.robot}: {task}")
             last = task
 
 

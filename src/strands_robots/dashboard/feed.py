@@ -3,14 +3,27 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import logging
 import threading
-from collections.abc import Mapping
-from typing import Any, Protocol
+import time
+from collections.abc import Awaitable, Callable, Mapping
+from typing import Any
 
-from strands_robots.envelope import Envelope
-from strands_robots.fleet.stop_button import StopSender
+from strands_robots.dashboard.fleet_model import FleetModel, key_of
+from strands_robots.dashboard.verb_forms import forms_of
+from strands_robots.envelope import Envelope, is_error
+from strands_robots.errors import RefusalError
+from strands_robots.fleet.adapter import DEVICE_CONNECT, EVERY, FoundRobot, NetworkAdapter, RobotEvent
+from strands_robots.fleet.joint_features import joint_limits, joint_units
+from strands_robots.fleet.lockout_report import Resumed
+from strands_robots.fleet.robot_task import task_of
+from strands_robots.safety.identity import KeyFileError
 
-DEVICE_CONNECT, MESH = "dc", "mesh"
+logger = logging.getLogger(__name__)
+
+KEYS = {DEVICE_CONNECT: "dc"}
+"""Networks that have another name in the page's messages than their adapter has."""
 
 POLL_MIN_S = 0.4
 """Shortest time between two questions to one robot for its lockout and its holder."""
@@ -21,32 +34,216 @@ POLLS_PER_S = 30.0
 ASK_S = 1.5
 """Seconds that a robot has to answer one."""
 
+READ_S = 3.0
+"""Seconds that a robot has to answer a question about what it can do."""
+
+STOP_S = 2.0
+SEARCH_S = 2.0
+SEARCH_AGAIN_S, SEARCH_SOON_S = 30.0, 1.0
+"""Seconds between two searches where no new robot was announced meanwhile; and after a search that failed, or where a
+stranger sent an event."""
+
+LOOK_S = 0.2
 PARALLEL = 8
+"""Robots that are asked at a time; those that did not answer last time keep none of the others waiting."""
+
+STRANGERS_MAX = 8
+PARTS_MAX = 16
+CAMERAS_MAX, CAMERA_NAME_MAX = 32, 128
 
 
-class FleetFeed(Protocol):
-    """Robots of one network; ``call`` and ``stop`` run on the caller's event loop."""
+class FleetFeed:
+    """Robots of one network, and the sender of its emergency stops.
 
-    network: str
+    ``call`` and ``stop`` run on the caller's event loop, everything else on a loop of the feed's own.
 
-    @property
-    def controller(self) -> StopSender:
-        """The sender of its emergency stops."""
+    Args:
+        model: takes what the robots say.
+        there: a joined network.
+        signing_key: signs emergency stops; then only enrolled robots can confirm one.
+
+    Attributes:
+        network: the name of the network in the page's messages.
+        controller: sends its emergency stops.
+    """
+
+    def __init__(self, model: FleetModel, there: NetworkAdapter, signing_key: Any = None) -> None:
+        self.network = KEYS.get(there.name, there.name)
+        self._model, self._there = model, there
+        self._names: set[str] = set()
+        self._passed: set[str] = set()
+        self._strangers: set[str] = set()
+        self._silent: set[str] = set()
+        self._functions: dict[str, object] = {}
+        self._asked: dict[str, float] = {}
+        self._searched, self._found = float("-inf"), True
+        self._tasks: dict[tuple[str, str], asyncio.Task[None]] = {}
+        self._limits = {each: asyncio.Semaphore(PARALLEL) for each in ("lively", "silent", "verbs")}
+        self._stack = contextlib.ExitStack()
+        try:
+            self.controller = self._stack.enter_context(
+                there.standing(signing_key, lambda: model.expected(self.network))
+            )
+            thread = LoopThread(f"dashboard-{self.network}")
+            self._stack.callback(thread.close)
+            self._stack.callback(there.subscribe(EVERY, self._take))
+        except BaseException:
+            self._stack.close()
+            raise
+        asyncio.run_coroutine_threadsafe(self._run(), thread.loop)
 
     async def call(self, robot: str, verb: str, params: Mapping[str, Any], seconds: float) -> Envelope:
         """Call a verb; every failure is an answer of status error."""
+        return await self._there.call_async(robot, verb, params, seconds)
 
     async def stop(self, robot: str) -> Envelope:
         """End a robot's motion without a lockout, as after a jog; graded, never raises."""
+        return await self._there.stop_async(robot, STOP_S)
 
     async def look_closer(self, robot: str) -> None:
-        """Read the limits and the cameras of a robot that somebody views."""
+        """Read the limits and the cameras of a robot, and its idle joints."""
+        reads = self._there.reads
+        asked = (reads["features"], "listCameras", reads["state"])
+        features, cameras, state = await asyncio.gather(*(self.call(robot, verb, {}, READ_S) for verb in asked))
+        found = cameras.get("cameras")
+        names = tuple(str(each)[:CAMERA_NAME_MAX] for each in found[:CAMERAS_MAX]) if isinstance(found, list) else ()
+        limits = joint_limits(features) if not is_error(features) else {}
+        self._model.update(self.network, robot, cameras=names, limits=limits, units=joint_units(features))
+        if isinstance(state.get("joints"), Mapping):
+            self._model.observe(self.network, robot, state["joints"])
 
-    def resume(self, robots: list[str], signer: Any, seconds: float) -> dict[str, tuple[bool, str]]:
+    def resume(self, robots: list[str], signer: Any, seconds: float) -> dict[str, Resumed]:
         """Free robots with the operator's key; blocks, and returns each outcome."""
+        try:
+            return self._there.resume(self._there.lockouts(robots, seconds), signer, seconds)
+        except (KeyFileError, RefusalError) as exc:
+            return dict.fromkeys(robots, (False, exc.why if isinstance(exc, RefusalError) else str(exc)))
 
     def close(self) -> None:
-        """Leave the network."""
+        """End the feed; the network is left by whoever joined it."""
+        self._stack.close()
+
+    # On a thread of the network: returns at once and may not raise.
+
+    def _take(self, event: RobotEvent) -> None:
+        name = event.robot
+        if name not in self._names:
+            if len(self._strangers) < STRANGERS_MAX and not self._there.bears(name):
+                self._strangers.add(name)
+            return
+        if event.alive:
+            self._model.sign_of_life(self.network, name)
+        if event.joints is not None:
+            self._model.observe(self.network, name, event.joints, event.part)
+        if event.task is not None:
+            self._model.task(self.network, name, **event.task)
+        if event.load is not None:
+            self._model.load(self.network, name, event.load)
+        if not event.frequent:
+            self._model.note(self.network, name, event.name, event.payload)
+
+    # On this feed's own loop.
+
+    async def _run(self) -> None:
+        while True:
+            try:
+                self._look()
+            except RefusalError as exc:
+                logger.debug("Robots on %s cannot be looked for: %s", self.network, exc)
+            await asyncio.sleep(LOOK_S if len(self._names) > 1 else LOOK_S / 2)
+
+    def _look(self) -> None:
+        """Begin what is due: a search, and a question to each robot."""
+        now = time.monotonic()
+        waited = now - self._searched
+        new = {*self._there.announced()} - self._names - self._passed
+        soon = not self._found or self._strangers
+        if (new and self._found) or waited > (SEARCH_SOON_S if soon else SEARCH_AGAIN_S):
+            self._searched = now if self._begin("search", "", self._search) else self._searched
+        every = poll_interval(len(self._names))
+        for name in sorted(self._names):
+            if now - self._asked.get(name, float("-inf")) >= every and self._begin("lockout", name, self._ask):
+                self._asked[name] = now
+
+    def _begin(self, what: str, name: str, work: Callable[[str], Awaitable[None]]) -> bool:
+        """Begin a task; False while the one before is under way."""
+        running = self._tasks.get((what, name))
+        if running is not None and not running.done():
+            return False
+
+        async def guarded() -> None:
+            try:
+                await work(name)
+            except (LookupError, TimeoutError, RuntimeError) as exc:
+                logger.warning("%s %s failed: %s", what, name, exc)
+
+        self._tasks[what, name] = asyncio.create_task(guarded())
+        return True
+
+    async def _search(self, _: str) -> None:
+        self._strangers.clear()
+        self._found = False
+        found = await asyncio.to_thread(self._there.find, SEARCH_S)
+        for each in found:
+            # A world has one card, with all of its robots.
+            if not each.world:
+                self._meet(each)
+        self._passed, self._found = {each.id for each in found} - self._names, True
+
+    def _meet(self, robot: FoundRobot) -> None:
+        kind, model = robot.type[:80], robot.model[:80]
+        self._model.update(self.network, robot.id, kind=kind, model=model, expected=robot.must_answer)
+        row = self._model.row(key_of(self.network, robot.id))
+        if row is None:
+            return
+        self._names.add(robot.id)
+        if self._there.announces_verbs:
+            self._describe(robot.id, self._there.describe(robot.id))
+        elif not row.forms:
+            self._begin("verbs", robot.id, self._ask_verbs)
+
+    def _describe(self, name: str, functions: object) -> None:
+        row = self._model.row(key_of(self.network, name))
+        # The same functions again are compared, which is faster than to make their forms.
+        if row is not None and not (row.forms and functions == self._functions.get(name)):
+            self._functions[name] = functions
+            forms = forms_of(functions) if isinstance(functions, list | tuple) else ()
+            self._model.update(self.network, name, forms=forms)
+
+    async def _ask_verbs(self, name: str) -> None:
+        async with self._limits["verbs"]:
+            self._describe(name, await asyncio.to_thread(self._there.describe, name))
+
+    async def _ask(self, name: str) -> None:
+        was_silent = name in self._silent
+        async with self._limits["silent" if was_silent else "lively"]:
+            report = await self._there.lockout_async(name, ASK_S)
+        if not report.facts:
+            # A robot that does not answer is shown by the age of what it said last.
+            self._silent.add(name)
+            return
+        self._silent.discard(name)
+        self._model.sign_of_life(self.network, name, report.round_trip_ms)
+        if self._model.row(key_of(self.network, name)) is None:
+            self._forget(name)
+            return
+        self._model.report(self.network, report)
+        if "task_status" in report.facts or "running_policies" in report.facts:
+            self._model.task(self.network, name, **task_of(report.facts))
+        robots = report.facts.get("robots")
+        for part, joints in list(robots.items())[:PARTS_MAX] if isinstance(robots, Mapping) else ():
+            if isinstance(joints, Mapping):
+                self._model.observe(self.network, name, joints, str(part))
+        if was_silent and not self._there.announces_verbs:
+            # It may be another program by now.
+            self._begin("verbs", name, self._ask_verbs)
+
+    def _forget(self, name: str) -> None:
+        """Forget a robot that an operator has removed; it is met anew when it is found."""
+        self._names.discard(name)
+        for each in (self._functions, self._asked):
+            each.pop(name, None)
+        self._tasks.pop(("verbs", name), None)
 
 
 class LoopThread:

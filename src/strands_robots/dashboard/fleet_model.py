@@ -175,12 +175,17 @@ class FleetModel:
                 row.ticked = self._next()
 
     def task(self, network: str, name: str, **task: Any) -> None:
-        """Set what a robot does; its number of steps changes twice a second only."""
+        """Set what a robot does; its number of steps changes twice a second only.
+
+        A message that says less of the same task than another one takes nothing of it away.
+        """
         with self._lock:
             row = self._rows.get(key_of(network, name))
             if row is None:
                 return
             new = {field_name: _cut(value) for field_name, value in task.items()}
+            if all(row.task.get(each) == new.get(each) for each in ("state", "instruction")):
+                new = {**row.task, **new}
             steps = {"step"}
             same = all(row.task.get(each) == new.get(each) for each in (row.task.keys() | new.keys()) - steps)
             row.task = new

@@ -9,9 +9,6 @@ from typing import Any
 
 from strands_robots.serving.advertised import AdvertisedParameter, AdvertisedVerb, RobotDescription
 from strands_robots.serving.control_verbs import CONTROL_VERBS
-from strands_robots.serving.peer_verbs import PEER_VERBS
-from strands_robots.serving.verb_schema import described
-from strands_robots.serving.verbs import Verb
 
 LEFT_OUT = frozenset({*CONTROL_VERBS, "resume", "ping", "teleop_status", "teleop_receive", "teleop_stop"})
 """Verbs that the page has a control of its own for, or none."""
@@ -47,14 +44,9 @@ _NUMBERS = ("number", "integer")
 
 
 def forms_of(functions: Iterable[Mapping[str, Any]]) -> tuple[dict[str, Any], ...]:
-    """Return the forms of a device's functions, as it describes them on the network."""
+    """Return the forms of a robot's functions, as it describes them on its network."""
     verbs = (each for each in RobotDescription.of(list(functions)).verbs.values() if each.name not in LEFT_OUT)
     return tuple(_form(each) for each in islice(verbs, FORMS_MAX))
-
-
-def peer_forms(verbs: Iterable[Verb] = tuple(PEER_VERBS.values())) -> tuple[dict[str, Any], ...]:
-    """Return the forms of a mesh peer, which has the same verbs as every other."""
-    return forms_of([described(verb) for verb in verbs])
 
 
 def _form(verb: AdvertisedVerb) -> dict[str, Any]:

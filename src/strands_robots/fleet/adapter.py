@@ -31,28 +31,55 @@ STOP_S = 5.0
 
 @dataclass(frozen=True, slots=True)
 class FoundRobot:
-    """A robot as its network announces it; the texts are plain and short."""
+    """A robot as its network announces it; the texts are plain and short.
+
+    Attributes:
+        must_answer: it can be stopped, so that a stop expects its answer.
+        world: id of the world that it is a part of, and stops with; empty for none.
+        status: what it says it is doing.
+        age_s: seconds since its last own message; None where only a registry names it.
+        facts: all that its network knows of it, for programs.
+    """
 
     id: str
     type: str = ""
     model: str = ""
     tags: tuple[str, ...] = ()
+    must_answer: bool = False
+    world: str = ""
     status: str = ""
-    """What it says it is doing."""
     age_s: float | None = None
-    """Seconds since its last own message; None where only a registry names it."""
     facts: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
-    """All that its network knows of it, for programs."""
 
 
 @dataclass(frozen=True, slots=True)
 class RobotEvent:
-    """An event of a robot, as it arrived. The robot is the one that the topic names."""
+    """An event of a robot, as it arrived. The robot is the one that the topic names.
+
+    What it says of the robot is read by its network, in the same shape for all of them.
+
+    Attributes:
+        joints: positions by name, not yet checked; None where it has none.
+        part: the robot of a world that they belong to.
+        task: what the robot does, as :func:`~strands_robots.fleet.robot_task.task_of` returns it.
+        load: of the robot's host, 1 for all of its cores.
+        frequent: one of many of its kind, which report a state.
+        alive: False where a broker may have kept it, so that it proves no life.
+    """
 
     robot: str
     name: str
     payload: Mapping[str, Any]
+    joints: Mapping[str, Any] | None = field(default=None, repr=False, compare=False)
+    part: str = field(default="", repr=False, compare=False)
+    task: Mapping[str, Any] | None = field(default=None, repr=False, compare=False)
+    load: float | None = field(default=None, repr=False, compare=False)
+    frequent: bool = field(default=False, repr=False, compare=False)
+    alive: bool = field(default=True, repr=False, compare=False)
 
+
+EVERY = "*"
+"""Every robot of a network, where one is followed."""
 
 OnEvent = Callable[[RobotEvent], None]
 """Takes an event on a thread of the network: it returns at once and does not raise."""
@@ -92,6 +119,12 @@ class NetworkAdapter(Protocol):
 
     def known(self, robot: str) -> FoundRobot:
         """Return what is known of a robot; asks no one."""
+
+    def announced(self) -> Collection[str]:
+        """Return robots that have announced themselves; asks no one.
+
+        At least those since the last :meth:`find`.
+        """
 
     def bears(self, robot: str) -> bool:
         """Return whether a robot of this id is known here; asks no one."""
@@ -147,6 +180,15 @@ class NetworkAdapter(Protocol):
 
     def silence(self, robot: str) -> str:
         """Return why a robot that did not answer a stop may be silent, or ""."""
+
+    async def call_async(self, robot: str, verb: str, arguments: Mapping[str, Any], within: float) -> Envelope:
+        """Call a verb from an event loop; every failure is an answer of status error."""
+
+    async def stop_async(self, robot: str, within: float = STOP_S) -> Envelope:
+        """Stop a robot from an event loop, and wait for no other call; never raises.
+
+        It is sent whether or not the robot is known. ``stopped`` is None without an answer.
+        """
 
     @property
     def key(self) -> NetworkKey:
@@ -222,6 +264,12 @@ class NetworkAdapter(Protocol):
             KeyFileError: the enrolled keys cannot be used.
         """
 
+    async def lockout_async(self, robot: str, within: float) -> LockoutReport:
+        """Ask one robot for its lockouts from an event loop.
+
+        Every failure is a ``problem``.
+        """
+
     def resume(self, reports: Sequence[LockoutReport], signer: Any, timeout: float) -> dict[str, Resumed]:
         """Clear every lockout of these reports; return each robot's outcome.
 
@@ -232,7 +280,12 @@ class NetworkAdapter(Protocol):
         """
 
     def subscribe(self, robot: str, on_event: OnEvent) -> Callable[[], None]:
-        """Receive the robot's events; return the function that ends it."""
+        """Receive the robot's events; return what ends it, which never fails.
+
+        Args:
+            robot: an id, or :data:`EVERY` for all robots: then also their states and signs of life.
+            on_event: takes each event.
+        """
 
     def close(self) -> None:
         """Leave the network; a second call does nothing."""

@@ -47,6 +47,7 @@ PARSERS = {
     "drivers/reachy/links.py": BOUNDED,
     "drivers/reachy/motion.py": BOUNDED,
     "drivers/reachy/rest.py": BOUNDED,
+    "fleet/mesh/standing.py": BOUNDED,
     "hardware/calibration.py": OWN_FILE,
     "kinematics/places.py": OWN_FILE,
     "mesh/commands.py": BOUNDED,
@@ -60,7 +61,6 @@ PARSERS = {
     "mesh/transport/access.py": OWN_FILE,
     "mesh/wire.py": BOUNDED,
     "ros/rosbridge_session.py": BOUNDED,
-    "tools/mesh_roster.py": BOUNDED,
     "safety/approval.py": OWN_FILE,
     "safety/clearance.py": OWN_FILE,
     "safety/identity.py": OWN_FILE,
@@ -86,7 +86,8 @@ RECEIVERS = {
     "drivers/reachy/links.py": "64 KiB, by the WebSocket and before it is copied",
     "drivers/reachy/motion.py": "64 KiB by the WebSocket",
     "drivers/reachy/rest.py": "512 KiB, of a stop 64 KiB, read in parts",
-    "fleet/mesh.py": "by the transport: the topic's own bound",
+    "fleet/mesh/events.py": "by the transport: the topic's own bound",
+    "fleet/mesh/standing.py": "by the transport: the topic's own bound",
     "mesh/children.py": "by the transport: the topic's own bound",
     "mesh/core.py": "by the transport: the topic's own bound",
     "mesh/input_receiver.py": "by the transport: the topic's own bound",
@@ -99,7 +100,7 @@ RECEIVERS = {
     "mesh/transport/zenoh.py": "the topic's own bound, by Zenoh and before it is copied",
     "ros/dds.py": "by ros/dds_types.py, before a sample is decoded",
     "ros/rclpy.py": "decoded by rclpy itself",
-    "tools/mesh_roster.py": "by the transport: the topic's own bound",
+    "serving/pipeline.py": "a question of this process",
 }
 """Each module that receives foreign messages, and their bound."""
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import logging
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from strands_robots.envelope import Envelope, text_of
+from strands_robots.fleet.cached_keys import Keys
 from strands_robots.fleet.lockout_report import LockoutReport, Resumed, before_resume
 from strands_robots.safety.identity import KeyFileError
 from strands_robots.safety.lockout import OVERFLOW, Lockout
@@ -17,11 +20,21 @@ from strands_robots.utils import plain_text
 if TYPE_CHECKING:
     from strands_robots.device_connect import FleetClient
     from strands_robots.device_connect.backends import LinkConfig
+    from strands_robots.device_connect.discovery import Peer
+
+logger = logging.getLogger(__name__)
+
+KEYS_UNUSABLE = "the enrolled keys cannot be used"
 
 
 def lockable_robots(fleet: FleetClient, seconds: float = 2.0) -> list[str]:
     """Return the devices on the network that can be locked and resumed."""
-    return [peer.id for peer in fleet.peers(seconds) if any(each.get("name") == "resume" for each in peer.functions)]
+    return [peer.id for peer in fleet.peers(seconds) if is_lockable(peer)]
+
+
+def is_lockable(peer: Peer) -> bool:
+    """Return True for a device that can be locked and resumed."""
+    return any(each.get("name") == "resume" for each in peer.functions)
 
 
 def ask_robots(
@@ -43,6 +56,26 @@ def ask_robots(
         else:
             reports.append(status_report(name, answer, took_s * 1000, keys.get(name), asked[name]))
     return reports
+
+
+async def ask_robot(fleet: FleetClient, name: str, seconds: float, keys: Keys) -> LockoutReport:
+    """Ask one robot for its status, on the event loop of the caller.
+
+    Args:
+        keys: enrolled ones; without any no answer counts.
+    """
+    from device_connect_edge.messaging import MessagingError  # noqa: PLC0415 - loaded when it is used
+
+    key = None if keys is None else keys.get(name)
+    asked, began = status_question(fleet, name, signed=key is not None), time.monotonic()
+    try:
+        answer = await fleet.call_async(name, "getStatus", asked, seconds)
+    except (LookupError, TimeoutError, RuntimeError, ValueError, MessagingError) as exc:
+        return LockoutReport(name, problem=plain_text(str(exc), 2000))
+    took_ms = (time.monotonic() - began) * 1000
+    if keys is None:
+        return LockoutReport(name, problem=KEYS_UNUSABLE, facts=answer, round_trip_ms=took_ms)
+    return status_report(name, answer, took_ms, key, asked)
 
 
 def status_question(fleet: FleetClient, name: str, *, signed: bool) -> dict[str, str]:
@@ -126,3 +159,12 @@ def enrolled_keys(link: LinkConfig) -> dict[str, bytes]:
         return enrolled_robots(link)
     except (KeyFileError, OSError) as exc:
         raise KeyFileError(f"The enrolled keys cannot be used: {exc}") from exc
+
+
+def usable_keys(link: LinkConfig) -> Keys:
+    """Return the enrolled keys; None, and a log record, where they cannot be used."""
+    try:
+        return enrolled_keys(link)
+    except KeyFileError as exc:
+        logger.critical("No answer counts as a robot's own: %s", exc)
+        return None

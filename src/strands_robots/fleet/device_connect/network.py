@@ -17,8 +17,18 @@ from strands_robots.errors import (
     UnknownVerbError,
     UnreachableError,
 )
-from strands_robots.fleet.adapter import CLOSED, DEVICE_CONNECT, FIND_S, STOP_S, FoundRobot, OnEvent, RobotEvent
-from strands_robots.fleet.device_connect.lockouts import ask_robots, enrolled_keys, lockable_robots, resume_robots
+from strands_robots.fleet.adapter import CLOSED, DEVICE_CONNECT, FIND_S, STOP_S, FoundRobot, OnEvent
+from strands_robots.fleet.cached_keys import CachedKeys
+from strands_robots.fleet.device_connect.events import robot_event
+from strands_robots.fleet.device_connect.lockouts import (
+    ask_robot,
+    ask_robots,
+    enrolled_keys,
+    is_lockable,
+    lockable_robots,
+    resume_robots,
+    usable_keys,
+)
 from strands_robots.fleet.device_connect.stops import network_key, silence_of, stop_found, stopped_and_locked
 from strands_robots.fleet.link_flags import described
 from strands_robots.fleet.lockout_report import LockoutReport, Resumed
@@ -31,7 +41,7 @@ from strands_robots.utils import ValidationError, plain_text
 
 if TYPE_CHECKING:
     from strands_robots.device_connect.backends import LinkConfig
-    from strands_robots.device_connect.client import DeviceEvent, FleetClient
+    from strands_robots.device_connect.client import FleetClient
     from strands_robots.device_connect.discovery import Peer
     from strands_robots.serving.advertised import AdvertisedVerb
 
@@ -77,6 +87,7 @@ class DeviceConnectNetwork:
         self._client, self._open, self._given = client, joined, joined
         self._peers: dict[str, Peer] = {}
         self._discoveries = 0
+        self._keys = CachedKeys(lambda: usable_keys(client.link))
 
     def open(self) -> None:
         """Connect; raise :class:`UnreachableError` where that fails."""
@@ -102,6 +113,10 @@ class DeviceConnectNetwork:
     def known(self, robot: str) -> FoundRobot:
         """Return what the device stated last."""
         return _found(self._peers[robot]) if robot in self._peers else FoundRobot(robot)
+
+    def announced(self) -> Collection[str]:
+        """Return the devices that have announced themselves since the last search."""
+        return self._connected.known()
 
     def bears(self, robot: str) -> bool:
         """Return whether a device of this id was found or has announced itself."""
@@ -158,6 +173,22 @@ class DeviceConnectNetwork:
     def silence(self, robot: str) -> str:
         """Return what this machine remembers of the device's last messages."""
         return silence_of(self._connected, robot)
+
+    async def call_async(self, robot: str, verb: str, arguments: Mapping[str, Any], within: float) -> Envelope:
+        """Call a function of the device."""
+        try:
+            return await self._connected.call_async(robot, verb, arguments, within)
+        except Exception as exc:
+            if _refusal(exc, robot, verb) is None and not isinstance(exc, RefusalError):
+                raise
+            return error(_why(exc))
+
+    async def stop_async(self, robot: str, within: float = STOP_S) -> Envelope:
+        """Stop the device by ``stop``, else by ``stopMotion``."""
+        try:
+            return await self._connected.stop_async(robot, within)
+        except Exception as exc:  # noqa: BLE001 - a stop that fails is a verdict, whatever it raised
+            return error(_why(exc), stopped=None)
 
     @property
     def key(self) -> NetworkKey:
@@ -234,6 +265,13 @@ class DeviceConnectNetwork:
         with _carried():
             return ask_robots(self._connected, dict.fromkeys(robots), timeout, signed=signed)
 
+    async def lockout_async(self, robot: str, within: float) -> LockoutReport:
+        """Ask the device for its status."""
+        try:
+            return await ask_robot(self._connected, robot, within, self._keys.read())
+        except UnreachableError as exc:
+            return LockoutReport(robot, problem=exc.why)
+
     def resume(self, reports: Sequence[LockoutReport], signer: Any, timeout: float) -> dict[str, Resumed]:
         """Send each device a resume of each of its lockouts."""
         with _carried():
@@ -241,12 +279,18 @@ class DeviceConnectNetwork:
 
     def subscribe(self, robot: str, on_event: OnEvent) -> Callable[[], None]:
         """Receive the device's events."""
-
-        def arrived(event: DeviceEvent) -> None:
-            on_event(RobotEvent(event.device, plain_text(event.name, 100), event.payload))
-
         with _carried():
-            return self._connected.subscription(robot, arrived).close
+            subscription = self._connected.subscription(robot, lambda event: on_event(robot_event(event)))
+
+        def end() -> None:
+            try:
+                with _carried():
+                    subscription.close()
+            except UnreachableError as exc:
+                # A connection that is lost needs no farewell.
+                logger.debug("Events of %s were not ended in good order: %s", robot, exc)
+
+        return end
 
     def close(self) -> None:
         """Disconnect."""
@@ -281,6 +325,7 @@ def _found(peer: Peer) -> FoundRobot:
         plain_text(peer.type, 100),
         plain_text(peer.model, 100),
         peer.tags,
+        must_answer=peer.stop_verb is not None or is_lockable(peer),
         status=plain_text(peer.status.get("availability"), 100),
         age_s=age,
         facts={
@@ -302,6 +347,10 @@ def _answered(robot: str, verb: str, call: Callable[[], T]) -> T:
         if refusal is None:
             raise
         raise refusal from exc
+
+
+def _why(exc: Exception) -> str:
+    return plain_text(str(exc.args[0]) if exc.args else "") or type(exc).__name__
 
 
 def _refusal(exc: Exception, robot: str, verb: str) -> RefusalError | None:

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
+from strands_robots.fleet.cached_keys import Keys
 from strands_robots.fleet.lockout_report import TOO_MANY, LockoutReport, Resumed
 from strands_robots.safety.lockout import OVERFLOW, Lockout
 from strands_robots.safety.orders import new_epoch
@@ -39,7 +40,32 @@ def ask_peers(mesh: Mesh, names: Iterable[str], seconds: float) -> list[LockoutR
     """
     wanted, keys = list(dict.fromkeys(names)), enrolled_peers()
     with ThreadPoolExecutor(PARALLEL_REQUESTS) as pool:
-        return list(pool.map(lambda name: _ask(mesh, name, seconds, keys), wanted))
+        return list(pool.map(lambda name: ask_peer(mesh, name, seconds, keys), wanted))
+
+
+def ask_peer(mesh: Mesh, name: str, seconds: float, keys: Keys) -> LockoutReport:
+    """Ask one peer for its status.
+
+    Args:
+        mesh: the peer that asks.
+        name: the peer that is asked.
+        seconds: in which it has to answer.
+        keys: enrolled ones; without any no answer counts.
+    """
+    began = time.monotonic()
+    nonce = new_epoch() if keys and enrolled_key(name, keys) else ""
+    reply = mesh.send(name, {"action": "status", **({"nonce": nonce} if nonce else {})}, seconds)
+    took_ms = (time.monotonic() - began) * 1000
+    result = reply.get("result")
+    if reply.get("type") != "response" or not isinstance(result, Mapping):
+        return LockoutReport(name, problem=shown(reply["error"]) if reply.get("error") else "no answer")
+    rows = result.get("lockout")
+    if not isinstance(rows, list):
+        return LockoutReport(name, problem="it does not report lockouts", facts=result, round_trip_ms=took_ms)
+    lockouts = tuple(Lockout.of(each) for each in rows if isinstance(each, Mapping))
+    distrusted = lockout_distrust(name, result, [each.epoch for each in lockouts], keys, nonce)
+    problem = distrusted or str(result.get("estop_unheard", ""))
+    return LockoutReport(name, () if distrusted else lockouts, problem, result, took_ms)
 
 
 def resume_peers(mesh: Mesh, found: Sequence[LockoutReport], signer: Any, seconds: float) -> dict[str, Resumed]:
@@ -90,23 +116,6 @@ def _outcome(before: tuple[Lockout, ...], left: tuple[Lockout, ...] | None, said
     if any(each.epoch == OVERFLOW for each in left):
         return TOO_MANY
     return f"{said or 'it did not confirm'}: its own audit says why"
-
-
-def _ask(mesh: Mesh, name: str, seconds: float, keys: Mapping[str, bytes] | None) -> LockoutReport:
-    began = time.monotonic()
-    nonce = new_epoch() if keys and enrolled_key(name, keys) else ""
-    reply = mesh.send(name, {"action": "status", **({"nonce": nonce} if nonce else {})}, seconds)
-    took_ms = (time.monotonic() - began) * 1000
-    result = reply.get("result")
-    if reply.get("type") != "response" or not isinstance(result, Mapping):
-        return LockoutReport(name, problem=shown(reply["error"]) if reply.get("error") else "no answer")
-    rows = result.get("lockout")
-    if not isinstance(rows, list):
-        return LockoutReport(name, problem="it does not report lockouts", facts=result, round_trip_ms=took_ms)
-    lockouts = tuple(Lockout.of(each) for each in rows if isinstance(each, Mapping))
-    distrusted = lockout_distrust(name, result, [each.epoch for each in lockouts], keys, nonce)
-    problem = distrusted or str(result.get("estop_unheard", ""))
-    return LockoutReport(name, () if distrusted else lockouts, problem, result, took_ms)
 
 
 def _send(mesh: Mesh, name: str, assertion: Mapping[str, Any], seconds: float) -> str:

@@ -10,17 +10,20 @@ import math
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
+from dataclasses import replace
 from itertools import count
 from typing import TYPE_CHECKING, Any, Self
 
 from strands_robots.envelope import Envelope, error
 from strands_robots.errors import ArgumentsError, NoAnswerError, NoSuchRobotError, UnreachableError
-from strands_robots.fleet.adapter import CLOSED, FIND_S, MESH, STOP_S, FoundRobot, OnEvent, RobotEvent
+from strands_robots.fleet.adapter import CLOSED, FIND_S, MESH, STOP_S, FoundRobot, OnEvent
 from strands_robots.fleet.lockout_report import LockoutReport, Resumed
 from strands_robots.fleet.mesh.controller import MeshController
 from strands_robots.fleet.mesh.descriptions import functions_of, functions_of_each, functions_of_kind
 from strands_robots.fleet.mesh.discovery import awaited, discover, in_reach, is_in_reach
+from strands_robots.fleet.mesh.events import follow
 from strands_robots.fleet.mesh.lockouts import ask_peers, lockable_peers, resume_peers
+from strands_robots.fleet.mesh.requests import PeerRequests
 from strands_robots.fleet.mesh.standing import mesh_network, stand_on_mesh
 from strands_robots.fleet.mesh.stops import lock_peers, stop_answer, stop_peers
 from strands_robots.fleet.mesh_settings import MeshSettings
@@ -74,6 +77,7 @@ class MeshNetwork:
         self._subscriptions = count()
         self._discoveries = 0
         self._given = False
+        self._requests = PeerRequests()
 
     @classmethod
     def joined(cls, mesh: Mesh) -> Self:
@@ -94,7 +98,7 @@ class MeshNetwork:
         except BaseException:
             self._settings.give_back()
             raise
-        self._joined = time.monotonic()
+        self._joined, self._requests = time.monotonic(), PeerRequests()
 
     def _dialled(self) -> Mesh:
         from strands_robots.mesh import session  # noqa: PLC0415 - as above
@@ -117,7 +121,16 @@ class MeshNetwork:
         """Return the robots in reach, once they had the time to announce themselves."""
         discover(self._joined_mesh, since=self._joined, within=timeout)
         self._discoveries += 1
-        return [_found(row) for row in self._rows() if _has_robot(row)]
+        lockable, rows = {*lockable_peers(self._joined_mesh)}, {str(row["peer_id"]): row for row in self._rows()}
+        return [
+            replace(
+                _found(row),
+                must_answer=name in lockable,
+                world=world if (world := name.rpartition("__")[0]) in rows else "",
+            )
+            for name, row in rows.items()
+            if _has_robot(row)
+        ]
 
     def listed(self, timeout: float | None = None) -> list[FoundRobot]:
         """Return every peer in reach; ``timeout`` is waited to its end."""
@@ -135,6 +148,10 @@ class MeshNetwork:
     def known(self, robot: str) -> FoundRobot:
         """Return what the peer announced last."""
         return _found(self._joined_mesh.get_peer(robot) or {"peer_id": robot})
+
+    def announced(self) -> Collection[str]:
+        """Return the robots in reach."""
+        return [str(row["peer_id"]) for row in self._rows() if _has_robot(row)]
 
     def bears(self, robot: str) -> bool:
         """Return whether a robot of this id is in reach."""
@@ -229,6 +246,20 @@ class MeshNetwork:
         del robot
         return ""
 
+    async def call_async(self, robot: str, verb: str, arguments: Mapping[str, Any], within: float) -> Envelope:
+        """Send the peer an action, without the arguments that are empty."""
+        given = {name: value for name, value in arguments.items() if value not in ("", None)}
+        try:
+            mesh = self._joined_mesh
+            return await self._requests.call(mesh, robot, {**given, "action": self._action(robot, verb)}, within)
+        except UnreachableError as exc:
+            return error(exc.why)
+
+    async def stop_async(self, robot: str, within: float = STOP_S) -> Envelope:
+        """Stop the peer on a thread that no call takes."""
+        mesh = self._mesh
+        return error(CLOSED, stopped=None) if mesh is None else await self._requests.stop(mesh, robot, within)
+
     @property
     def key(self) -> NetworkKey:
         """The name of the mesh that the settings, or a profile's, name.
@@ -297,32 +328,24 @@ class MeshNetwork:
         del signed
         return ask_peers(self._joined_mesh, robots, timeout)
 
+    async def lockout_async(self, robot: str, within: float) -> LockoutReport:
+        """Ask the peer for its status."""
+        mesh = self._mesh
+        return (
+            LockoutReport(robot, problem=CLOSED) if mesh is None else await self._requests.lockout(mesh, robot, within)
+        )
+
     def resume(self, reports: Sequence[LockoutReport], signer: Any, timeout: float) -> dict[str, Resumed]:
         """Send the resumes of these peers, which relay them."""
         return resume_peers(self._joined_mesh, reports, signer, timeout)
 
     def subscribe(self, robot: str, on_event: OnEvent) -> Callable[[], None]:
-        """Receive the robot's policy steps and safety events."""
-        from strands_robots.mesh import topics  # noqa: PLC0415 - the network is loaded when it is used
-
-        mesh, number = self._joined_mesh, next(self._subscriptions)
-        names = []
-        for name, key in (("stream", topics.stream(robot)), ("safety_event", topics.safety_event(robot))):
-
-            def arrived(key: str, message: Mapping[str, Any], name: str = name) -> None:
-                on_event(RobotEvent(robot, name, message))
-
-            names.append(f"fleet {number} {name}")
-            mesh.subscribe(key, arrived, names[-1])
-
-        def end() -> None:
-            for each in names:
-                mesh.unsubscribe(each)
-
-        return end
+        """Receive a robot's policy steps and safety events, or what all say."""
+        return follow(self._joined_mesh, robot, on_event, next(self._subscriptions))
 
     def close(self) -> None:
         """Leave the mesh."""
+        self._requests.close()
         if self._given:
             return
         mesh, self._mesh = self._mesh, None

@@ -1,0 +1,75 @@
+"""Requests to peers of the mesh from an event loop, on threads of their own."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any
+
+from strands_robots.envelope import Envelope, error
+from strands_robots.fleet.adapter import CLOSED
+from strands_robots.fleet.cached_keys import CachedKeys
+from strands_robots.fleet.lockout_report import LockoutReport
+from strands_robots.fleet.mesh.lockouts import ask_peer
+from strands_robots.fleet.mesh.stops import stop_answer
+from strands_robots.safety.peer_answers import enrolled_peers
+from strands_robots.utils import plain_text
+
+if TYPE_CHECKING:
+    from strands_robots.mesh import Mesh
+
+IN_FLIGHT = 64
+"""Requests of one kind that wait for an answer at a time; threads are started as they are needed."""
+
+
+class PeerRequests:
+    """Calls, stops and questions of one peer; none waits for one of another kind."""
+
+    def __init__(self) -> None:
+        self._calls = ThreadPoolExecutor(IN_FLIGHT, "mesh call")
+        self._stops = ThreadPoolExecutor(IN_FLIGHT, "mesh stop")
+        self._questions = ThreadPoolExecutor(IN_FLIGHT, "mesh question")
+        self._keys = CachedKeys(enrolled_peers)
+
+    async def call(self, mesh: Mesh, robot: str, command: dict[str, Any], seconds: float) -> Envelope:
+        """Send an action; every failure is an answer of status error."""
+        loop = asyncio.get_running_loop()
+        try:
+            reply = await loop.run_in_executor(self._calls, mesh.send, robot, command, seconds)
+        except RuntimeError:
+            return error(CLOSED)
+        if reply.get("status") == "timeout":
+            return error(f"{robot} did not answer.")
+        if reply.get("type") != "response":
+            return error(f"{robot}: {plain_text(reply.get('error')) or 'refused'}")
+        result = reply.get("result")
+        return dict(result) if isinstance(result, Mapping) else error(f"{robot} answered with an unknown result shape.")
+
+    async def stop(self, mesh: Mesh, robot: str, seconds: float) -> Envelope:
+        """Stop a peer; *stopped* counts only where an enrolled robot has signed it."""
+        loop = asyncio.get_running_loop()
+        try:
+            return await loop.run_in_executor(self._stops, _stopped, mesh, robot, seconds)
+        except RuntimeError:
+            return error(CLOSED, stopped=None)
+
+    async def lockout(self, mesh: Mesh, robot: str, seconds: float) -> LockoutReport:
+        """Ask a peer for its status."""
+        loop = asyncio.get_running_loop()
+        try:
+            return await loop.run_in_executor(
+                self._questions, lambda: ask_peer(mesh, robot, seconds, self._keys.read())
+            )
+        except RuntimeError:
+            return LockoutReport(robot, problem=CLOSED)
+
+    def close(self) -> None:
+        """Begin no more requests."""
+        for pool in (self._calls, self._stops, self._questions):
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _stopped(mesh: Mesh, robot: str, seconds: float) -> Envelope:
+    reply = mesh.send(robot, {"action": "stop"}, seconds)
+    return stop_answer(robot, reply, enrolled_peers())

@@ -1,0 +1,31 @@
+"""Task of a robot, as its status, its state and its presence report it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+TASK_MAX = 2000
+"""Characters of a text of a task."""
+
+
+def task_of(facts: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a robot does, of a world its first task.
+
+    It has ``state``, ``instruction``, and as far as they are reported ``step``, ``policy`` and ``who``, which is the
+    robot of the world.
+    """
+    running = facts.get("running_policies")
+    if isinstance(running, Mapping):
+        named = next(((name, row) for name, row in running.items() if isinstance(row, Mapping)), None)
+        if named is None:
+            return {"state": "idle"}
+        name, row = named
+        policy, instruction = _text(row.get("policy")), _text(row.get("instruction"))
+        return {"state": "running", "instruction": instruction, "policy": policy, "step": row.get("step"), "who": name}
+    task = {"state": _text(facts.get("task_status")).lower() or "idle", "instruction": _text(facts.get("instruction"))}
+    return {**task, "step": facts["step_count"]} if "step_count" in facts else task
+
+
+def _text(value: object) -> str:
+    return value[:TASK_MAX] if isinstance(value, str) else ""

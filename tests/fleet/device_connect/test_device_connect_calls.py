@@ -1,0 +1,92 @@
+"""Calls, stops and questions on Device Connect from an event loop."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+import pytest
+from device_connect_edge.messaging import MessagingError
+
+from strands_robots.device_connect import client as clients
+from strands_robots.device_connect.backends import loopback_config
+from strands_robots.envelope import success
+from strands_robots.fleet.device_connect import lockouts
+from strands_robots.fleet.device_connect.network import DeviceConnectNetwork
+from strands_robots.safety.identity import KeyFileError
+from strands_robots.utils import ValidationError
+
+
+class Client(clients.FleetClient):
+    """A client without a connection whose answer a test sets."""
+
+    answer: Any = None
+
+    async def call_async(self, device: str, function: str, params: Any = None, within: float = 10.0) -> dict[str, Any]:
+        if isinstance(self.answer, Exception):
+            raise self.answer
+        return dict(self.answer)
+
+    async def stop_async(self, device: str, within: float = 5.0, robot_name: str = "") -> dict[str, Any]:
+        return await self.call_async(device, "stop")
+
+    def announces(self, device: str, function: str, argument: str) -> bool:
+        return False
+
+
+@pytest.fixture
+def there() -> Any:
+    client = Client(loopback_config(1))
+    yield DeviceConnectNetwork.joined(client)
+    client.close()
+
+
+FAILURES = (
+    clients.NoSuchDeviceError("no device 'arm-1'"),
+    clients.DeviceTimeoutError("arm-1 did not answer"),
+    clients.ClientClosedError("closed"),
+    clients.CallRefusedError("\x1b[2Jbusy", -32000),
+    ValidationError("x must be a number"),
+    MessagingError("the broker is gone"),
+)
+
+
+@pytest.mark.parametrize("failure", FAILURES, ids=lambda each: type(each).__name__)
+def test_failure_is_an_answer_a_verdict_and_a_problem(there: Any, failure: Exception) -> None:
+    there._client.answer = failure
+
+    async def asked() -> Any:
+        called, stopped = await there.call_async("arm-1", "moveTo", {}, 1.0), await there.stop_async("arm-1", 1.0)
+        return called, stopped, await there.lockout_async("arm-1", 1.0)
+
+    called, stopped, report = asyncio.run(asked())
+    said = str(failure).replace("\x1b[2J", "")
+    assert [called["content"][0]["text"], stopped["content"][0]["text"], report.problem] == [said] * 3
+    assert (called["status"], stopped["stopped"], dict(report.facts)) == ("error", None, {})
+
+
+def test_end_of_the_events_of_a_lost_connection_does_not_fail(there: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+
+    class Lost:
+        def close(self) -> None:
+            asked.append("close")
+            raise MessagingError("the broker is gone")
+
+    monkeypatch.setattr(there._client, "subscription", lambda device, callback: Lost())
+    there.subscribe("*", asked.append)()
+    assert asked == ["close"]
+
+
+def test_lockouts_count_only_while_the_enrolled_keys_can_be_used(there: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    there._client.answer = success("idle", locked=False, lockout=[])
+    assert asyncio.run(there.lockout_async("arm-1", 1.0)).problem == ""
+
+    def unusable(link: Any) -> Any:
+        raise KeyFileError("open to others")
+
+    monkeypatch.setattr(lockouts, "enrolled_keys", unusable)
+    other = DeviceConnectNetwork.joined(there._client)
+    report = asyncio.run(other.lockout_async("arm-1", 1.0))
+    assert report.problem == lockouts.KEYS_UNUSABLE
+    assert report.facts["locked"] is False

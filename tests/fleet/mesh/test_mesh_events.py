@@ -1,0 +1,115 @@
+"""Messages of the mesh's peers, read for the calling side."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fixtures.mesh_robots import Arm, World
+from fixtures.waiting import eventually
+from tests.mesh.peers import Fleet, fleet
+
+from strands_robots.fleet.adapter import EVERY, RobotEvent
+from strands_robots.fleet.mesh.events import LOAD_MAX
+from strands_robots.fleet.mesh.network import MeshNetwork
+
+Say = Callable[[str, dict[str, Any]], None]
+
+
+class Followed:
+    """A console that follows every robot of a mesh with one arm."""
+
+    def __init__(self, peers: Fleet) -> None:
+        self.peers = peers
+        peers.join(Arm("arm-1"), "arm-1")
+        self.there = MeshNetwork.joined(peers.join(None, "console"))
+        self.events: list[RobotEvent] = []
+        self.end = self.there.subscribe(EVERY, self.events.append)
+        self._stranger = peers.stranger()
+
+    def say(self, topic: str, message: dict[str, Any]) -> None:
+        """Publish as a peer without an identity."""
+        self._stranger.put(f"strands/{topic}", json.dumps(message).encode())
+
+    def arrived(self, name: str) -> RobotEvent:
+        """Wait for an event of this name."""
+        eventually(lambda: any(each.name == name for each in list(self.events)), what=name)
+        return next(each for each in self.events if each.name == name)
+
+
+@contextmanager
+def _followed(folder: Path) -> Iterator[Followed]:
+    with fleet(folder) as peers:
+        yield Followed(peers)
+
+
+@pytest.fixture
+def followed(tmp_path: Path) -> Iterator[Followed]:
+    with _followed(tmp_path) as one:
+        yield one
+        one.there.close()
+
+
+def test_heartbeat_is_a_sign_of_life_with_the_task_of_the_registry(followed: Followed) -> None:
+    heard = followed.arrived("presence")
+    assert (heard.robot, heard.alive, heard.frequent) == ("arm-1", True, True)
+    assert heard.task is not None
+    assert heard.task["state"] == "idle"
+
+
+def test_state_has_the_joints(followed: Followed) -> None:
+    heard = followed.arrived("state")
+    assert (heard.robot, heard.joints, heard.frequent) == ("arm-1", {"shoulder": 1.5}, True)
+
+
+def test_message_about_another_robot_than_its_topic_names_is_left_out(followed: Followed) -> None:
+    followed.say("arm-1/state", {"peer_id": "arm-9", "joints": {"forged": 1.0}})
+    followed.say("arm-1/presence", {"robot_id": "arm-9", "task_status": "forged"})
+    followed.say("arm-9/presence", {"robot_id": "arm-9", "task_status": "forged"})
+    followed.say("arm-1/safety/event", {"event": "last"})
+    followed.arrived("last")
+    assert all("forged" not in str((each.joints, each.task)) for each in followed.events)
+
+
+def test_load_within_its_domain_is_read_and_proves_no_life(followed: Followed) -> None:
+    for load in (-1.0, LOAD_MAX, "full", True, None):
+        followed.say("arm-1/health", {"cpu_load": load})
+    followed.say("arm-1/health", {"cpu_load": 0.5})
+    heard = followed.arrived("health")
+    assert (heard.robot, heard.load, heard.alive, heard.frequent) == ("arm-1", 0.5, False, True)
+
+
+def test_safety_event_is_plain_and_for_the_timeline(followed: Followed) -> None:
+    followed.say("arm-1/safety/event", {"event": "\x1b[2J" + "x" * 1000})
+    followed.say("arm-1/safety/event", {"type": "locked"})
+    followed.say("arm-1/safety/event", {"event": ["nonsense"]})
+    followed.arrived("safety event")
+    followed.arrived("locked")
+    names = [each.name for each in followed.events if not each.frequent]
+    assert max(map(len, names)) <= 100
+    assert "\x1b" not in "".join(names)
+
+
+def test_no_event_arrives_after_the_end(followed: Followed) -> None:
+    followed.arrived("presence")
+    followed.end()
+    seen: list[RobotEvent] = []
+    end = followed.there.subscribe("arm-1", seen.append)
+    count = len(followed.events)
+    followed.say("arm-1/safety/event", {"event": "later"})
+    eventually(lambda: seen, what="the event at another subscription")
+    assert len(followed.events) == count
+    end()
+
+
+def test_robots_of_a_world_are_found_as_its_parts(followed: Followed) -> None:
+    followed.peers.join(World("left"), "cell", "sim")
+    followed.peers.join(Arm("left"), "cell__left")
+    followed.peers.meet()
+    eventually(lambda: {"arm-1", "cell", "cell__left"} <= {*followed.there.announced()}, what="all are in reach")
+    found = {each.id: (each.world, each.must_answer) for each in followed.there.find(0.0)}
+    assert found == {"arm-1": ("", True), "cell": ("", True), "cell__left": ("cell", False)}

@@ -1,0 +1,106 @@
+"""Calls, stops and questions to peers from an event loop."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fixtures.mesh_robots import Arm
+from fixtures.waiting import eventually
+from tests.mesh.peers import fleet
+
+from strands_robots.fleet.adapter import CLOSED
+from strands_robots.fleet.mesh.network import MeshNetwork
+from strands_robots.fleet.mesh.requests import IN_FLIGHT
+from strands_robots.mesh import Mesh
+
+
+@pytest.fixture
+def console(tmp_path: Path) -> Iterator[tuple[Mesh, MeshNetwork, Arm]]:
+    with fleet(tmp_path) as peers:
+        arm = Arm("arm-1")
+        peers.join(arm, "arm-1")
+        mesh = peers.join(None, "console")
+        there = MeshNetwork.joined(mesh)
+        yield mesh, there, arm
+        there.close()
+
+
+class Busy:
+    """A mesh on which every call hangs until it is released; stops and questions pass."""
+
+    def __init__(self, mesh: Mesh, monkeypatch: pytest.MonkeyPatch, hung: str) -> None:
+        self.released, self.waiting = threading.Event(), 0
+        self._send, self._hung = mesh.send, hung
+        monkeypatch.setattr(mesh, "send", self._sent)
+
+    def _sent(self, target: str, cmd: dict[str, Any], timeout: float = 30.0) -> dict[str, Any]:
+        if cmd["action"] == self._hung:
+            self.waiting += 1
+            self.released.wait(60)
+            return {"status": "timeout"}
+        return self._send(target, cmd, timeout)
+
+
+def test_stop_and_question_wait_for_no_call(console: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    mesh, there, arm = console
+    busy = Busy(mesh, monkeypatch, "ping")
+    arm.start_task("wave")
+
+    async def both() -> None:
+        calls = [asyncio.create_task(there.call_async("arm-1", "ping", {}, 60.0)) for _ in range(2 * IN_FLIGHT)]
+        await asyncio.to_thread(eventually, lambda: busy.waiting >= IN_FLIGHT, 30.0, what="every thread of calls waits")
+        stopped = await there.stop_async("arm-1", 10.0)
+        report = await there.lockout_async("arm-1", 10.0)
+        assert stopped["stopped"] is True
+        assert not arm.moving
+        assert (report.problem, report.lockouts) == ("", ())
+        assert report.facts["task_status"] == "idle"
+        busy.released.set()
+        assert {(await each)["status"] for each in calls} == {"error"}
+
+    asyncio.run(both())
+
+
+def test_answers_and_failures_of_a_call_are_envelopes(console: Any) -> None:
+    _, there, _ = console
+
+    async def answers() -> list[Any]:
+        return [
+            await there.call_async("arm-1", "getFeatures", {"nothing": None, "empty": ""}, 10.0),
+            await there.call_async("arm-1", "fly", {}, 10.0),
+            await there.call_async("arm-9", "getStatus", {}, 0.05),
+        ]
+
+    features, unknown, silent = asyncio.run(answers())
+    assert features["status"] == "success"
+    assert "action must be one of" in unknown["content"][0]["text"]
+    assert silent["content"][0]["text"] == "arm-9 did not answer."
+
+
+def test_silent_robot_has_neither_stopped_nor_reported(console: Any) -> None:
+    _, there, _ = console
+
+    async def asked() -> Any:
+        return await there.stop_async("arm-9", 0.05), await there.lockout_async("arm-9", 0.05)
+
+    stop, report = asyncio.run(asked())
+    assert (stop["status"], stop["stopped"]) == ("error", None)
+    assert (report.problem, report.facts) == ("no answer", {})
+
+
+def test_closed_network_answers_at_once(console: Any) -> None:
+    _, there, _ = console
+    there.close()
+
+    async def asked() -> Any:
+        called, stopped = await there.call_async("arm-1", "ping", {}, 10.0), await there.stop_async("arm-1", 10.0)
+        return called, stopped, await there.lockout_async("arm-1", 10.0)
+
+    called, stopped, report = asyncio.run(asked())
+    assert [called["content"][0], stopped["content"][0]] == [{"text": CLOSED}] * 2
+    assert (stopped["stopped"], report.problem) == (None, CLOSED)
