@@ -132,7 +132,8 @@ class FleetVerdict(Mapping[str, StopVerdict]):
         return " ".join(filter(None, said)) or "No robot is known."
 
     def __repr__(self) -> str:
-        return f"<FleetVerdict of {len(self)} robots: {'ok' if self.ok else str(self)}>"
+        robots = "1 robot" if len(self) == 1 else f"{len(self)} robots"
+        return f"<FleetVerdict of {robots}: {'ok' if self.ok else str(self)}>"
 
 
 def verdict_of_answer(answer: object, name: str) -> StopVerdict:

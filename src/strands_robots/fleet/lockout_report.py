@@ -22,7 +22,7 @@ class LockoutReport:
     name: str
     lockouts: tuple[Lockout, ...] = ()
     problem: str = ""
-    facts: Mapping[str, Any] = field(default_factory=dict)
+    facts: Mapping[str, Any] = field(default_factory=dict, repr=False)
     round_trip_ms: float = 0.0
     at: float = field(default_factory=time.monotonic)
 
