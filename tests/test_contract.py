@@ -12,7 +12,7 @@ from fixtures.devices import BlindDevice
 from strands_robots.bus_access import bus_lock, read_joints
 from strands_robots.contract import AdaptedRobot, TaskRobot, adapt, for_request, put_away
 from strands_robots.envelope import Envelope, error, success
-from strands_robots.safety.gate import MotionGate, answered
+from strands_robots.safety.gate import MotionGate, MotionRequest, answered
 from strands_robots.safety.stopping import StopVerdict, grade
 from strands_robots.utils import ValidationError
 
@@ -230,16 +230,40 @@ def test_two_wrappers_of_one_robot_share_its_gate_so_that_a_stop_on_one_network_
     assert AdaptedRobot(Foreign()).gate is not one.gate
 
 
+def by_keyword(*, request: MotionRequest | None = None) -> Any:
+    return request is not None
+
+
+class Proxy:
+    """A stranger's method that stands for one elsewhere, and has every attribute."""
+
+    def __call__(self) -> bool:
+        return False
+
+    def __getattr__(self, name: str) -> Proxy:
+        return self
+
+
 @pytest.mark.parametrize(
     ("method", "taken"),
     [
-        (lambda *, request=None: request is not None, True),
+        (by_keyword, True),
+        (lambda *, request=None: request is not None, False),
         (lambda request=None: request is not None, False),
         (lambda **options: "request" in options, False),
-        (answered(lambda *, request=None: request is not None), True),
+        (answered(by_keyword), True),
         (dict, {}),
+        (Proxy(), False),
     ],
-    ids=["by keyword", "a stranger's own request", "any option", "decorated", "no code"],
+    ids=[
+        "by keyword",
+        "a stranger's keyword",
+        "a stranger's own request",
+        "any option",
+        "decorated",
+        "no code",
+        "proxy",
+    ],
 )
 def test_request_is_given_to_a_method_that_takes_it_by_keyword_alone(method: Callable[..., Any], taken: object) -> None:
     request = MotionGate().request()

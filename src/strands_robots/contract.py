@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
-from types import CodeType
+from types import FunctionType, MethodType
 from typing import TYPE_CHECKING, Any, Literal, ParamSpec, Protocol, TypeVar, runtime_checkable
 
 from strands_robots import settings
@@ -298,11 +298,16 @@ def for_request(request: MotionRequest | None, method: Callable[P, T]) -> Callab
 
 
 def _takes_request(method: Callable[..., object]) -> bool:
-    # Off its code: inspect.signature takes 90 us of each command.
-    code = getattr(inspect.unwrap(method), "__code__", None)
-    if not isinstance(code, CodeType):
+    # Off its code: inspect.signature takes 90 us of each command. The methods of a proxy are no functions.
+    if not isinstance(method, FunctionType | MethodType):
         return False
-    return "request" in code.co_varnames[code.co_argcount : code.co_argcount + code.co_kwonlyargcount]
+    function = inspect.unwrap(method.__func__ if isinstance(method, MethodType) else method)
+    if not isinstance(function, FunctionType):
+        return False
+    code = function.__code__
+    named = code.co_varnames[code.co_argcount : code.co_argcount + code.co_kwonlyargcount]
+    # An argument of a stranger's that has the same name is not ours.
+    return "request" in named and MotionRequest.__name__ in str(function.__annotations__.get("request"))
 
 
 def observe(robot: Robot, observer: Observer) -> Unsubscribe:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from typing import Any
 
 from strands_robots.envelope import Envelope, error, success
@@ -18,7 +16,8 @@ from strands_robots.safety.lockout import Lockout
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope
 from strands_robots.safety.silence import Sending
-from strands_robots.safety.statements import Purpose, signed
+from strands_robots.safety.statements import Purpose
+from strands_robots.safety.statements import signed as signed_by
 from strands_robots.safety.stop_roster import StopOutcome, StopRoster
 from strands_robots.serving.advertised import AdvertisedVerb, find_verb
 
@@ -74,6 +73,8 @@ class ScriptedNetwork:
         self.locked: dict[str, str] = {}
         self.silent: list[str] = []
         self.remembered = False
+        self.signers: list[Any] = []
+        self.keys: dict[str, SigningIdentity] = {}
         self.children: dict[str, str] = {}
         self.mute: set[str] = set()
         self.controller: Any = object()
@@ -91,7 +92,7 @@ class ScriptedNetwork:
 
         def status(arguments: Mapping[str, Any]) -> Envelope:
             fields = {"nonce": arguments.get("nonce", "")}
-            return success("idle", statement=signed(key, Purpose.LOCKOUT_STATE, self.calls[-1][0], fields))
+            return success("idle", statement=signed_by(key, Purpose.LOCKOUT_STATE, self.calls[-1][0], fields))
 
         self.answers["getStatus"] = status
 
@@ -190,6 +191,7 @@ class ScriptedNetwork:
         remembers: Remembers | None = None,
     ) -> StopOutcome:
         self.estops.append((reason, scope, estop_id))
+        self.signers.append(signing_key)
         self.remembered = remembers is not None and remembers(scope)
         if self.unreachable:
             raise UnreachableError(self.unreachable)
@@ -227,19 +229,13 @@ class ScriptedNetwork:
         return list(self.robots)
 
     def lockouts(self, robots: Iterable[str], timeout: float, *, signed: bool = False) -> list[LockoutReport]:
-        return [
-            LockoutReport(name, (Lockout(self.locked[name], "desk", 1.0, ""),) if name in self.locked else ())
-            for name in robots
-        ]
+        def report(name: str) -> LockoutReport:
+            lockouts = (Lockout(self.locked[name], "desk", 1.0, ""),) if name in self.locked else ()
+            key = self.keys.get(name)
+            facts = {} if key is None else {"statement": signed_by(key, Purpose.LOCKOUT_STATE, name, {"nonce": "n"})}
+            return LockoutReport(name, lockouts, facts=facts)
 
-    async def lockout_async(self, robot: str, within: float) -> LockoutReport:
-        """Report the lockouts and the answer to ``getStatus``; a mute robot none."""
-        self.asked.append(robot)
-        if robot in self.mute:
-            await asyncio.sleep(within)
-            return LockoutReport(robot, problem="it did not answer")
-        facts = await self.call_async(robot, "getStatus", {}, within)
-        return replace(self.lockouts([robot], within)[0], facts=facts, round_trip_ms=1.0)
+        return [report(name) for name in robots]
 
     def resume(self, reports: Sequence[LockoutReport], signer: Any, timeout: float) -> dict[str, Resumed]:
         for each in reports:

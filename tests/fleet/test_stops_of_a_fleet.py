@@ -7,13 +7,21 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from tests.fleet.scripted import ScriptedNetwork
 
 from strands_robots import errors
 from strands_robots.envelope import error, success
 from strands_robots.fleet import Fleet
 from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
+from strands_robots.fleet.enrollment import Enrolled, enrolled_robots
+from strands_robots.safety.identity import ROBOTS, KeyFile
+from strands_robots.safety.network_key import NetworkKey
+from strands_robots.safety.roster import Roster, RosterRow
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
+from strands_robots.safety.sightings import Known
+
+NEAR = NetworkKey.of(DEVICE_CONNECT, ["scripted"])
 
 
 @pytest.fixture
@@ -176,3 +184,89 @@ def test_network_that_cannot_be_asked_is_absent(fleet: Fleet, far: ScriptedNetwo
 def test_verdict_says_what_was_halted(fleet: Fleet, near: ScriptedNetwork) -> None:
     near.stops = success("stopped", stopped=True, halted=["policy", "teleop"])
     assert fleet.stop()["arm-1"].halted == ("policy", "teleop")
+
+
+@pytest.mark.parametrize("key", ["-----BEGIN PRIVATE KEY-----", b"32 bytes", object()])
+def test_key_that_cannot_sign_refuses_no_stop(
+    fleet: Fleet, near: ScriptedNetwork, far: ScriptedNetwork, caplog: pytest.LogCaptureFixture, key: Any
+) -> None:
+    with caplog.at_level(logging.WARNING):
+        stop = fleet.estop(signing_key=key)
+    assert stop.ok
+    assert (near.signers, far.signers) == ([None], [None])
+    assert "signing_key cannot sign" in caplog.text
+    assert "Ignored: signing_key cannot sign" in str(stop)
+
+
+def test_key_that_signs_is_used(fleet: Fleet, near: ScriptedNetwork) -> None:
+    key = Ed25519PrivateKey.generate()
+    fleet.estop(signing_key=key)
+    assert near.signers == [key]
+
+
+def test_named_robot_that_a_network_remembers_must_answer_there(
+    fleet: Fleet, near: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    del near.robots["both"]
+    near.silent.append("both")
+    assert fleet.estop(only="both").ok
+    row = RosterRow("both", Known.ENROLLED)
+    monkeypatch.setattr(Roster, "of", lambda network: Roster(network, (row,) if network == near.key else ()))
+    stop = fleet.estop(only="both")
+    assert stop.missing == ("both",)
+
+
+def test_network_that_is_left_during_a_stop_loses_no_verdict(
+    fleet: Fleet, far: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def left(robot: str) -> bool:
+        raise errors.UnreachableError("left")
+
+    monkeypatch.setattr(far, "bears", left)
+    assert fleet.estop(only="arm-1")["arm-1"].stopped is True
+
+
+def test_stated_network_that_is_unknown_counts_as_not_stopped(
+    near: ScriptedNetwork, far: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def unknown(network: object) -> Any:
+        raise errors.UnreachableError("the mesh of another profile is joined")
+
+    far.unreachable = "another mesh is joined"
+    monkeypatch.setattr(type(far), "key", property(lambda self: unknown(self) if self is far else NEAR))
+    with Fleet([near, far]) as fleet:
+        for stop in (fleet.stop(), fleet.estop()):
+            assert stop["arm-1"].stopped is True
+            assert stop.missing == ("the robots on mesh",)
+            assert "another mesh is joined" in str(stop)
+
+
+def test_robot_that_was_freed_on_one_network_is_asked_anew_on_the_other(
+    fleet: Fleet, near: ScriptedNetwork, far: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fleet.estop()
+    resume = near.resume
+
+    def freed(reports: Any, signer: Any, timeout: float) -> Any:
+        # One robot that is served on both.
+        far.locked.pop("both")
+        return resume(reports, signer, timeout)
+
+    def strict(reports: Any, *_: Any) -> Any:
+        return {each.name: (True, "free") if each.lockouts else (True, "was not locked") for each in reports}
+
+    monkeypatch.setattr(near, "resume", freed)
+    monkeypatch.setattr(far, "resume", strict)
+    assert fleet.resume("key")["both"] == (True, "free")
+
+
+def test_two_keys_of_one_id_are_both_left_out(fleet: Fleet, near: ScriptedNetwork, far: ScriptedNetwork) -> None:
+    for network, key in ((near, "near"), (far, "far")):
+        network.keys = {name: KeyFile(ROBOTS, f"{key}-{name}").load_or_make() for name in network.robots}
+    outcome = fleet.enroll()
+    assert outcome["both"].outcome is Enrolled.TWO_KEYS
+    assert "device_connect shows" in outcome["both"].said and "mesh shows" in outcome["both"].said
+    assert {name: each.outcome for name, each in outcome.items() if name != "both"} == dict.fromkeys(
+        ("arm-1", "arm-2"), Enrolled.NEW
+    )
+    assert sorted(enrolled_robots()) == ["arm-1", "arm-2"]

@@ -84,7 +84,7 @@ class EmergencyStop:
         """
         try:
             found = self._found.result()
-        except Exception:  # noqa: BLE001 - logged by the search, and told by the outcome
+        except BaseException:  # noqa: BLE001 - logged by the search, and told by the outcome
             return []
         self._search.complete(found)
         answered = {*report.stopped, *report.not_stopped, *report.refused}
@@ -139,7 +139,7 @@ class EmergencyStop:
         for last in (False, True):
             try:
                 self._found.set_result(devices(self._begun))
-            except Exception as exc:  # noqa: BLE001 - raised again by the future
+            except BaseException as exc:  # noqa: BLE001 - raised again by the future; a binding's panic is no Exception
                 self._search.failed(exc)
                 # A network that is not there yet is asked again once the stop has begun.
                 self._begun.wait()

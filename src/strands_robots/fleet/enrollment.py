@@ -28,6 +28,7 @@ class Enrolled(Enum):
     KNOWN = "known"
     NO_KEY = "no key"
     CHANGED_KEY = "CHANGED KEY"
+    TWO_KEYS = "TWO KEYS"
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +63,7 @@ def enroll(reports: Sequence[LockoutReport], network: NetworkKey, *, replace: bo
     known, fresh = file.load(), dict[str, bytes]()
     outcomes, cells = dict[str, Enrolment](), dict[str, str]()
     for each in reports:
-        local, public = local_name(tenant, each.name), own_key(Purpose.LOCKOUT_STATE, each.name, _statement(each.facts))
+        local, public = local_name(tenant, each.name), shown_key(each)
         cell = _signed_cell(each, public)
         cells |= {} if cell is None else {local: cell}
         mark = "" if public is None else fingerprint(public)
@@ -78,6 +79,11 @@ def enroll(reports: Sequence[LockoutReport], network: NetworkKey, *, replace: bo
     for local, exempt in file.enroll(fresh, replace=replace, network=network, cells=cells).items():
         log_safety_event("exemption_undone", local, {"was": exempt.state, "by": exempt.by, "who": operator()})
     return outcomes
+
+
+def shown_key(report: LockoutReport) -> bytes | None:
+    """Return the key that a robot signed its report with; None without one."""
+    return own_key(Purpose.LOCKOUT_STATE, report.name, _statement(report.facts))
 
 
 def enrolled_robots() -> dict[str, EnrolledRobot]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any, Self
 from strands_robots._mesh_switch import mesh_env_request
 from strands_robots.errors import NoSuchRobotError, RefusalError, UnreachableError
 from strands_robots.fleet.adapter import DEVICE_CONNECT, FIND_S, MESH, STOP_S, FoundRobot, NetworkAdapter
-from strands_robots.fleet.enrollment import Enrolment, enroll
+from strands_robots.fleet.enrollment import Enrolled, Enrolment, enroll, shown_key
 from strands_robots.fleet.fleet_verdict import FleetVerdict, NetworkVerdict
 from strands_robots.fleet.link_flags import LinkFlags
 from strands_robots.fleet.lockout_report import LockoutReport, Resumed
@@ -19,10 +20,12 @@ from strands_robots.fleet.profiles import profile_for
 from strands_robots.fleet.remote_robot import RemoteRobot
 from strands_robots.fleet.side_by_side import side_by_side
 from strands_robots.fleet.stop_answers import measured
+from strands_robots.safety.identity import fingerprint
 from strands_robots.safety.orders import new_epoch
+from strands_robots.safety.roster import Roster
 from strands_robots.safety.scope import Scope
 from strands_robots.safety.silence import Sending
-from strands_robots.safety.stop_roster import StopRoster, robots_known_at
+from strands_robots.safety.stop_roster import READ_WITHIN_S, StopRoster, robots_known_at
 from strands_robots.safety.unheard import unheard_now
 from strands_robots.serving.stop_arguments import stop_reason, stop_scope
 from strands_robots.tags import own_tags
@@ -269,27 +272,29 @@ class Fleet:
         why, cut = stop_reason(reason)
         named = [only] if isinstance(only, str) else only
         scope, unread = stop_scope(named or None, cell)
-        for note in filter(None, (cut, unread)):
+        signer, unfit = _signer(signing_key)
+        notes = tuple(filter(None, (cut, unread, unfit)))
+        for note in notes:
             logger.warning("Ignored: %s.", note)
 
         def remembers(meant: Scope) -> bool:
             # Of the robots that a stop means none need be on each network; only where none is on any all are stopped.
-            if any(each.bears(name) for each in joined for name in meant.only):
+            if any(_bears(each, name) for each in joined for name in meant.only):
                 return True
             return any(robots_known_at(lambda each=each: each.key)(meant) for each in joined)  # type: ignore[misc]
 
         def stopped(network: NetworkAdapter) -> NetworkVerdict:
             try:
                 outcome = network.emergency_stop(
-                    why, scope=scope, signing_key=signing_key, estop_id=estop_id, remembers=remembers
+                    why, scope=scope, signing_key=signer, estop_id=estop_id, remembers=remembers
                 )
             except Exception as exc:  # noqa: BLE001 - a network that fails must not hide the verdicts of the others
                 return _not_left(network, exc)
-            absent = frozenset(name for name in scope.only if not network.bears(name))
-            return NetworkVerdict(network.name, outcome, not_here=absent)
+            strange = {name for name in scope.only if not _bears(network, name)}
+            return NetworkVerdict(network.name, outcome, not_here=_not_remembered(network, strange))
 
         stops = [*side_by_side(stopped, joined), *self._not_reached(joined)]
-        return FleetVerdict(stops, estop_id, tuple(self._robots) if scope.everything else tuple(scope.only))
+        return FleetVerdict(stops, estop_id, tuple(self._robots) if scope.everything else tuple(scope.only), notes)
 
     def lockouts(self, timeout: float = FIND_S) -> dict[str, LockoutReport]:
         """Ask the robots in reach for their lockouts; return the reports by id.
@@ -328,9 +333,12 @@ class Fleet:
             if unheard := unheard_now(network.key, {each.name for each in reports if not each.problem}):
                 logger.warning("%s: %s", network.name, unheard)
         outcomes: dict[str, Resumed] = {}
-        done = side_by_side(lambda one: one[0].resume(one[1], signing_key, seconds), asked)
-        for freed in reversed(done):
-            for name, outcome in freed.items():
+        for network, reports in asked:
+            # A robot that is served on both was freed by the first: it refuses a second resume.
+            twice = [each.name for each in reports if each.name in outcomes]
+            anew = {each.name: each for each in network.lockouts(twice, seconds)} if twice else {}
+            now = [anew.get(each.name, each) for each in reports]
+            for name, outcome in network.resume(now, signing_key, seconds).items():
                 # Locked on one of two networks is locked.
                 outcomes[name] = min(outcomes.get(name, outcome), outcome, key=lambda each: each[0])
         return outcomes
@@ -348,9 +356,21 @@ class Fleet:
         Raises:
             KeyFileError, OSError: the file of enrolled keys cannot be used; nothing was enrolled.
         """
-        seconds, outcomes = number("timeout", timeout, above=0, high=60), dict[str, Enrolment]()
-        for network, reports in reversed(self._asked((), seconds, signed=True)):
-            outcomes |= enroll(reports, network.key, replace=replace)
+        seconds = number("timeout", timeout, above=0, high=60)
+        asked = self._asked((), seconds, signed=True)
+        keys: dict[str, dict[bytes, str]] = {}
+        for network, reports in asked:
+            for each in reports:
+                if (key := shown_key(each)) is not None:
+                    keys.setdefault(each.name, {}).setdefault(key, network.name)
+        several = {name: shown for name, shown in keys.items() if len(shown) > 1}
+        outcomes = {name: Enrolment(Enrolled.TWO_KEYS, said=_two_keys(shown)) for name, shown in several.items()}
+        for network, reports in asked:
+            alone = [each for each in reports if each.name not in several]
+            for name, outcome in enroll(alone, network.key, replace=replace).items():
+                # A key that one network shows is the robot's, though the other shows none.
+                if name not in outcomes or outcomes[name].outcome is Enrolled.NO_KEY:
+                    outcomes[name] = outcome
         return outcomes
 
     def _asked(
@@ -381,7 +401,8 @@ class Fleet:
         """Return networks that are not joined, and have robots that must answer."""
         absent = [each for each in self._stated if each not in joined]
         stops = [_not_left(each, self.absent.get(each.name, "it is not joined")) for each in absent]
-        return [each for each in stops if each.outcome is not None and each.outcome.size]
+        # Of a network whose roster cannot be read it is not known whether a robot is there.
+        return [each for each in stops if each.outcome is None or each.outcome.size]
 
     def __getitem__(self, robot: str) -> RemoteRobot:
         """Return the robot of this id, looked for where it is not known yet.
@@ -476,3 +497,48 @@ def _not_left(network: NetworkAdapter, why: object) -> NetworkVerdict:
         logger.warning("The roster of %s cannot be read: %s", network.name, exc)
         return NetworkVerdict(network.name, absent=said)
     return NetworkVerdict(network.name, outcome, absent=said)
+
+
+def _signer(key: Any) -> tuple[Any, str]:
+    """Return a key that can sign, None without one, and a note on one that cannot."""
+    if key is None:
+        return None, ""
+    try:
+        key.public_key()
+        key.sign(b"")
+    except Exception:  # noqa: BLE001 - whatever it raises, the stop leaves without it
+        return None, "signing_key cannot sign, so the stop is not signed"
+    return key, ""
+
+
+def _bears(network: NetworkAdapter, robot: str) -> bool:
+    """Return whether a network has a robot now; False for a network that was left."""
+    try:
+        return network.bears(robot)
+    except RefusalError:
+        return False
+
+
+def _not_remembered(network: NetworkAdapter, robots: Collection[str]) -> frozenset[str]:
+    """Return those robots that this machine does not remember on a network.
+
+    A roster that is not read in time, or cannot be, may have all of them.
+    """
+    rows: list[frozenset[str]] = []
+
+    def read() -> None:
+        try:
+            rows.append(frozenset(row.name for row in Roster.of(network.key).rows))
+        except Exception as exc:  # noqa: BLE001 - then each of them counts
+            logger.warning("The roster of %s cannot be read: %s", network.name, exc)
+
+    if robots:
+        reading = threading.Thread(target=read, name="stop roster", daemon=True)
+        reading.start()
+        reading.join(READ_WITHIN_S)
+    return frozenset(robots) - rows[0] if rows else frozenset()
+
+
+def _two_keys(keys: Mapping[bytes, str]) -> str:
+    shown_keys = ", ".join(f"{network} shows {fingerprint(key)}" for key, network in keys.items())
+    return f"{shown_keys}; neither was enrolled"

@@ -93,10 +93,17 @@ class FleetVerdict(Mapping[str, StopVerdict]):
     Attributes:
         networks: the stop on each network.
         estop_id: the epoch of the lockout; empty for a stop without one.
+        ignored: notes on arguments that could not be read.
     """
 
-    def __init__(self, networks: Sequence[NetworkVerdict], estop_id: str = "", known: Sequence[str] = ()) -> None:
-        self.networks, self.estop_id = tuple(networks), estop_id
+    def __init__(
+        self,
+        networks: Sequence[NetworkVerdict],
+        estop_id: str = "",
+        known: Sequence[str] = (),
+        ignored: Sequence[str] = (),
+    ) -> None:
+        self.networks, self.estop_id, self.ignored = tuple(networks), estop_id, tuple(ignored)
         by_robot: dict[str, list[StopVerdict]] = {name: [] for name in known}
         for each in self.networks:
             for name, verdict in each.verdicts().items():
@@ -125,7 +132,8 @@ class FleetVerdict(Mapping[str, StopVerdict]):
         return len(self._verdicts)
 
     def __str__(self) -> str:
-        said = [f"{name} did not stop." for name, each in self._verdicts.items() if each.stopped is False]
+        said = [f"Ignored: {note}." for note in self.ignored]
+        said += [f"{name} did not stop." for name, each in self._verdicts.items() if each.stopped is False]
         said += [f"{name}: {why}." for name, each in self._verdicts.items() for why in each.unknown.values()]
         told = [each for each in self.networks if each.absent or each.problems or (each.outcome and each.outcome.size)]
         said += [f"{each.network}: {each.sentence}" if len(told) > 1 else each.sentence for each in told]

@@ -326,7 +326,7 @@ class RemoteRobot:
         return arguments
 
     def _stopped_on(self, network: NetworkAdapter) -> object:
-        return _stopped(self.address, network)
+        return _stopped(self.address, network, insist=network is self._network)
 
     def rediscovered(self, found: FoundRobot, network: NetworkAdapter) -> None:
         """Take what a new discovery found; its verbs are read again when they are used."""
@@ -473,7 +473,7 @@ class RobotOfWorld(RemoteRobot):
         return {**arguments, ROBOT_NAME: self._name} if named else arguments
 
     def _stopped_on(self, network: NetworkAdapter) -> object:
-        return _stopped(self.address, network, self._name)
+        return _stopped(self.address, network, self._name, insist=network is self._network)
 
 
 def _of_one(verb: AdvertisedVerb) -> AdvertisedVerb | None:
@@ -487,9 +487,9 @@ _RESERVED = frozenset(dir(RemoteRobot))
 """Names of members, which no verb of a robot takes."""
 
 
-def _stopped(robot: str, network: NetworkAdapter, robot_name: str = "") -> object:
+def _stopped(robot: str, network: NetworkAdapter, robot_name: str = "", *, insist: bool = False) -> object:
     try:
-        return network.stop(robot, STOP_S, robot_name)
+        return network.stop(robot, STOP_S, robot_name, insist=insist)
     except NoSuchRobotError:
         return None
     except Exception as exc:  # noqa: BLE001 - a stop that fails is a verdict, whatever it raised

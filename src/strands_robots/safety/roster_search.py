@@ -106,7 +106,7 @@ class RosterSearch:
     def _find(self, look_up: LookUp) -> None:
         try:
             found = look_up()
-        except Exception as exc:  # noqa: BLE001 - said with the report; the stop goes on to its deadline
+        except BaseException as exc:  # noqa: BLE001 - said with the report; the stop goes on to its deadline
             logger.warning("The search for robots failed: %s", exc)
             self.failed(exc)
             return
@@ -121,7 +121,7 @@ class RosterSearch:
         with self._lock:
             self._problem = found.problem.rstrip(".")
 
-    def failed(self, exc: Exception) -> None:
+    def failed(self, exc: BaseException) -> None:
         """Note why devices in reach could not be looked up."""
         with self._lock:
             self._problem = plain_text(str(exc), 300).rstrip(".") or type(exc).__name__

@@ -192,16 +192,16 @@ def test_warnings_of_a_device_reach_its_logger_after_others_of_its_id_have_left(
             """Shine."""
             raise OSError("burnt out")
 
-    name, warnings = f"{bringup.RUNTIME_LOGGER}arm-1", queue.SimpleQueue[logging.LogRecord]()
-    runtime = init_device_connect_sync(Lamp(), peer_id="arm-1", link=link)
-    with pytest.raises(DuplicateDeviceError, match="arm-1"):
-        init_device_connect_sync(Lamp(), peer_id="arm-1", link=link)
-    stop_device_connect(init_device_connect_sync(Lamp(), peer_id="arm-1", link=replace(link, tenant="b")))
+    name, warnings = f"{bringup.RUNTIME_LOGGER}lamp-1", queue.SimpleQueue[logging.LogRecord]()
+    runtime = init_device_connect_sync(Lamp(), peer_id="lamp-1", link=link)
+    with pytest.raises(DuplicateDeviceError, match="lamp-1"):
+        init_device_connect_sync(Lamp(), peer_id="lamp-1", link=link)
+    stop_device_connect(init_device_connect_sync(Lamp(), peer_id="lamp-1", link=replace(link, tenant="b")))
     handler = QueueHandler(warnings)
     logging.getLogger(name).addHandler(handler)
     try:
         with FleetClient(link) as fleet, pytest.raises(CallRefusedError, match="burnt out"):
-            fleet.call("arm-1", "shine")
+            fleet.call("lamp-1", "shine")
         assert "burnt out" in warnings.get(timeout=20).getMessage()
     finally:
         logging.getLogger(name).removeHandler(handler)

@@ -11,7 +11,7 @@ from strands_robots.fleet.mesh.lockouts import lockable_peers
 from strands_robots.fleet.mesh.standing import MeshReports, mesh_network
 from strands_robots.fleet.stop_answers import stop_outcome
 from strands_robots.safety.answers import Answer
-from strands_robots.safety.controller import OnProgress, Press, Progress, StopReport
+from strands_robots.safety.controller import PRESSES_MAX, OnProgress, Press, Progress, StopReport
 from strands_robots.safety.orders import new_epoch
 from strands_robots.safety.peer_answers import enrolled_peers, stop_distrust
 from strands_robots.safety.roster_inbox import OnReport
@@ -36,9 +36,9 @@ class MeshController:
     def __init__(self, mesh: Mesh, signing_key: Any = None) -> None:
         self._mesh = mesh
         self._key = signing_key
-        self._press = ("", Press(0.0, 0.0))
+        self._presses: dict[str, Press] = {}
         self._keys = enrolled_peers()
-        self._named: frozenset[str] = frozenset()
+        self._named: dict[str, frozenset[str]] = {}
         self.controller_id, self.network = mesh.peer_id, mesh_network()
         self.sending = Sending(signed=signing_key is not None)
         self._reports = MeshReports(mesh)
@@ -51,9 +51,10 @@ class MeshController:
 
     def press(self, estop_id: str) -> Press:
         """Note the moment of a press, from which its answers are counted."""
-        if self._press[0] != estop_id:
-            self._press = (estop_id, Press(time.monotonic(), time.time()))
-        return self._press[1]
+        press = self._presses.setdefault(estop_id, Press(time.monotonic(), time.time()))
+        while len(self._presses) > PRESSES_MAX:
+            del self._presses[next(iter(self._presses))]
+        return press
 
     def check_in_every(self, interval_s: float) -> None:
         """Check in with the robots that need a live controller."""
@@ -74,9 +75,9 @@ class MeshController:
 
         Where no robot in the scope is there, every robot is stopped.
         """
-        self._named = frozenset(expected) | scope.only
         epoch = estop_id or new_epoch()
         pressed = self.press(epoch)
+        self._named[epoch] = frozenset(expected) | scope.only
         answers: dict[str, Answer] = {}
         alarms: dict[str, str] = {}
         widened: list[bool] = []
@@ -88,7 +89,7 @@ class MeshController:
                     alarms[name] = why
                 elif name not in answers or answers[name].stopped is not True or answers[name].claimed:
                     answers[name] = _answer(name, reply, (time.monotonic() - pressed.at) * 1000, claimed=bool(why))
-            silent = tuple(sorted(self._named - answers.keys()))
+            silent = tuple(sorted(self._named[epoch] - answers.keys()))
             elapsed = (time.monotonic() - pressed.at) * 1000
             on_progress(
                 Progress(
@@ -121,14 +122,15 @@ class MeshController:
         # By the keys of now: a robot may have been enrolled since the last stop.
         answers.clear()
         note(replies)
-        robots = {*self._named, *lockable_peers(self._mesh)}
+        expected = self._named.pop(epoch)
+        robots = {*expected, *lockable_peers(self._mesh)}
         told = {name: each for name, each in answers.items() if name in robots}
         return StopReport(
             epoch,
             {name: each for name, each in told.items() if each.stopped is True and not each.claimed},
             {name: each for name, each in told.items() if each.stopped is not True},
             {},
-            tuple(sorted(self._named - told.keys() - alarms.keys())),
+            tuple(sorted(expected - told.keys() - alarms.keys())),
             up,
             (time.monotonic() - pressed.at) * 1000,
             claimed={name: each for name, each in told.items() if each.stopped is True and each.claimed},
@@ -139,7 +141,10 @@ class MeshController:
 
     def expect(self, estop_id: str, names: Collection[str], *, more: bool = False) -> bool:
         """Name further robots that must answer; the mesh asks those in reach by itself."""
-        self._named |= frozenset(names)
+        named = self._named.get(estop_id)
+        if named is None:
+            return False
+        self._named[estop_id] = named | frozenset(names)
         return True
 
     def _load_keys(self) -> None:

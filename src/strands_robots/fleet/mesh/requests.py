@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from strands_robots.envelope import Envelope, error
 from strands_robots.fleet.adapter import CLOSED
@@ -22,23 +22,26 @@ if TYPE_CHECKING:
 IN_FLIGHT = 64
 """Requests of one kind that wait for an answer at a time; threads are started as they are needed."""
 
+STOPS_IN_FLIGHT = 1024
+"""The same of stops: as many as a page has robots, so that the last one begins as soon as the first."""
+
+T = TypeVar("T")
+
 
 class PeerRequests:
     """Calls, stops and questions of one peer; none waits for one of another kind."""
 
     def __init__(self) -> None:
         self._calls = ThreadPoolExecutor(IN_FLIGHT, "mesh call")
-        self._stops = ThreadPoolExecutor(IN_FLIGHT, "mesh stop")
+        self._stops = ThreadPoolExecutor(STOPS_IN_FLIGHT, "mesh stop")
         self._questions = ThreadPoolExecutor(IN_FLIGHT, "mesh question")
         self._keys = CachedKeys(enrolled_peers)
 
     async def call(self, mesh: Mesh, robot: str, command: dict[str, Any], seconds: float) -> Envelope:
         """Send an action; every failure is an answer of status error."""
-        loop = asyncio.get_running_loop()
-        try:
-            reply = await loop.run_in_executor(self._calls, mesh.send, robot, command, seconds)
-        except RuntimeError:
-            return error(CLOSED)
+        reply = await _done(self._calls, lambda: mesh.send(robot, command, seconds), lambda why: {"failed": why})
+        if "failed" in reply:
+            return error(reply["failed"])
         if reply.get("status") == "timeout":
             return error(f"{robot} did not answer.")
         if reply.get("type") != "response":
@@ -48,21 +51,15 @@ class PeerRequests:
 
     async def stop(self, mesh: Mesh, robot: str, seconds: float) -> Envelope:
         """Stop a peer; *stopped* counts only where an enrolled robot has signed it."""
-        loop = asyncio.get_running_loop()
-        try:
-            return await loop.run_in_executor(self._stops, _stopped, mesh, robot, seconds)
-        except RuntimeError:
-            return error(CLOSED, stopped=None)
+        return await _done(self._stops, lambda: _stopped(mesh, robot, seconds), lambda why: error(why, stopped=None))
 
     async def lockout(self, mesh: Mesh, robot: str, seconds: float) -> LockoutReport:
         """Ask a peer for its status."""
-        loop = asyncio.get_running_loop()
-        try:
-            return await loop.run_in_executor(
-                self._questions, lambda: ask_peer(mesh, robot, seconds, self._keys.read())
-            )
-        except RuntimeError:
-            return LockoutReport(robot, problem=CLOSED)
+        return await _done(
+            self._questions,
+            lambda: ask_peer(mesh, robot, seconds, self._keys.read()),
+            lambda why: LockoutReport(robot, problem=why),
+        )
 
     def close(self) -> None:
         """Begin no more requests."""
@@ -73,3 +70,21 @@ class PeerRequests:
 def _stopped(mesh: Mesh, robot: str, seconds: float) -> Envelope:
     reply = mesh.send(robot, {"action": "stop"}, seconds)
     return stop_answer(robot, reply, enrolled_peers())
+
+
+async def _done(pool: ThreadPoolExecutor, work: Callable[[], T], failed: Callable[[str], T]) -> T:
+    """Return what ``work`` returns on a thread of the pool, or what ``failed`` makes of the reason why it did not."""
+    try:
+        begun = pool.submit(work)
+    except RuntimeError:
+        return failed(CLOSED)
+    try:
+        return await asyncio.wrap_future(begun)
+    except asyncio.CancelledError:
+        # Of the pool that is closed, not of the task that waits.
+        task = asyncio.current_task()
+        if task is not None and task.cancelling():
+            raise
+        return failed(CLOSED)
+    except Exception as exc:  # noqa: BLE001 - a request that fails is answered, whatever it raised
+        return failed(plain_text(str(exc)) or type(exc).__name__)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 from collections.abc import Callable, Collection, Mapping
+from itertools import count
 from typing import TYPE_CHECKING, Any
 
 from strands_robots.bounded_json import json_object
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
 REPORTS, STOPS = "missed rosters", "stops of others"
 """Names of the subscriptions."""
 
+_subscriptions = count()
+
 
 def mesh_network() -> NetworkKey:
     """Return the key of the mesh that this process joins."""
@@ -40,16 +43,18 @@ class MeshReports:
 
     def __init__(self, mesh: Mesh) -> None:
         self._mesh, self.inbox = mesh, RosterInbox(_fields)
+        # Of two with one name the later would end the earlier one's.
+        self._name = f"{REPORTS} {next(_subscriptions)}"
 
     def begin(self) -> None:
         """Receive reports from now on."""
         from strands_robots.mesh import topics  # noqa: PLC0415 - the network is loaded when it is used
 
-        self._mesh.listen(topics.missed_roster("*"), self._take, REPORTS)
+        self._mesh.listen(topics.missed_roster("*"), self._take, self._name)
 
     def close(self) -> None:
         """Receive none any more."""
-        self._mesh.unsubscribe(REPORTS)
+        self._mesh.unsubscribe(self._name)
         self.inbox.end()
 
     def _take(self, sample: Sample) -> None:

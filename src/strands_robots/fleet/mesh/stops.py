@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 ESTOP_S = 1.5
 """Seconds in which peers answer a stop; it is repeated until then."""
 
+REPORTED_S = 0.5
+"""Seconds from an emergency stop in which standing controllers report whom they miss: their first two reports."""
+
 AGAIN_S = 1.0
 """Seconds between two sendings of a stop that a peer in reach has not confirmed."""
 
@@ -83,8 +86,11 @@ def lock_peers(
             some = {"scope": roster.scope, "remembers": known, "on_widened": roster.widen}
         return mesh.emergency_stop(signing_key, estop_id=epoch, on_answers=left, **some)
 
+    sent = time.monotonic()
     try:
         answers = _stop_all(mesh, send, roster, since)
+        # Also where all in reach have answered: other consoles say whom they miss.
+        time.sleep(max(0.0, sent + REPORTED_S - time.monotonic()))
     finally:
         reports.close()
     outcome = measured(answers, roster, Sending(signed=signing_key is not None), epoch)
