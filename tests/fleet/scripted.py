@@ -11,6 +11,7 @@ from strands_robots.errors import NoSuchRobotError, RefusalError, UnknownVerbErr
 from strands_robots.fleet.adapter import DEVICE_CONNECT, FIND_S, STOP_S, FoundRobot, OnEvent, RobotEvent
 from strands_robots.fleet.lockout_report import LockoutReport, Resumed
 from strands_robots.fleet.stop_answers import measured, roster_verdict, unanswered
+from strands_robots.safety import network_key
 from strands_robots.safety.identity import SigningIdentity
 from strands_robots.safety.lockout import Lockout
 from strands_robots.safety.network_key import NetworkKey
@@ -48,6 +49,11 @@ OURS = (
     function("releaseControl", lease_id={"type": "string"}),
 )
 """What a robot of ours describes, in short."""
+
+
+def key_of(network: str) -> NetworkKey:
+    """Return the key of a scripted network."""
+    return NetworkKey.of({DEVICE_CONNECT: network_key.DEVICE_CONNECT}.get(network, network), ["tcp/127.0.0.1:1"])
 
 
 class ScriptedNetwork:
@@ -167,7 +173,7 @@ class ScriptedNetwork:
 
     @property
     def key(self) -> NetworkKey:
-        return NetworkKey.of(self.name, ["scripted"])
+        return key_of(self.name)
 
     @property
     def reach(self) -> str:

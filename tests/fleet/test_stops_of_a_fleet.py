@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
-from tests.fleet.scripted import ScriptedNetwork
+from tests.fleet.scripted import ScriptedNetwork, key_of
 
 from strands_robots import errors
 from strands_robots.envelope import error, success
@@ -16,12 +16,11 @@ from strands_robots.fleet import Fleet
 from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
 from strands_robots.fleet.enrollment import Enrolled, enrolled_robots
 from strands_robots.safety.identity import ROBOTS, KeyFile
-from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.roster import Roster, RosterRow
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.safety.sightings import Known
 
-NEAR = NetworkKey.of(DEVICE_CONNECT, ["scripted"])
+NEAR = key_of(DEVICE_CONNECT)
 
 
 @pytest.fixture

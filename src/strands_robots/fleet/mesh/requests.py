@@ -73,7 +73,10 @@ def _stopped(mesh: Mesh, robot: str, seconds: float) -> Envelope:
 
 
 async def _done(pool: ThreadPoolExecutor, work: Callable[[], T], failed: Callable[[str], T]) -> T:
-    """Return what ``work`` returns on a thread of the pool, or what ``failed`` makes of the reason why it did not."""
+    """Return what ``work`` returns on a thread of the pool.
+
+    Where it does not, return what ``failed`` makes of the reason.
+    """
     try:
         begun = pool.submit(work)
     except RuntimeError:
