@@ -104,3 +104,51 @@ def test_closed_network_answers_at_once(console: Any) -> None:
     called, stopped, report = asyncio.run(asked())
     assert [called["content"][0], stopped["content"][0]] == [{"text": CLOSED}] * 2
     assert (stopped["stopped"], report.problem) == (None, CLOSED)
+
+
+def test_hundredth_stop_begins_as_soon_as_the_first(console: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    mesh, there, _ = console
+    busy = Busy(mesh, monkeypatch, "stop")
+
+    async def all_of_them() -> None:
+        stops = [asyncio.create_task(there.stop_async(f"arm-{each}", 60.0)) for each in range(3 * IN_FLIGHT)]
+        await asyncio.to_thread(eventually, lambda: busy.waiting == 3 * IN_FLIGHT, 30.0, what="every stop has begun")
+        busy.released.set()
+        assert {each["stopped"] for each in await asyncio.gather(*stops)} == {None}
+
+    asyncio.run(all_of_them())
+
+
+def test_requests_answer_whatever_the_mesh_raises(console: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    mesh, there, _ = console
+
+    def broken(*_: Any) -> Any:
+        raise OSError("the cable")
+
+    monkeypatch.setattr(mesh, "send", broken)
+
+    async def asked() -> Any:
+        called, stopped = await there.call_async("arm-1", "ping", {}, 10.0), await there.stop_async("arm-1", 10.0)
+        return called, stopped, await there.lockout_async("arm-1", 10.0)
+
+    called, stopped, report = asyncio.run(asked())
+    assert [called["reason"], stopped["reason"], report.problem] == ["the cable"] * 3
+    assert stopped["stopped"] is None
+
+
+def test_request_that_waits_for_a_thread_is_answered_where_the_network_is_left(
+    console: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mesh, there, _ = console
+    busy = Busy(mesh, monkeypatch, "ping")
+
+    async def left() -> Any:
+        calls = [asyncio.create_task(there.call_async("arm-1", "ping", {}, 60.0)) for _ in range(IN_FLIGHT + 1)]
+        await asyncio.to_thread(eventually, lambda: busy.waiting >= IN_FLIGHT, 30.0, what="every thread of calls waits")
+        there.close()
+        last = await calls[-1]
+        busy.released.set()
+        await asyncio.gather(*calls)
+        return last
+
+    assert asyncio.run(left())["reason"] == CLOSED
