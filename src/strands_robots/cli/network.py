@@ -191,6 +191,20 @@ class Network:
                 words += [flag] if value is True else [flag, str(value)]
         return "".join(f" {shlex.quote(word)}" for word in words)
 
+    def beside(self) -> list[NetworkAdapter]:
+        """Return the networks of the connection profile besides Device Connect, which a stop of all has to reach.
+
+        A mesh that cannot be used is left out, as :meth:`link` says in the log.
+        """
+        from strands_robots.fleet.mesh.network import MeshNetwork  # noqa: PLC0415 - loaded when it is used
+
+        profile = self._profile
+        try:
+            mesh = None if profile is None else profile.mesh
+        except ValidationError:
+            mesh = None
+        return [] if mesh is None else [MeshNetwork(self.caller(), mesh)]
+
     def use_mesh(self) -> None:
         """Apply the flags to the native mesh, which takes ``--fleet`` and ``--port``.
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterator, Mapping
-from concurrent.futures import wait
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, wait
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -28,9 +28,12 @@ from strands_robots.cli.stop_report import (
 from strands_robots.envelope import Envelope, text_of
 from strands_robots.fleet.device_connect.stops import devices_on, network_key
 from strands_robots.fleet.emergency_stop import EmergencyStop
+from strands_robots.fleet.fleet_verdict import NetworkVerdict
 from strands_robots.fleet.link_flags import described
+from strands_robots.fleet.network_stop import stop_beside
 from strands_robots.fleet.stop_answers import combined_verdict, roster_verdict, stop_outcome, unanswered
 from strands_robots.safety.controller import DEADLINE_S, Progress
+from strands_robots.safety.orders import new_epoch
 from strands_robots.safety.stop_roster import StopOutcome
 from strands_robots.serving.stop_arguments import robot_of_world, stop_reason, stop_robot, stop_scope
 from strands_robots.tools.networks import SOURCE as PEER
@@ -78,6 +81,7 @@ def stop(
         unread = unread or "--robot names no robot of a DEVICE's world, so all of it is stopped"
     _say_ignored(screen, unread)
     seconds = _seconds(screen, "--timeout", timeout, 60, 5.0)
+    others = [] if device or on_mesh else _beside(network, lambda each: each.stop_all(seconds)[1])
     with _stopping(screen, network, on_mesh=on_mesh) as there:
         if device is None:
             answers, outcome = there.stop_all(seconds)
@@ -90,7 +94,7 @@ def stop(
                 why = there.silence(device)
                 said, alike = (f"{said.rstrip('.')}: {why}", "") if why else (said, near_robots(there, device))
     if device is None:
-        _report_all(screen, outcome, facts, there.reach)
+        _report_all(screen, outcome, facts, there.reach, others)
         return
     # One robot of a world is named with it: the others may move on.
     robot = f"{device}/{name}" if name else device
@@ -169,6 +173,8 @@ def estop(
         safety_controller,
     )
 
+    epoch = new_epoch()
+    others = _beside(network, lambda each: each.emergency_stop(reason, scope=scope, signing_key=signer, estop_id=epoch))
     controller = safety_controller(source, link, signing_key=signer, require_signed=signer is not None)
     try:
         running = EmergencyStop(
@@ -179,6 +185,7 @@ def estop(
             named=expected,
             devices=None if expected else devices_on(link, seconds),
             scope=scope,
+            estop_id=epoch,
             link_wait_s=LINK_WAIT_S,
         )
         if screen.live:
@@ -199,7 +206,7 @@ def estop(
         screen.say(CLAIMED, "yellow")
     if report.link and report.silent and not (report.answered or outcome.others.answered):
         screen.say(KEPT_BY_NONE, "yellow")
-    _end(screen, outcome, _facts(outcome_envelope(outcome)), "" if report.link else described(link))
+    _end(screen, outcome, _facts(outcome_envelope(outcome)), "" if report.link else described(link), others)
     if link.loopback_only:
         user = meeting_user(link)
         screen.say(LOCKED)
@@ -276,21 +283,52 @@ def _title(progress: Progress) -> str:
     return f"EMERGENCY STOP{age}" + ("" if progress.link_up else ": THE LINK IS DOWN")
 
 
-def _report_all(screen: Screen, outcome: StopOutcome, facts: Mapping[str, Any], absent: str = "") -> None:
+def _beside(network: Network, stop_robots: Callable[[NetworkAdapter], StopOutcome]) -> list[Future[NetworkVerdict]]:
+    """Stop the robots of a connection profile's other networks at the same time."""
+    return [stop_beside(each, stop_robots) for each in network.beside()]
+
+
+def _report_all(
+    screen: Screen,
+    outcome: StopOutcome,
+    facts: Mapping[str, Any],
+    absent: str = "",
+    others: Sequence[Future[NetworkVerdict]] = (),
+) -> None:
     """Print a stop of all without times; raise unless the roster stands still."""
     rows = outcome_rows(outcome)
     if rows:
         screen.show(stop_table(rows, timed=False))
         say_outcome(screen, outcome)
-    _end(screen, outcome, {**facts, **outcome.facts()}, "" if rows else absent)
+    _end(screen, outcome, {**facts, **outcome.facts()}, "" if rows else absent, others)
 
 
-def _end(screen: Screen, outcome: StopOutcome, facts: Mapping[str, Any], where: str) -> None:
-    """Print facts for programs; raise unless the roster stands still."""
-    code = exit_code(outcome)
-    if code is not Exit.OK:
-        raise CliError(plain(f"{failure(outcome)} {where}".rstrip(), 2000), code, **facts)
-    screen.data({"status": "success", **facts})
+def _end(
+    screen: Screen,
+    outcome: StopOutcome,
+    facts: Mapping[str, Any],
+    where: str,
+    others: Sequence[Future[NetworkVerdict]] = (),
+) -> None:
+    """Print facts for programs; raise unless the rosters of all networks stand still."""
+    beside = [each for each in (other.result() for other in others) if each.verdicts() or each.problems]
+    known, parts = {**facts}, list[tuple[Exit, str]]()
+    if not beside or outcome.size or outcome.problems:
+        # Beside a network with robots, one without any is no failure.
+        parts.append((exit_code(outcome), f"{failure(outcome)} {where}".rstrip()))
+    for each in beside:
+        screen.say(f"On {each.network}:")
+        if each.outcome is not None:
+            screen.show(stop_table(outcome_rows(each.outcome), timed=False))
+            say_outcome(screen, each.outcome)
+        code = Exit.SILENT if each.outcome is None else exit_code(each.outcome)
+        parts.append((code, f"On {each.network}: {each.sentence}"))
+        known[each.network] = {name: verdict.stopped for name, verdict in each.verdicts().items()}
+    failed = [(code, said) for code, said in parts if code is not Exit.OK]
+    if failed:
+        worst = Exit.REFUSED if any(code is Exit.REFUSED for code, _ in failed) else Exit.SILENT
+        raise CliError(plain(" ".join(said for _, said in failed), 2000), worst, **known)
+    screen.data({"status": "success", **known})
 
 
 def _devices(answers: Mapping[str, Envelope], outcome: StopOutcome) -> dict[str, Any]:

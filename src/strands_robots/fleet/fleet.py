@@ -16,16 +16,15 @@ from strands_robots.fleet.enrollment import Enrolled, Enrolment, enroll, shown_k
 from strands_robots.fleet.fleet_verdict import FleetVerdict, NetworkVerdict
 from strands_robots.fleet.link_flags import LinkFlags
 from strands_robots.fleet.lockout_report import LockoutReport, Resumed
+from strands_robots.fleet.network_stop import not_left
 from strands_robots.fleet.profiles import profile_for
 from strands_robots.fleet.remote_robot import RemoteRobot
 from strands_robots.fleet.side_by_side import side_by_side
-from strands_robots.fleet.stop_answers import measured
 from strands_robots.safety.identity import fingerprint
 from strands_robots.safety.orders import new_epoch
 from strands_robots.safety.roster import Roster
 from strands_robots.safety.scope import Scope
-from strands_robots.safety.silence import Sending
-from strands_robots.safety.stop_roster import READ_WITHIN_S, StopRoster, robots_known_at
+from strands_robots.safety.stop_roster import READ_WITHIN_S, robots_known_at
 from strands_robots.safety.unheard import unheard_now
 from strands_robots.serving.stop_arguments import stop_reason, stop_scope
 from strands_robots.tags import own_tags
@@ -289,7 +288,7 @@ class Fleet:
                     why, scope=scope, signing_key=signer, estop_id=estop_id, remembers=remembers
                 )
             except Exception as exc:  # noqa: BLE001 - a network that fails must not hide the verdicts of the others
-                return _not_left(network, exc)
+                return not_left(network, exc)
             strange = {name for name in scope.only if not _bears(network, name)}
             return NetworkVerdict(network.name, outcome, not_here=_not_remembered(network, strange))
 
@@ -400,7 +399,7 @@ class Fleet:
     def _not_reached(self, joined: Sequence[NetworkAdapter]) -> list[NetworkVerdict]:
         """Return networks that are not joined, and have robots that must answer."""
         absent = [each for each in self._stated if each not in joined]
-        stops = [_not_left(each, self.absent.get(each.name, "it is not joined")) for each in absent]
+        stops = [not_left(each, self.absent.get(each.name, "it is not joined")) for each in absent]
         # Of a network whose roster cannot be read it is not known whether a robot is there.
         return [each for each in stops if each.outcome is None or each.outcome.size]
 
@@ -482,21 +481,8 @@ def _all_stopped(network: NetworkAdapter) -> NetworkVerdict:
     try:
         answers, outcome = network.stop_all(STOP_S)
     except Exception as exc:  # noqa: BLE001 - a stop that fails is a verdict, whatever it raised
-        return _not_left(network, exc)
+        return not_left(network, exc)
     return NetworkVerdict(network.name, outcome, answers)
-
-
-def _not_left(network: NetworkAdapter, why: object) -> NetworkVerdict:
-    """Return the verdict of a network that a stop did not reach."""
-    said = plain_text(str(why)) or type(why).__name__
-    try:
-        roster = StopRoster(network.key)
-        roster.read()
-        outcome = measured({}, roster, Sending(left=False))
-    except Exception as exc:  # noqa: BLE001 - the roster's disk must not hide the verdicts of other networks
-        logger.warning("The roster of %s cannot be read: %s", network.name, exc)
-        return NetworkVerdict(network.name, absent=said)
-    return NetworkVerdict(network.name, outcome, absent=said)
 
 
 def _signer(key: Any) -> tuple[Any, str]:
