@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -176,3 +179,38 @@ def test_robot_of_a_network_that_is_gone_is_named(
         toy.close()
         peer.close()
         clear_peers()
+
+
+@pytest.mark.parametrize("verb", ["stop", "estop"])
+def test_command_stops_the_robots_of_both_networks_of_a_profile(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, patient_halts: None, verb: str
+) -> None:
+    port, mesh_port = free_port(), free_port()
+    profile = tmp_path / "lab.toml"
+    profile.write_text(f'name = "desk"\nport = {port}\n[mesh]\nport = {mesh_port}\n')
+    profile.chmod(0o600)
+    monkeypatch.setenv("DEVICE_CONNECT_ESTOP_ALLOW", "*")
+    state = tmp_path / "far"
+    state.mkdir(mode=0o700)
+    peer = MeshPeer("far-arm", "world", {"STRANDS_MESH_PORT": str(mesh_port), "STRANDS_STATE_DIR": str(state)})
+    toy = ToyRobot("toy")
+    runtime = init_device_connect_sync(toy, peer_id="arm-1", link=loopback_config(port))
+
+    def ran() -> tuple[int, dict[str, Any]]:
+        line = [sys.executable, "-m", "strands_robots.cli", verb, "--all", "--fleet", str(profile), "--json"]
+        run = subprocess.run(line, capture_output=True, text=True, timeout=120, check=False)
+        return run.returncode, json.loads(run.stdout)
+
+    try:
+        code, facts = ran()
+        assert (code, facts["mesh"]) == (0, {"far-arm": True}), facts
+        assert toy.gate.lockout("execute") is not None or verb == "stop"
+        peer.kill()
+        code, facts = ran()
+        assert (code, facts["mesh"]) == (3, {"far-arm": None}), facts
+        assert "On mesh: " in facts["reason"]
+        assert "far-arm" in str(facts["mesh"])
+    finally:
+        stop_device_connect(runtime)
+        toy.close()
+        peer.close()
