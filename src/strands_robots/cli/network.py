@@ -191,6 +191,12 @@ class Network:
                 words += [flag] if value is True else [flag, str(value)]
         return "".join(f" {shlex.quote(word)}" for word in words)
 
+    @property
+    def on_mesh_alone(self) -> bool:
+        """True for a connection profile that has a mesh and no Device Connect."""
+        profile = self._profile
+        return profile is not None and not profile.reaches_devices(self._given)
+
     def beside(self) -> list[NetworkAdapter]:
         """Return the networks of the connection profile besides Device Connect, which a stop of all has to reach.
 

@@ -80,7 +80,7 @@ def stop(
     if one and not name:
         unread = unread or "--robot names no robot of a DEVICE's world, so all of it is stopped"
     _say_ignored(screen, unread)
-    seconds = _seconds(screen, "--timeout", timeout, 60, 5.0)
+    seconds, on_mesh = _seconds(screen, "--timeout", timeout, 60, 5.0), on_mesh or network.on_mesh_alone
     others = [] if device or on_mesh else _beside(network, lambda each: each.stop_all(seconds)[1])
     with _stopping(screen, network, on_mesh=on_mesh) as there:
         if device is None:
@@ -153,7 +153,7 @@ def estop(
     _say_ignored(screen, cut)
     scope, unread = stop_scope(only, cell)
     _say_ignored(screen, unread)
-    if on_mesh:
+    if on_mesh or network.on_mesh_alone:
         if devices:
             _say_ignored(screen, "estop --mesh stops every robot, and no DEVICE is waited for")
         on_key = None if key is None else signing_key(key, passphrase_file)

@@ -214,3 +214,18 @@ def test_command_stops_the_robots_of_both_networks_of_a_profile(
         stop_device_connect(runtime)
         toy.close()
         peer.close()
+
+
+def test_profile_of_a_mesh_alone_needs_no_word_for_a_stop(tmp_path: Path) -> None:
+    mesh_port = free_port()
+    profile = tmp_path / "hall.toml"
+    profile.write_text(f"[mesh]\nport = {mesh_port}\n")
+    profile.chmod(0o600)
+    state = tmp_path / "far"
+    state.mkdir(mode=0o700)
+    with MeshPeer("far-arm", "world", {"STRANDS_MESH_PORT": str(mesh_port), "STRANDS_STATE_DIR": str(state)}):
+        for command in (("stop", "--all"), ("estop",), ("enroll", "far-arm", "--mesh")):
+            line = [sys.executable, "-m", "strands_robots.cli", *command, "--fleet", str(profile), "--json"]
+            run = subprocess.run(line, capture_output=True, text=True, timeout=120, check=False)
+            assert run.returncode == 0, run.stdout + run.stderr
+            assert "far-arm" in run.stdout

@@ -326,6 +326,8 @@ class MeshNetwork:
     def lockouts(self, robots: Iterable[str], timeout: float, *, signed: bool = False) -> list[LockoutReport]:
         """Ask each peer for its status; a robot of ours signs in any case."""
         del signed
+        # The answer of a peer that was not seen yet is refused.
+        discover(self._joined_mesh, since=self._joined)
         return ask_peers(self._joined_mesh, robots, timeout)
 
     async def lockout_async(self, robot: str, within: float) -> LockoutReport:
