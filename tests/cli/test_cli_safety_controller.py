@@ -242,6 +242,22 @@ def test_robots_that_beat_and_do_not_answer_take_no_turn_of_the_others(monkeypat
     assert sorted(asked) == sorted(names * 2), "each is asked once in three looks"
 
 
+def test_silent_robots_without_a_beat_are_asked_in_turn_and_after_all_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    fleet, clock, names = calm_fleet(monkeypatch, 2)
+    fleet.take_beats({})
+    silent = [f"a-silent-{number}" for number in range(9)]
+    every, asked = [*names, *silent], list[str]()
+    assert set(fleet.due(every)) == set(every), "one that is new is asked at once"
+    for _look in range(3):
+        fleet.update([LockoutReport(name, at=clock.now) for name in names])
+        fleet.update([LockoutReport(name, problem="no answer") for name in silent])
+        clock.now += 1.0
+        due = fleet.due(every)
+        assert due[:2] == names
+        asked += due[2:]
+    assert sorted(asked) == silent, "three at a look, each of them once"
+
+
 def test_robots_that_do_not_answer_a_stop_take_their_turn_again_after_it(monkeypatch: pytest.MonkeyPatch) -> None:
     fleet, clock, names = calm_fleet(monkeypatch, 9)
     fleet.expected()

@@ -16,7 +16,10 @@ from strands_robots.safety.scope import EVERY_ROBOT, Scope
 LOOK_S = 1.0
 ASK_S = 1.0
 ASKED_MOST = 32
-"""Robots that are asked for their status at a look, if their beats say that they live: those asked longest ago."""
+"""Robots that are asked for their status at a look, if their beats say that they live: those asked longest ago.
+
+As many more are asked of those that have no fresh beat and did not answer the last question.
+"""
 
 BEAT_FRESH_S = 3.0
 """Age of a beat up to which its robot is not asked out of turn."""
@@ -97,21 +100,19 @@ class WatchedRobots:
     def due(self, names: Collection[str]) -> list[str]:
         """Return the robots to ask now.
 
-        All that are new, that have no fresh beat, or that were not asked since the last stop or the last change of a
-        lockout; of the others those asked longest ago.
+        All that are new, that were not asked since the last stop or the last change of a lockout, or that answer but
+        have no fresh beat; of the others those asked longest ago. Those that did not answer come last.
         """
-        now, reports = time.monotonic(), self._robots
-        asked = {name: self._asked.get(name, reports[name].at) for name in names if name in reports}
-        calm = [
-            name
-            for name in names
-            if name in reports
-            and asked[name] > self._all_since + GONE_S
-            and now - self._beats.get(name, float("-inf")) < BEAT_FRESH_S
-        ]
+        now, reports, never = time.monotonic(), self._robots, float("-inf")
+        asked = {name: self._asked.get(name, reports[name].at if name in reports else never) for name in names}
+        settled = {name for name in names if asked[name] > self._all_since + GONE_S}
+        calm = {name for name in settled if name in reports and now - self._beats.get(name, never) < BEAT_FRESH_S}
+        silent = (settled & self._unanswered) - calm
         # By the question and not by the answer: those that no longer answer would take the turns of all others.
-        in_turn = sorted(calm, key=lambda name: asked[name])[:ASKED_MOST]
-        chosen = sorted({*names} - {*calm} | {*in_turn})
+        in_turn = {
+            name for each in (calm, silent) for name in sorted(each, key=lambda one: (asked[one], one))[:ASKED_MOST]
+        }
+        chosen = sorted({*names} - calm - silent | in_turn, key=lambda name: (name in self._unanswered, name))
         self._asked = asked | dict.fromkeys(chosen, now)
         return chosen
 

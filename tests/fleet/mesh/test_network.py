@@ -81,6 +81,35 @@ def test_silent_peers_hold_up_a_list_for_a_bounded_time(monkeypatch: pytest.Monk
     assert len(given) < len(names) and max(given) <= 0.1
 
 
+def test_silent_peers_do_not_delay_the_question_for_the_lockouts_of_another_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    names, asked = [f"bar-{n}" for n in range(60)], threading.Event()
+
+    def send(peer: str, command: dict[str, Any], seconds: float) -> dict[str, Any]:
+        if peer == "lively":
+            asked.set()
+            return {"type": "response", "result": {"lockout": []}}
+        waited.append(asked.wait(10.0))
+        return {"status": "timeout"}
+
+    waited = list[bool]()
+    mesh = FakeMesh([row(name) for name in (*names, "lively")], timeout)
+    monkeypatch.setattr(mesh, "send", send)
+    reports = joined(mesh).lockouts([*names, "lively"], 1.0)
+    assert [each.name for each in reports if not each.problem] == ["lively"]
+    assert waited == [True] * len(names)
+
+
+def test_presence_of_a_peer_is_its_beat() -> None:
+    there = joined(FakeMesh([row("arm-1", age=2.0), row("arm-2", reachable=False)], timeout))
+    before = time.monotonic()
+    beats = there.beats(["arm-1", "arm-2", "arm-3"])
+    at = beats["arm-1"]
+    assert at is not None and before <= at + 2.0 <= time.monotonic()
+    assert (beats["arm-2"], beats["arm-3"]) == (None, None)
+
+
 def test_verbs_of_an_older_peer_are_those_of_its_kind() -> None:
     older = {"type": "error", "error": "validation: action must be one of status, stop."}
     mesh = FakeMesh([row("bar-1", own_verbs=["brewCoffee", 5])], lambda _: older)

@@ -18,7 +18,9 @@ from strands_robots.utils import shown
 if TYPE_CHECKING:
     from strands_robots.mesh import Mesh
 
-PARALLEL_REQUESTS = 8
+PARALLEL_REQUESTS = 64
+"""Peers that are asked at a time: so many silent ones keep no other one waiting."""
+
 RELAYED_S = 1.0
 """Seconds in which a resume reaches all robots from the first one, before each is asked by itself."""
 

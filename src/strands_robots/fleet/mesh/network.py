@@ -314,8 +314,10 @@ class MeshNetwork:
             yield MeshController(mesh, signing_key)
 
     def beats(self, robots: Iterable[str]) -> Mapping[str, float | None]:
-        """Return none, so that each peer is asked at each look."""
-        return dict.fromkeys(robots)
+        """Return the times of the presence of those in reach."""
+        rows, now = self._joined_mesh.peers_by_id, time.monotonic()
+        living = {name: now - row["age"] for name, row in rows.items() if row["reachable"]}
+        return {name: living.get(name) for name in robots}
 
     def lockable(self, timeout: float = FIND_S) -> list[str]:
         """Return the peers that have a robot, once those in reach are known."""
