@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -147,6 +148,76 @@ def test_robot_that_was_silent_is_described_anew_where_its_network_does_not_anno
         eventually(lambda: "brewCoffee" in [form["name"] for form in row.forms], what="its new verb")
     finally:
         page.feed.close()
+
+
+@pytest.fixture
+def mesh_page() -> Iterator[Page]:
+    network = ScriptedNetwork(MESH)
+    network.announces_verbs = False
+    opened = Page(network)
+    yield opened
+    opened.feed.close()
+
+
+def test_silent_robots_delay_neither_the_verbs_of_another_one_nor_the_search(
+    mesh_page: Page, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    there, released = mesh_page.there, threading.Event()
+    describe = there.describe
+
+    def blocked(robot: str, *, anew: bool = False) -> object:
+        if robot in there.mute:
+            released.wait(30.0)
+        return describe(robot)
+
+    monkeypatch.setattr(there, "describe", blocked)
+    silent = {f"a-silent-{number}": OURS for number in range(60)}
+    there.mute |= set(silent)
+    there.robots |= silent
+    try:
+        eventually(lambda: set(silent) <= set(there.asked), what="every silent robot was asked")
+        there.robots["z-lively"] = OURS
+        row = mesh_page.shown("z-lively")
+        eventually(lambda: len(row.forms) == 3, what="its verbs")
+    finally:
+        released.set()
+
+
+def test_new_silent_robots_keep_no_new_one_waiting(mesh_page: Page, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(feeds, "ASK_S", 60.0)
+    silent = {f"a-silent-{number}": OURS for number in range(24)}
+    mesh_page.there.mute |= set(silent)
+    mesh_page.there.robots |= silent | {"z-lively": OURS}
+    mesh_page.shown("z-lively")
+
+
+def test_robot_has_the_verbs_of_its_kind_until_it_answers(mesh_page: Page) -> None:
+    there = mesh_page.there
+    there.of_kind = (function("getStatus", "read"),)
+    there.mute.add("arm-2")
+    there.robots["arm-2"] = OURS
+    eventually(lambda: (row := mesh_page.row("arm-2")) is not None and row.forms, what="the verbs of its kind")
+    row = mesh_page.row("arm-2")
+    assert row is not None
+    assert [form["name"] for form in row.forms] == ["getStatus"]
+    there.mute.clear()
+    eventually(lambda: "moveTo" in [form["name"] for form in row.forms], what="its own verbs")
+
+
+def test_silent_robot_that_was_removed_is_asked_no_more(page: Page, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(feeds, "ASK_S", 0.1)
+    page.shown("arm-1")
+    page.there.mute.add("arm-2")
+    page.there.robots["arm-2"] = OURS
+    eventually(lambda: page.there.asked.count("arm-2") >= 2, what="a silent robot")
+    del page.there.robots["arm-2"]
+    assert page.model.forget(f"{page.feed.network}:arm-2", 0.0)
+
+    def looks_without_it() -> int:
+        return list(reversed(page.there.asked)).index("arm-2")
+
+    # Both are asked in turn.
+    eventually(lambda: looks_without_it() >= 8, what="looks at the other robot alone")
 
 
 def test_forgotten_robot_is_met_anew_with_its_verbs(page: Page) -> None:

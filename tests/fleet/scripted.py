@@ -87,6 +87,7 @@ class ScriptedNetwork:
         self.standing_for: list[Callable[[], Collection[str]]] = []
         self.asked: list[str] = []
         self.searches = 0
+        self.of_kind: object = ()
 
     def open(self) -> None:
         if self.unreachable:
@@ -128,6 +129,9 @@ class ScriptedNetwork:
 
     def enrolled_key(self, robot: str) -> bytes | None:
         return self.enrolled.get(robot)
+
+    def announced_functions(self, robot: str) -> object:
+        return self.robots[robot] if self.announces_verbs else self.of_kind
 
     def describe(self, robot: str, *, anew: bool = False) -> object:
         return self.robots[robot]

@@ -8,6 +8,7 @@ import logging
 import threading
 import time
 from collections.abc import Awaitable, Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from strands_robots.dashboard.fleet_model import FleetModel, key_of
@@ -44,8 +45,11 @@ SEARCH_AGAIN_S, SEARCH_SOON_S = 30.0, 1.0
 stranger sent an event."""
 
 LOOK_S = 0.2
-PARALLEL = 8
-"""Robots that are asked at a time; those that did not answer last time keep none of the others waiting."""
+PARALLEL, PARALLEL_NEW = 8, 32
+"""Robots that are asked at a time, and besides them of those that are asked for the first time.
+
+Those that did not answer last time keep none of the others waiting.
+"""
 
 STRANGERS_MAX = 8
 PARTS_MAX = 16
@@ -73,13 +77,20 @@ class FleetFeed:
         self._names: set[str] = set()
         self._passed: set[str] = set()
         self._strangers: set[str] = set()
-        self._silent: set[str] = set()
+        self._answered: dict[str, bool] = {}
+        self._described: set[str] = set()
         self._functions: dict[str, object] = {}
         self._asked: dict[str, float] = {}
         self._searched, self._found = float("-inf"), True
         self._tasks: dict[tuple[str, str], asyncio.Task[None]] = {}
-        self._limits = {each: asyncio.Semaphore(PARALLEL) for each in ("lively", "silent", "verbs")}
+        most = {True: PARALLEL, False: PARALLEL, None: PARALLEL_NEW}
+        self._limits = {answered: asyncio.Semaphore(number) for answered, number in most.items()}
+        # Both may block for seconds: a search waits for no robot.
+        self._searcher = ThreadPoolExecutor(1, "dashboard search")
+        self._describers = ThreadPoolExecutor(PARALLEL, "dashboard verbs")
         self._stack = contextlib.ExitStack()
+        for pool in (self._searcher, self._describers):
+            self._stack.callback(pool.shutdown, wait=False, cancel_futures=True)
         try:
             self.controller = self._stack.enter_context(
                 there.standing(signing_key, lambda: model.expected(self.network))
@@ -183,7 +194,7 @@ class FleetFeed:
     async def _search(self, _: str) -> None:
         self._strangers.clear()
         self._found = False
-        found = await asyncio.to_thread(self._there.find, SEARCH_S)
+        found = await asyncio.get_running_loop().run_in_executor(self._searcher, self._there.find, SEARCH_S)
         for each in found:
             # A world has one card, with all of its robots.
             if not each.world:
@@ -197,10 +208,11 @@ class FleetFeed:
         if row is None:
             return
         self._names.add(robot.id)
-        if self._there.announces_verbs:
-            self._describe(robot.id, self._there.describe(robot.id))
-        elif not row.forms:
-            self._begin("verbs", robot.id, self._ask_verbs)
+        if not row.forms:
+            self._described.discard(robot.id)
+        # A robot that was asked has said more than it announces.
+        if robot.id not in self._described:
+            self._describe(robot.id, self._there.announced_functions(robot.id))
 
     def _describe(self, name: str, functions: object) -> None:
         row = self._model.row(key_of(self.network, name))
@@ -211,22 +223,24 @@ class FleetFeed:
             self._model.update(self.network, name, forms=forms)
 
     async def _ask_verbs(self, name: str) -> None:
-        async with self._limits["verbs"]:
-            self._describe(name, await asyncio.to_thread(self._there.describe, name))
+        loop = asyncio.get_running_loop()
+        functions = await loop.run_in_executor(self._describers, self._there.describe, name)
+        self._described.add(name)
+        self._describe(name, functions)
 
     async def _ask(self, name: str) -> None:
-        was_silent = name in self._silent
-        async with self._limits["silent" if was_silent else "lively"]:
+        answered = self._answered.get(name)
+        async with self._limits[answered]:
             report = await self._there.lockout_async(name, ASK_S)
-        if not report.facts:
-            # A robot that does not answer is shown by the age of what it said last.
-            self._silent.add(name)
-            return
-        self._silent.discard(name)
-        self._model.sign_of_life(self.network, name, report.round_trip_ms)
         if self._model.row(key_of(self.network, name)) is None:
             self._forget(name)
             return
+        if not report.facts:
+            # A robot that does not answer is shown by the age of what it said last.
+            self._answered[name] = False
+            return
+        self._answered[name] = True
+        self._model.sign_of_life(self.network, name, report.round_trip_ms)
         self._model.report(self.network, report)
         if "task_status" in report.facts or "running_policies" in report.facts:
             self._model.task(self.network, name, **task_of(report.facts))
@@ -234,16 +248,18 @@ class FleetFeed:
         for part, joints in list(robots.items())[:PARTS_MAX] if isinstance(robots, Mapping) else ():
             if isinstance(joints, Mapping):
                 self._model.observe(self.network, name, joints, str(part))
-        if was_silent and not self._there.announces_verbs:
-            # It may be another program by now.
+        if not self._there.announces_verbs and not (answered and name in self._described):
+            # Only one that answers is asked. One that was silent may be another program by now.
             self._begin("verbs", name, self._ask_verbs)
 
     def _forget(self, name: str) -> None:
         """Forget a robot that an operator has removed; it is met anew when it is found."""
         self._names.discard(name)
-        for each in (self._functions, self._asked):
+        self._described.discard(name)
+        for each in (self._functions, self._asked, self._answered):
             each.pop(name, None)
-        self._tasks.pop(("verbs", name), None)
+        for what in ("verbs", "lockout"):
+            self._tasks.pop((what, name), None)
 
 
 class LoopThread:

@@ -117,6 +117,13 @@ def test_verbs_of_an_older_peer_are_those_of_its_kind() -> None:
     assert "moveTo" in verbs and verbs[-1] == "brewCoffee"
 
 
+def test_peer_announces_the_verbs_of_its_kind_and_is_not_asked_for_them() -> None:
+    mesh = FakeMesh([row("bar-1", "mobile_base", own_verbs=["brewCoffee"])], timeout)
+    verbs = [*RobotDescription.of(joined(mesh).announced_functions("bar-1")).verbs]
+    assert "drive" in verbs and verbs[-1] == "brewCoffee"
+    assert mesh.sent == []
+
+
 def test_peer_without_a_robot_is_listed_and_not_found() -> None:
     console = {"peer_id": "console", "type": "tool", "reachable": True, "age": 0.1}
     there = joined(FakeMesh([row("arm-1"), console], timeout))

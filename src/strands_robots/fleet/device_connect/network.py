@@ -134,6 +134,11 @@ class DeviceConnectNetwork:
             logger.warning("%s So none counts.", exc)
             return None
 
+    def announced_functions(self, robot: str) -> object:
+        """Return the functions that the device announced."""
+        peer = self._peers.get(robot)
+        return None if peer is None else peer.functions
+
     def describe(self, robot: str, *, anew: bool = False) -> object:
         """Return the functions that the device announced."""
         if anew:
@@ -146,8 +151,7 @@ class DeviceConnectNetwork:
                 if robot not in self._peers:
                     raise refusal from exc
                 logger.debug("%s: it does not describe itself anew: %s", robot, refusal)
-        peer = self._peers.get(robot)
-        return None if peer is None else peer.functions
+        return self.announced_functions(robot)
 
     def describe_each(self, robots: Iterable[str]) -> Mapping[str, object]:
         """Return the functions that the devices announced."""

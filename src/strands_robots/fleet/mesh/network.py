@@ -166,14 +166,16 @@ class MeshNetwork:
         """Return the peer's enrolled key."""
         return (enrolled_peers() or {}).get(robot)
 
+    def announced_functions(self, robot: str) -> object:
+        """Return the functions of the peer's kind."""
+        row = self._joined_mesh.get_peer(robot) or {}
+        return functions_of_kind(row, usual="world" if row.get("type") == "sim" else "robot")
+
     def describe(self, robot: str, *, anew: bool = False) -> object:
         """Return the robot's functions, of an older one those of its kind."""
         del anew  # the robot is always asked
-        row = self._joined_mesh.get_peer(robot) or {}
         functions = functions_of(self._joined_mesh, robot, DESCRIBE_S)
-        if functions is not None:
-            return functions
-        return functions_of_kind(row, usual="world" if row.get("type") == "sim" else "robot")
+        return self.announced_functions(robot) if functions is None else functions
 
     def describe_each(self, robots: Iterable[str]) -> Mapping[str, object]:
         """Ask many peers at once; of a silent one return the functions of its kind."""
