@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from strands_robots.utils import plain_text
+
 TASK_MAX = 2000
 """Characters of a text of a task."""
 
@@ -13,7 +15,7 @@ def task_of(facts: Mapping[str, Any]) -> dict[str, Any]:
     """Return what a robot does, of a world its first task.
 
     It has ``state``, ``instruction``, and as far as they are reported ``step``, ``policy`` and ``who``, which is the
-    robot of the world.
+    robot of the world. The texts are plain, and a step is an integer.
     """
     running = facts.get("running_policies")
     if isinstance(running, Mapping):
@@ -22,10 +24,20 @@ def task_of(facts: Mapping[str, Any]) -> dict[str, Any]:
             return {"state": "idle"}
         name, row = named
         policy, instruction = _text(row.get("policy")), _text(row.get("instruction"))
-        return {"state": "running", "instruction": instruction, "policy": policy, "step": row.get("step"), "who": name}
+        return {
+            "state": "running",
+            "instruction": instruction,
+            "policy": policy,
+            **_step(row.get("step")),
+            "who": _text(name),
+        }
     task = {"state": _text(facts.get("task_status")).lower() or "idle", "instruction": _text(facts.get("instruction"))}
-    return {**task, "step": facts["step_count"]} if "step_count" in facts else task
+    return task | _step(facts.get("step_count"))
 
 
 def _text(value: object) -> str:
-    return value[:TASK_MAX] if isinstance(value, str) else ""
+    return plain_text(value, TASK_MAX)
+
+
+def _step(value: object) -> dict[str, int]:
+    return {"step": value} if isinstance(value, int) and not isinstance(value, bool) else {}
