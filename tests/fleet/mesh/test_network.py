@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 import threading
 import time
@@ -168,6 +169,17 @@ def test_no_argument_refuses_a_stop(arguments: dict[str, Any]) -> None:
     with pytest.raises(ArgumentsError) as refused:
         there.call("arm-1", "moveTo", arguments, 1.0)
     assert not refused.value.envelope
+
+
+@pytest.mark.parametrize("arguments", [{"x": math.nan}, {"action": "start"}, {"x": object()}])
+def test_call_from_an_event_loop_is_refused_for_such_an_argument_and_a_stop_is_not(arguments: dict[str, Any]) -> None:
+    mesh = FakeMesh([row("arm-1")], done)
+    there = joined(mesh)
+    refused = asyncio.run(there.call_async("arm-1", "moveTo", arguments, 1.0))
+    assert refused["status"] == "error"
+    assert mesh.sent == []
+    asyncio.run(there.call_async("arm-1", "stop", arguments, 1.0))
+    assert [command for _, command, _ in mesh.sent] == [{"action": "stop"}]
 
 
 def test_stop_of_a_robot_that_was_not_found_is_sent_where_it_can_be_nowhere_else() -> None:

@@ -15,7 +15,7 @@ from itertools import count
 from typing import TYPE_CHECKING, Any, Self
 
 from strands_robots.envelope import Envelope, error
-from strands_robots.errors import ArgumentsError, NoAnswerError, NoSuchRobotError, UnreachableError
+from strands_robots.errors import ArgumentsError, NoAnswerError, NoSuchRobotError, RefusalError, UnreachableError
 from strands_robots.fleet.adapter import CLOSED, FIND_S, MESH, STOP_S, FoundRobot, OnEvent
 from strands_robots.fleet.lockout_report import LockoutReport, Resumed
 from strands_robots.fleet.mesh.controller import MeshController
@@ -199,11 +199,7 @@ class MeshNetwork:
 
     def call(self, robot: str, verb: str, arguments: Mapping[str, Any], timeout: float) -> Envelope:
         """Send the peer an action."""
-        if problem := _not_carried(arguments):
-            if verb != "stop":
-                raise ArgumentsError(problem, robot=robot, verb=verb)
-            # A stop is never refused for its arguments: without them it stops all that the robot has.
-            arguments = {}
+        arguments = _carried(robot, verb, arguments)
         mesh = self._joined_mesh
         try:
             there = self._waited_for(robot)
@@ -252,9 +248,10 @@ class MeshNetwork:
         """Send the peer an action, without the arguments that are empty."""
         given = {name: value for name, value in arguments.items() if value not in ("", None)}
         try:
+            carried = _carried(robot, verb, given)
             mesh = self._joined_mesh
-            return await self._requests.call(mesh, robot, {**given, "action": self._action(robot, verb)}, within)
-        except UnreachableError as exc:
+            return await self._requests.call(mesh, robot, {**carried, "action": self._action(robot, verb)}, within)
+        except RefusalError as exc:
             return error(exc.why)
 
     async def stop_async(self, robot: str, within: float = STOP_S) -> Envelope:
@@ -398,17 +395,21 @@ class MeshNetwork:
         return NoSuchRobotError(f"No peer {robot!r} is on the mesh", robot=robot, verb=verb, remedy=remedy)
 
 
-def _not_carried(arguments: Mapping[str, Any]) -> str:
-    """Return why the mesh cannot carry these arguments, or ""."""
-    if "action" in arguments:
-        return "the mesh cannot carry an argument called action"
+def _carried(robot: str, verb: str, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the arguments; raise :class:`ArgumentsError` where the mesh cannot carry them.
+
+    A stop is never refused for its arguments: without them it stops all that the robot has.
+    """
+    problem = "the mesh cannot carry an argument called action" if "action" in arguments else ""
     try:
         for name, value in arguments.items():
             finite(name, value)
         json.dumps(arguments, allow_nan=False)
     except (ValidationError, TypeError, ValueError, RecursionError) as exc:
-        return str(exc)
-    return ""
+        problem = problem or str(exc)
+    if problem and verb != "stop":
+        raise ArgumentsError(problem, robot=robot, verb=verb)
+    return {} if problem else arguments
 
 
 def _forget_peers() -> None:
