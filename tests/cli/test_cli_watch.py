@@ -2,10 +2,14 @@ from __future__ import annotations
 
 import io
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from rich.console import Console
+from tests.fleet.scripted import ScriptedNetwork
 
 from strands_robots.cli import watch
 from strands_robots.cli.output import CliError, Exit, Screen
@@ -22,8 +26,10 @@ from strands_robots.cli.watch import (
     print_changes,
 )
 from strands_robots.device_connect.client import DeviceEvent
+from strands_robots.envelope import success
 from strands_robots.fleet.adapter import RobotEvent
 from strands_robots.fleet.device_connect.events import robot_event
+from strands_robots.fleet.device_connect.network import DeviceConnectNetwork
 
 
 def drawn(thing: object) -> str:
@@ -61,6 +67,26 @@ def test_the_view_keeps_the_last_joints_and_task() -> None:
     text = drawn(view.draw())
     assert "+0.250" in text
     assert "wave" in text
+
+
+def test_watched_device_is_asked_and_followed_by_one_adapter(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    there, joined = ScriptedNetwork(), list[object]()
+    there.answers["getStatus"] = lambda _: success("", task_status="running", instruction="wave")
+
+    class Linked:
+        @contextmanager
+        def fleet(self) -> Iterator[Any]:
+            yield SimpleNamespace(beats_every=lambda _: 5.0)
+
+    monkeypatch.setattr(DeviceConnectNetwork, "joined", lambda fleet: joined.append(fleet) or there)
+    linked: Any = Linked()
+    watch.watch(Screen(), linked, "arm-1", 0.01)
+    assert capsys.readouterr().out.startswith("arm-1: running: 'wave', step 0.")
+    assert len(joined) == 1
+    assert [verb for _, verb, _, _ in there.calls] == ["getFeatures", "getState", "getStatus"]
+    assert there.subscribers == []
 
 
 def test_each_change_is_one_line_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:

@@ -22,8 +22,7 @@ from strands_robots.fleet.joint_features import Range, joint_limits
 from strands_robots.utils import number
 
 if TYPE_CHECKING:
-    from strands_robots.device_connect import FleetClient
-    from strands_robots.fleet.adapter import RobotEvent
+    from strands_robots.fleet.adapter import NetworkAdapter, RobotEvent
 
 REDRAW_S = 0.07
 """Seconds between two redraws."""
@@ -67,30 +66,28 @@ def watch(
     from strands_robots.fleet.device_connect.network import DeviceConnectNetwork  # noqa: PLC0415 - loaded when it is used
 
     with network.fleet() as fleet:
+        there = DeviceConnectNetwork.joined(fleet)
         limits: dict[str, Range] = {}
         try:
-            limits = joint_limits(call_robot(DeviceConnectNetwork.joined(fleet), device, "getFeatures", {}, 3.0))
+            limits = joint_limits(call_robot(there, device, "getFeatures", {}, 3.0))
         except CliError as failure:
             # A device without getFeatures is drawn without its limits.
             if isinstance(failure.__cause__, LookupError):
                 raise
-        from strands_robots.fleet.device_connect.network import DeviceConnectNetwork  # noqa: PLC0415 - loaded when it is used
-
-        there = DeviceConnectNetwork.joined(fleet)
         signs = SignsOfLife(lambda: there.beats([device])[device], lambda: fleet.beats_every(device))
         with contextlib.ExitStack() as stack:
             stack.callback(there.subscribe(device, signs.take))
             frames = follow(signs, longest, device)
             if screen.machine:
-                for function, answer in _present_answers(fleet, device):
+                for function, answer in _present_answers(there, device):
                     screen.data({"device": device, "event": function, "payload": answer})
                 for events, _ in frames:
                     for event in events:
                         screen.data({"device": event.robot, "event": event.name, "payload": dict(event.payload)})
             elif screen.live:
-                _draw_live(screen, _present_state(fleet, device, limits), frames)
+                _draw_live(screen, _present_state(there, device, limits), frames)
             else:
-                now = _present_state(fleet, device, limits)
+                now = _present_state(there, device, limits)
                 print_changes(screen, device, now.summary, (event for events, _ in frames for event in events))
 
 
@@ -288,21 +285,19 @@ def _finite(value: object) -> TypeGuard[int | float]:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def _present_state(fleet: FleetClient, device: str, limits: Mapping[str, Range]) -> DeviceView:
+def _present_state(there: NetworkAdapter, device: str, limits: Mapping[str, Range]) -> DeviceView:
     """Return a view of the device now; an idle robot may send no joints."""
     view = DeviceView(device, limits)
-    for _, answer in _present_answers(fleet, device):
+    for _, answer in _present_answers(there, device):
         view.take_state(answer)
     return view
 
 
-def _present_answers(fleet: FleetClient, device: str) -> Iterator[tuple[str, dict[str, Any]]]:
+def _present_answers(there: NetworkAdapter, device: str) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield its present state by function; an idle one sends none for 10 s."""
-    from strands_robots.fleet.device_connect.network import DeviceConnectNetwork  # noqa: PLC0415 - loaded when it is used
-
     for function in ("getState", "getStatus"):
         with contextlib.suppress(CliError):  # a device answers one of the two
-            yield function, call_robot(DeviceConnectNetwork.joined(fleet), device, function, {}, 3.0)
+            yield function, call_robot(there, device, function, {}, 3.0)
 
 
 def _draw_live(screen: Screen, view: DeviceView, frames: Iterator[Frame]) -> None:
