@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 from strands_robots.envelope import Envelope, error, success
@@ -246,6 +248,15 @@ class ScriptedNetwork:
             return LockoutReport(name, lockouts, facts=facts)
 
         return [report(name) for name in robots]
+
+    async def lockout_async(self, robot: str, within: float) -> LockoutReport:
+        """Report the lockouts and the answer to ``getStatus``; a mute robot none."""
+        self.asked.append(robot)
+        if robot in self.mute:
+            await asyncio.sleep(within)
+            return LockoutReport(robot, problem="it did not answer")
+        facts = await self.call_async(robot, "getStatus", {}, within)
+        return replace(self.lockouts([robot], within)[0], facts=facts, round_trip_ms=1.0)
 
     def resume(self, reports: Sequence[LockoutReport], signer: Any, timeout: float) -> dict[str, Resumed]:
         for each in reports:
