@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -14,8 +14,11 @@ from strands_robots.errors import UnreachableError
 from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
 from strands_robots.fleet.fleet import connect
 from strands_robots.fleet.link_flags import LinkFlags
+from strands_robots.fleet.mesh.network import MeshNetwork
 from strands_robots.fleet.mesh_settings import MeshSettings
-from strands_robots.fleet.profiles import profile_for, profile_names, profiles_folder, read_profile
+from strands_robots.fleet.profiles import mesh_at, profile_for, profile_names, profiles_folder, read_profile
+from strands_robots.mesh import Mesh, session
+from strands_robots.mesh.transport import MemoryTransport
 from strands_robots.utils import ValidationError
 
 Write = Callable[..., Path]
@@ -307,35 +310,84 @@ class TestMesh:
 
 
 class TestMeshOfOneProcess:
-    def test_settings_hold_while_a_fleet_is_joined(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    @pytest.fixture
+    def no_session(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setenv("STRANDS_MESH_PORT", "7001")
+        monkeypatch.setattr(session, "opened_with", lambda: None)
+
+    @pytest.fixture
+    def opened(self, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], None]]:
+        """Opens a session with the settings of the moment, as a robot of this process does."""
+        monkeypatch.setenv("STRANDS_MESH_PORT", "7001")
+        monkeypatch.setattr(session, "make_transport", MemoryTransport)
+        references = list[object]()
+        yield lambda: references.append(session.dial())
+        for _ in references:
+            session.release_session()
+
+    @pytest.mark.usefixtures("no_session")
+    def test_settings_hold_while_a_fleet_is_joined(self) -> None:
         one, two = (MeshSettings({"STRANDS_MESH_PORT": "7002"}) for _ in range(2))
-        one.take(alive=lambda: False)
-        two.take(alive=lambda: True)
+        one.take()
+        two.take()
         assert settings.raw("STRANDS_MESH_PORT") == "7002"
         one.give_back()
         assert settings.raw("STRANDS_MESH_PORT") == "7002"
         two.give_back()
         assert settings.raw("STRANDS_MESH_PORT") == "7001"
 
+    @pytest.mark.usefixtures("no_session")
     def test_fleet_of_another_profile_is_refused_meanwhile(self) -> None:
         one, other, none = MeshSettings({"STRANDS_MESH_PORT": "7002"}), MeshSettings({}), MeshSettings({})
-        one.take(alive=lambda: False)
+        one.take()
         with pytest.raises(UnreachableError, match="another connection profile"):
-            other.take(alive=lambda: True)
+            other.take()
         one.give_back()
-        other.take(alive=lambda: True)
-        none.take(alive=lambda: True)
+        other.take()
+        none.take()
         with pytest.raises(UnreachableError, match="another connection profile"):
-            one.take(alive=lambda: False)
+            one.take()
         other.give_back()
         none.give_back()
 
-    def test_session_of_a_robot_here_is_not_taken_for_the_profiles(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setenv("STRANDS_MESH_PORT", "7001")
-        with pytest.raises(UnreachableError, match="on a mesh already"):
-            MeshSettings({"STRANDS_MESH_PORT": "7002"}).take(alive=lambda: True)
+    def test_session_of_a_robot_here_is_not_taken_for_the_profiles(self, opened: Callable[[], None]) -> None:
+        opened()
+        with pytest.raises(UnreachableError, match="on a mesh already, with other settings than the profile's"):
+            MeshSettings({"STRANDS_MESH_PORT": "7002"}).take()
         assert settings.raw("STRANDS_MESH_PORT") == "7001"
-        same = MeshSettings({"STRANDS_MESH_PORT": "7001", "STRANDS_MESH_NAMESPACE": ""})
-        same.take(alive=lambda: True)
+        same = MeshSettings({"STRANDS_MESH_PORT": "7001", "STRANDS_MESH_NAMESPACE": "", **mesh_at()})
+        same.take()
         same.give_back()
+
+    def test_session_that_outlives_its_profile_is_not_taken_for_the_environments(
+        self, opened: Callable[[], None]
+    ) -> None:
+        lab, here = MeshSettings({"STRANDS_MESH_PORT": "7002"}), MeshNetwork("tool")
+        lab.take()
+        opened()
+        lab.give_back()
+        assert settings.raw("STRANDS_MESH_PORT") == "7001"
+        with pytest.raises(UnreachableError, match="on a mesh already, with other settings than the environment's"):
+            here.open()
+        lab.take()
+        lab.give_back()
+        session.release_session()
+        here.open()
+        here.close()
+
+    @pytest.mark.usefixtures("opened")
+    def test_settings_are_restored_where_the_mesh_is_not_left_in_good_order(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def close(mesh: Mesh) -> None:
+            left(mesh)
+            raise OSError("the link is gone")
+
+        left = Mesh.close
+        monkeypatch.setattr(Mesh, "close", close)
+        lab = MeshNetwork("tool", {"STRANDS_MESH_PORT": "7002"})
+        lab.open()
+        assert settings.raw("STRANDS_MESH_PORT") == "7002"
+        with pytest.raises(OSError, match="the link is gone"):
+            lab.close()
+        assert settings.raw("STRANDS_MESH_PORT") == "7001"

@@ -88,9 +88,7 @@ class MeshNetwork:
 
     def open(self) -> None:
         """Join; raise :class:`UnreachableError` where there is no mesh."""
-        from strands_robots.mesh import session  # noqa: PLC0415 - the network is loaded when it is used
-
-        if self._settings.take(alive=session.session_alive):
+        if self._settings.take():
             _forget_peers()
         self._key = mesh_network()
         try:
@@ -101,7 +99,7 @@ class MeshNetwork:
         self._joined, self._requests = time.monotonic(), PeerRequests()
 
     def _dialled(self) -> Mesh:
-        from strands_robots.mesh import session  # noqa: PLC0415 - as above
+        from strands_robots.mesh import session  # noqa: PLC0415 - the network is loaded when it is used
         from strands_robots.mesh.core import Mesh, Parts  # noqa: PLC0415 - as above
         from strands_robots.mesh.transport import TransportError  # noqa: PLC0415 - as above
         from strands_robots.mesh.wire_identity import IdentityError, visitor_id  # noqa: PLC0415 - as above
@@ -351,8 +349,11 @@ class MeshNetwork:
         if self._given:
             return
         mesh, self._mesh = self._mesh, None
-        if mesh is not None:
+        if mesh is None:
+            return
+        try:
             mesh.close()
+        finally:
             if self._settings.give_back():
                 _forget_peers()
 
