@@ -14,6 +14,7 @@ from tests.cli.conftest import Run
 from strands_robots import settings
 from strands_robots.cli.network import Network
 from strands_robots.cli.output import CliError, Exit
+from strands_robots.mesh.transport.zenoh_config import Posture
 
 Write = Callable[..., Path]
 
@@ -180,6 +181,15 @@ class TestMesh:
         Network(profile="lab", port=7602).use_mesh()
         assert settings.integer("STRANDS_MESH_PORT") == 7602
         assert settings.raw("STRANDS_MESH_CONNECT") == settings.NO_ENDPOINT
+
+    @pytest.mark.parametrize("name", ["STRANDS_MESH_CONNECT", "STRANDS_MESH_LISTEN", "ZENOH_CONNECT", "ZENOH_LISTEN"])
+    def test_given_port_is_the_mesh_whatever_endpoints_the_shell_names(
+        self, write: Write, monkeypatch: pytest.MonkeyPatch, name: str
+    ) -> None:
+        monkeypatch.setenv(name, "tcp/127.0.0.1:7601")
+        Network(port=7602).use_mesh()
+        posture = Posture.from_settings()
+        assert (posture.hub, posture.connect, posture.listen) == ("tcp/127.0.0.1:7602", (), ())
 
     def test_profile_without_the_table_is_refused(self, write: Write) -> None:
         write("port = 7633")

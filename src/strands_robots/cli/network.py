@@ -228,8 +228,7 @@ class Network:
                 raise CliError(f"--mesh: the connection profile {profile.label} has no mesh.", Exit.USAGE)
             put_settings(profile.mesh)
         if self.port is not None:
-            number = port("--port", self.port)
-            put_settings({"STRANDS_MESH_PORT": str(number)} if profile is None else mesh_at(number))
+            put_settings(mesh_at(port("--port", self.port)))
 
 
 def _mesh_beside(profile: FleetProfile) -> Mapping[str, str]:
