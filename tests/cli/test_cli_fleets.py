@@ -82,6 +82,26 @@ def test_consent_and_tenant_are_the_profiles(write: Write) -> None:
     assert network.link().connect == ("nats://192.0.2.1:4222",)
 
 
+@pytest.mark.parametrize("words", [("stop", "--all"), ("stop", "arm-1"), ("estop",), ("peers",)], ids=" ".join)
+@pytest.mark.parametrize(
+    ("flags", "why"),
+    [
+        (("--tenant", ""), "tenant must be"),
+        (("--nats", ""), "nats needs a server"),
+        (("--nats", " , "), "nats needs a server"),
+        (("--connect", ""), "connect needs an endpoint"),
+    ],
+    ids=repr,
+)
+@pytest.mark.parametrize("profile", [(), ("--fleet", "lab")], ids=["without", "profile"])
+def test_empty_tenant_or_network_is_wrong_usage(
+    run: Run, write: Write, words: tuple[str, ...], flags: tuple[str, ...], why: str, profile: tuple[str, ...]
+) -> None:
+    write('port = 7633\ntenant = "lab"')
+    result = run(*words, *profile, *flags)
+    assert (result.exit_code, why in result.output) == (Exit.USAGE, True), result.output
+
+
 @pytest.mark.parametrize(
     "words",
     [

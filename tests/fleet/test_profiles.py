@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from strands_robots import settings
+from strands_robots.device_connect.backends import LinkConfig
 from strands_robots.errors import UnreachableError
 from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
 from strands_robots.fleet.fleet import connect
@@ -117,6 +118,37 @@ class TestFile:
         assert read_profile("lab").network == {}
 
 
+class TestFilesThatItNames:
+    KEYS = ("tls_ca", "tls_cert", "tls_key", "credentials", "mesh.tls_ca", "mesh.tls_key", "mesh.acl_file")
+
+    @pytest.mark.parametrize("key", KEYS)
+    def test_one_that_others_can_write_is_refused(self, write: Write, tmp_path: Path, key: str) -> None:
+        named = tmp_path / "named"
+        named.touch()
+        write(f'{key} = "named"')
+        named.chmod(0o644)
+        read_profile("lab").check()
+        named.chmod(0o666)
+        with pytest.raises(ValidationError, match="named has mode 0666: others may write it; run chmod go-w"):
+            read_profile("lab").check()
+
+    @pytest.mark.skipif(os.getuid() != 0, reason="only root gives a file away")
+    def test_one_of_another_user_is_refused(self, write: Write, tmp_path: Path) -> None:
+        (tmp_path / "ca.pem").touch()
+        os.chown(tmp_path / "ca.pem", 12345, -1)
+        write('tls_ca = "ca.pem"')
+        with pytest.raises(ValidationError, match=r"ca\.pem belongs to uid 12345"):
+            read_profile("lab")
+
+    def test_link_to_one_that_others_can_write_is_refused(self, write: Write, tmp_path: Path) -> None:
+        (tmp_path / "real.pem").touch()
+        (tmp_path / "real.pem").chmod(0o622)
+        (tmp_path / "ca.pem").symlink_to(tmp_path / "real.pem")
+        write('tls_ca = "ca.pem"')
+        with pytest.raises(ValidationError, match=r"ca\.pem has mode 0622"):
+            read_profile("lab")
+
+
 class TestKeys:
     @pytest.mark.parametrize(
         ("content", "why"),
@@ -191,6 +223,37 @@ class TestGivenBesides:
         with pytest.raises(ValidationError, match="needs authentication"):
             connect("lab", connect="tcp/192.0.2.1:1")
 
+    def test_empty_tenant_is_refused_instead_of_the_default_one(self, write: Write) -> None:
+        write('tenant = "lab"')
+        for refused in (
+            lambda: connect("lab", tenant=""),
+            lambda: connect(tenant=""),
+            lambda: read_profile("lab").flags({"tenant": ""}),
+        ):
+            with pytest.raises(ValidationError, match="tenant must be 1 to 128 letters.*not ''"):
+                refused()
+
+    @pytest.mark.parametrize("value", ["", " , ", ["nats://a:1", ""]], ids=repr)
+    def test_empty_server_is_refused_instead_of_another_network(self, write: Write, value: str | list[str]) -> None:
+        write("port = 7500")
+        with pytest.raises(ValidationError, match="nats needs a server"):
+            connect("lab", nats=value)
+        with pytest.raises(ValidationError, match="connect needs an endpoint"):
+            connect("lab", connect=value)
+        with pytest.raises(ValidationError, match="listen needs an endpoint"):
+            connect(listen=value)
+
+    def test_no_server_at_all_leaves_the_files(self, write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
+        links: list[LinkConfig] = []
+        monkeypatch.setattr(
+            "strands_robots.fleet.device_connect.network.DeviceConnectNetwork.__init__",
+            lambda self, link, source: links.append(link),
+        )
+        write('nats = "nats://127.0.0.1:4333"')
+        for empty in ((), [], iter(())):
+            connect("lab", nats=empty, connect=empty, listen=empty)  # type: ignore[arg-type]
+        assert [each.connect for each in links] == [("nats://127.0.0.1:4333",)] * 3
+
     def test_default_profile_is_left_out_beside_another_network(
         self, write: Write, monkeypatch: pytest.MonkeyPatch
     ) -> None:
@@ -229,6 +292,8 @@ class TestEnvironment:
             "ZENOH_LISTEN": "tcp/0.0.0.0:7447",
             "ZENOH_CONNECT": "tcp/192.0.2.9:7447",
             "TENANT": "other",
+            "STRANDS_DC_PORT": "7555",
+            "STRANDS_MESH_PORT": "7556",
         }
         for name, value in other.items():
             monkeypatch.setenv(name, value)
@@ -237,6 +302,10 @@ class TestEnvironment:
         write('name = "bench"')
         link = read_profile("lab").flags({}).link()
         assert (link.loopback_only, link.meet_port, link.tenant, link.ca) == (True, 7447, "default", "")
+
+    def test_mesh_without_a_port_has_the_usual_one(self, write: Write) -> None:
+        write("[mesh]")
+        assert (read_profile("lab").mesh or {})["STRANDS_MESH_PORT"] == "7447"
 
     def test_credentials_alone_name_the_network(self, write: Write, tmp_path: Path) -> None:
         (tmp_path / "lab.json").write_text('{"tenant": "lab", "nats": {"urls": ["nats://127.0.0.1:4333"]}}')
@@ -355,7 +424,7 @@ class TestMeshOfOneProcess:
         with pytest.raises(UnreachableError, match="on a mesh already, with other settings than the profile's"):
             MeshSettings({"STRANDS_MESH_PORT": "7002"}).take()
         assert settings.raw("STRANDS_MESH_PORT") == "7001"
-        same = MeshSettings({"STRANDS_MESH_PORT": "7001", "STRANDS_MESH_NAMESPACE": "", **mesh_at()})
+        same = MeshSettings({"STRANDS_MESH_NAMESPACE": "", **mesh_at(7001)})
         same.take()
         same.give_back()
 
