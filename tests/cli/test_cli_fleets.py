@@ -184,9 +184,20 @@ def test_caller_is_the_profiles_unless_another_is_given(
 
     monkeypatch.setattr("strands_robots.device_connect.FleetClient", client)
     write('name = "bench"')
-    for words in (("call", "arm-1", "getStatus"), ("peers",), ("call", "arm-1", "getStatus", "--as", "ada")):
+    call = ("call", "arm-1", "getStatus")
+    for words in (call, ("peers",), (*call, "--as", "ada"), (*call, "--as", "strands-robots")):
         run(*words, "--fleet", "lab")
-    assert named == ["bench", "bench", "ada"]
+    run(*call)
+    assert named == ["bench", "bench", "ada", "strands-robots", "strands-robots"]
+
+
+def test_stop_has_the_source_that_is_given(run: Run, write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
+    named: list[str] = []
+    monkeypatch.setattr("strands_robots.cli.stop.device_id", lambda _, source: named.append(source))
+    write('port = 7633\nname = "bench"')
+    for words in ((), ("--as", "strands-robots")):
+        run("estop", *words, "--fleet", "lab", "--deadline", "0.1")
+    assert named == ["bench", "strands-robots"]
 
 
 class TestMesh:

@@ -230,7 +230,7 @@ class TestGivenBesides:
             lambda: connect(tenant=""),
             lambda: read_profile("lab").flags({"tenant": ""}),
         ):
-            with pytest.raises(ValidationError, match="tenant must be 1 to 128 letters.*not ''"):
+            with pytest.raises(ValidationError, match=r"tenant must be 1 to 128 letters.*not ''"):
                 refused()
 
     @pytest.mark.parametrize("value", ["", " , ", ["nats://a:1", ""]], ids=repr)

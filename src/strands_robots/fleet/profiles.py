@@ -37,7 +37,7 @@ class FleetProfile:
     Attributes:
         label: the name or the path by which it was asked for.
         file: where it stands.
-        network: the fields of :class:`LinkFlags` that it states. No variable that names a network or a port counts besides.
+        network: the fields of :class:`LinkFlags` that it states; no variable of another one counts besides.
         stated_name: the caller's name, None for none; or why it cannot be used.
         stated_mesh: the mesh's settings by variable, None where the mesh is left out; or why they cannot be used.
     """
