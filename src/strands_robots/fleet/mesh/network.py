@@ -88,8 +88,7 @@ class MeshNetwork:
 
     def open(self) -> None:
         """Join; raise :class:`UnreachableError` where there is no mesh."""
-        if self._settings.take():
-            _forget_peers()
+        self._settings.take()
         self._key = mesh_network()
         try:
             self._mesh = self._dialled()
@@ -354,8 +353,7 @@ class MeshNetwork:
         try:
             mesh.close()
         finally:
-            if self._settings.give_back():
-                _forget_peers()
+            self._settings.give_back()
 
     @property
     def _joined_mesh(self) -> Mesh:
@@ -406,14 +404,6 @@ def _not_carried(arguments: Mapping[str, Any]) -> str:
     except (ValidationError, TypeError, ValueError, RecursionError) as exc:
         return str(exc)
     return ""
-
-
-def _forget_peers() -> None:
-    """Forget the peers of the mesh that this process was on."""
-    from strands_robots.mesh import session  # noqa: PLC0415 - loaded when it is used
-
-    if not session.session_alive():
-        session.clear_peers()
 
 
 def _has_robot(row: Mapping[str, Any]) -> bool:
