@@ -256,6 +256,7 @@ class TestFleets:
             "tenant": "lab",
             "caller": "bench",
             "mesh": True,
+            "mesh_network": "Meets at 127.0.0.1:7447.",
             "file": str(tmp_path / "lab.toml"),
             "problem": "",
         }
@@ -264,6 +265,29 @@ class TestFleets:
         write("port = 7633")
         monkeypatch.setenv("STRANDS_FLEET", "lab")
         assert "lab (default)" in run("fleets").output
+
+    def test_fleet_on_the_mesh_alone_has_no_network_of_device_connect(self, run: Run, write: Write) -> None:
+        write('[mesh]\nconnect = ["tcp/127.0.0.1:7601", "tcp/127.0.0.1:7602"]\nmulticast = true')
+        (lab,) = json.loads(run("fleets", "--json").output)["fleets"]
+        assert (lab["network"], lab["tenant"], lab["mesh"], lab["problem"]) == (None, None, True, "")
+        assert lab["mesh_network"] == "Connects to tcp/127.0.0.1:7601, tcp/127.0.0.1:7602; finds peers by multicast."
+        write("port = 7633")
+        (lab,) = json.loads(run("fleets", "--json").output)["fleets"]
+        assert (lab["mesh"], lab["mesh_network"]) == (False, None)
+
+    @pytest.mark.parametrize("others", [(), ("near",)], ids=["none", "another"])
+    def test_default_that_is_not_there_is_said(
+        self, run: Run, write: Write, monkeypatch: pytest.MonkeyPatch, others: tuple[str, ...]
+    ) -> None:
+        for name in others:
+            write("port = 7633", name)
+        monkeypatch.setenv("STRANDS_FLEET", "nearr")
+        result = run("fleets")
+        assert "no connection profile 'nearr'" in " ".join(result.output.split())
+        assert result.exit_code == 0
+        assert "no connection profile 'nearr'" in json.loads(run("fleets", "--json").output)["default_problem"]
+        write("port = 7634", "nearr")
+        assert "no connection profile" not in " ".join(run("fleets").output.split())
 
     def test_folder_without_one_is_named(self, run: Run, write: Write, tmp_path: Path) -> None:
         result = run("fleets")
