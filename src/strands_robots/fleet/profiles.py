@@ -262,7 +262,7 @@ def _urls(name: str, value: object, _file: Path) -> tuple[str, ...]:
 
 
 def _path(name: str, value: object, file: Path) -> Path:
-    """Return a file that a profile names; who can write it decides as much as who can write the profile."""
+    """Return a file that a profile names, refused where others can write it."""
     named = file.parent / _expanded(Path(text(name, value, longest=1000)))
     try:
         status = named.stat()

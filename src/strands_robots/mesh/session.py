@@ -172,7 +172,7 @@ def session_alive() -> bool:
 
 
 def opened_with() -> Mapping[str, str] | None:
-    """Return what :func:`stated_mesh` was when the session was opened; None without one."""
+    """Return :func:`stated_mesh` of the open session; None without a session."""
     with _shared.lock:
         return None if _shared.transport is None else _shared.opened_with
 
