@@ -200,9 +200,9 @@ class Network:
         return profile is not None and not profile.reaches_devices(self._given)
 
     def beside(self) -> list[NetworkAdapter]:
-        """Return the networks of the connection profile besides Device Connect, which a stop of all has to reach.
+        """Return the connection profile's networks besides Device Connect.
 
-        A mesh that cannot be used is left out, as :meth:`link` says in the log.
+        A stop of all has to reach them. A mesh that cannot be used is left out, as :meth:`link` says in the log.
         """
         from strands_robots.fleet.mesh.network import MeshNetwork  # noqa: PLC0415 - loaded when it is used
 
