@@ -262,8 +262,10 @@ def _label(name: object) -> str:
 def _join_mesh(robot: Any, peer_id: str | None, peer_type: str, stated: Mapping[str, Any] | None = None) -> Any:
     from strands_robots.mesh import init_mesh  # noqa: PLC0415 - the mesh is loaded when it is used
 
-    facts = {name: (stated or {}).get(name, getattr(robot, name, None)) for name in ("cell", "tags")}
-    mesh = init_mesh(robot, peer_id=peer_id, peer_type=peer_type, **facts)
+    given = stated or {}
+    cell = given.get("cell", getattr(robot, "cell", None))
+    # What a foreign robot calls tags need be none: the mesh reads the robot's own as Device Connect does.
+    mesh = init_mesh(robot, peer_id=peer_id, peer_type=peer_type, cell=cell, tags=given.get("tags"))
     if mesh is not None and hasattr(robot, "input_sink"):
         from strands_robots.mesh.input import MeshInputSink  # noqa: PLC0415 - as above
 

@@ -207,7 +207,12 @@ _declare(
     Setting("STRANDS_STATE_DIR", "path", "", "Directory for grants, lockouts and keys. Unset: ~/.strands_robots."),
     Setting("STRANDS_TAGS", "list", "", "Tags of the robots of this process, by which callers choose robots."),
     # The calling side.
-    Setting("STRANDS_FLEET", "text", "", "Connection profile where no network is stated: a name or a .toml file."),
+    Setting(
+        "STRANDS_FLEET",
+        "text",
+        "",
+        "Connection profile (name or .toml file) of commands with --fleet, connect() and robot_mesh alone.",
+    ),
     Setting(
         "STRANDS_FLEETS_DIR",
         "path",

@@ -14,6 +14,7 @@ from tests.cli.conftest import Run
 from strands_robots import settings
 from strands_robots.cli.network import Network
 from strands_robots.cli.output import CliError, Exit
+from strands_robots.mesh.transport.zenoh_config import Posture
 
 Write = Callable[..., Path]
 
@@ -79,6 +80,26 @@ def test_consent_and_tenant_are_the_profiles(write: Write) -> None:
     assert network.opted_in
     assert network.stated_tenant == "lab"
     assert network.link().connect == ("nats://192.0.2.1:4222",)
+
+
+@pytest.mark.parametrize("words", [("stop", "--all"), ("stop", "arm-1"), ("estop",), ("peers",)], ids=" ".join)
+@pytest.mark.parametrize(
+    ("flags", "why"),
+    [
+        (("--tenant", ""), "tenant must be"),
+        (("--nats", ""), "nats needs a server"),
+        (("--nats", " , "), "nats needs a server"),
+        (("--connect", ""), "connect needs an endpoint"),
+    ],
+    ids=repr,
+)
+@pytest.mark.parametrize("profile", [(), ("--fleet", "lab")], ids=["without", "profile"])
+def test_empty_tenant_or_network_is_wrong_usage(
+    run: Run, write: Write, words: tuple[str, ...], flags: tuple[str, ...], why: str, profile: tuple[str, ...]
+) -> None:
+    write('port = 7633\ntenant = "lab"')
+    result = run(*words, *profile, *flags)
+    assert (result.exit_code, why in result.output) == (Exit.USAGE, True), result.output
 
 
 @pytest.mark.parametrize(
@@ -163,9 +184,20 @@ def test_caller_is_the_profiles_unless_another_is_given(
 
     monkeypatch.setattr("strands_robots.device_connect.FleetClient", client)
     write('name = "bench"')
-    for words in (("call", "arm-1", "getStatus"), ("peers",), ("call", "arm-1", "getStatus", "--as", "ada")):
+    call = ("call", "arm-1", "getStatus")
+    for words in (call, ("peers",), (*call, "--as", "ada"), (*call, "--as", "strands-robots")):
         run(*words, "--fleet", "lab")
-    assert named == ["bench", "bench", "ada"]
+    run(*call)
+    assert named == ["bench", "bench", "ada", "strands-robots", "strands-robots"]
+
+
+def test_stop_has_the_source_that_is_given(run: Run, write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
+    named: list[str] = []
+    monkeypatch.setattr("strands_robots.cli.stop.device_id", lambda _, source: named.append(source))
+    write('port = 7633\nname = "bench"')
+    for words in ((), ("--as", "strands-robots")):
+        run("estop", *words, "--fleet", "lab", "--deadline", "0.1")
+    assert named == ["bench", "strands-robots"]
 
 
 class TestMesh:
@@ -180,6 +212,15 @@ class TestMesh:
         Network(profile="lab", port=7602).use_mesh()
         assert settings.integer("STRANDS_MESH_PORT") == 7602
         assert settings.raw("STRANDS_MESH_CONNECT") == settings.NO_ENDPOINT
+
+    @pytest.mark.parametrize("name", ["STRANDS_MESH_CONNECT", "STRANDS_MESH_LISTEN", "ZENOH_CONNECT", "ZENOH_LISTEN"])
+    def test_given_port_is_the_mesh_whatever_endpoints_the_shell_names(
+        self, write: Write, monkeypatch: pytest.MonkeyPatch, name: str
+    ) -> None:
+        monkeypatch.setenv(name, "tcp/127.0.0.1:7601")
+        Network(port=7602).use_mesh()
+        posture = Posture.from_settings()
+        assert (posture.hub, posture.connect, posture.listen) == ("tcp/127.0.0.1:7602", (), ())
 
     def test_profile_without_the_table_is_refused(self, write: Write) -> None:
         write("port = 7633")
@@ -215,6 +256,7 @@ class TestFleets:
             "tenant": "lab",
             "caller": "bench",
             "mesh": True,
+            "mesh_network": "Meets at 127.0.0.1:7447.",
             "file": str(tmp_path / "lab.toml"),
             "problem": "",
         }
@@ -223,6 +265,29 @@ class TestFleets:
         write("port = 7633")
         monkeypatch.setenv("STRANDS_FLEET", "lab")
         assert "lab (default)" in run("fleets").output
+
+    def test_fleet_on_the_mesh_alone_has_no_network_of_device_connect(self, run: Run, write: Write) -> None:
+        write('[mesh]\nconnect = ["tcp/127.0.0.1:7601", "tcp/127.0.0.1:7602"]\nmulticast = true')
+        (lab,) = json.loads(run("fleets", "--json").output)["fleets"]
+        assert (lab["network"], lab["tenant"], lab["mesh"], lab["problem"]) == (None, None, True, "")
+        assert lab["mesh_network"] == "Connects to tcp/127.0.0.1:7601, tcp/127.0.0.1:7602; finds peers by multicast."
+        write("port = 7633")
+        (lab,) = json.loads(run("fleets", "--json").output)["fleets"]
+        assert (lab["mesh"], lab["mesh_network"]) == (False, None)
+
+    @pytest.mark.parametrize("others", [(), ("near",)], ids=["none", "another"])
+    def test_default_that_is_not_there_is_said(
+        self, run: Run, write: Write, monkeypatch: pytest.MonkeyPatch, others: tuple[str, ...]
+    ) -> None:
+        for name in others:
+            write("port = 7633", name)
+        monkeypatch.setenv("STRANDS_FLEET", "nearr")
+        result = run("fleets")
+        assert "no connection profile 'nearr'" in " ".join(result.output.split())
+        assert result.exit_code == 0
+        assert "no connection profile 'nearr'" in json.loads(run("fleets", "--json").output)["default_problem"]
+        write("port = 7634", "nearr")
+        assert "no connection profile" not in " ".join(run("fleets").output.split())
 
     def test_folder_without_one_is_named(self, run: Run, write: Write, tmp_path: Path) -> None:
         result = run("fleets")

@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 from strands_robots import settings
+from strands_robots.device_connect.backends import LinkConfig
 from strands_robots.errors import UnreachableError
 from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
 from strands_robots.fleet.fleet import connect
 from strands_robots.fleet.link_flags import LinkFlags
+from strands_robots.fleet.mesh.network import MeshNetwork
 from strands_robots.fleet.mesh_settings import MeshSettings
-from strands_robots.fleet.profiles import profile_for, profile_names, profiles_folder, read_profile
+from strands_robots.fleet.profiles import mesh_at, profile_for, profile_names, profiles_folder, read_profile
+from strands_robots.mesh import Mesh, session
+from strands_robots.mesh.transport import MemoryTransport
 from strands_robots.utils import ValidationError
 
 Write = Callable[..., Path]
@@ -114,6 +118,37 @@ class TestFile:
         assert read_profile("lab").network == {}
 
 
+class TestFilesThatItNames:
+    KEYS = ("tls_ca", "tls_cert", "tls_key", "credentials", "mesh.tls_ca", "mesh.tls_key", "mesh.acl_file")
+
+    @pytest.mark.parametrize("key", KEYS)
+    def test_one_that_others_can_write_is_refused(self, write: Write, tmp_path: Path, key: str) -> None:
+        named = tmp_path / "named"
+        named.touch()
+        write(f'{key} = "named"')
+        named.chmod(0o644)
+        read_profile("lab").check()
+        named.chmod(0o666)
+        with pytest.raises(ValidationError, match="named has mode 0666: others may write it; run chmod go-w"):
+            read_profile("lab").check()
+
+    @pytest.mark.skipif(os.getuid() != 0, reason="only root gives a file away")
+    def test_one_of_another_user_is_refused(self, write: Write, tmp_path: Path) -> None:
+        (tmp_path / "ca.pem").touch()
+        os.chown(tmp_path / "ca.pem", 12345, -1)
+        write('tls_ca = "ca.pem"')
+        with pytest.raises(ValidationError, match=r"ca\.pem belongs to uid 12345"):
+            read_profile("lab")
+
+    def test_link_to_one_that_others_can_write_is_refused(self, write: Write, tmp_path: Path) -> None:
+        (tmp_path / "real.pem").touch()
+        (tmp_path / "real.pem").chmod(0o622)
+        (tmp_path / "ca.pem").symlink_to(tmp_path / "real.pem")
+        write('tls_ca = "ca.pem"')
+        with pytest.raises(ValidationError, match=r"ca\.pem has mode 0622"):
+            read_profile("lab")
+
+
 class TestKeys:
     @pytest.mark.parametrize(
         ("content", "why"),
@@ -188,6 +223,37 @@ class TestGivenBesides:
         with pytest.raises(ValidationError, match="needs authentication"):
             connect("lab", connect="tcp/192.0.2.1:1")
 
+    def test_empty_tenant_is_refused_instead_of_the_default_one(self, write: Write) -> None:
+        write('tenant = "lab"')
+        for refused in (
+            lambda: connect("lab", tenant=""),
+            lambda: connect(tenant=""),
+            lambda: read_profile("lab").flags({"tenant": ""}),
+        ):
+            with pytest.raises(ValidationError, match=r"tenant must be 1 to 128 letters.*not ''"):
+                refused()
+
+    @pytest.mark.parametrize("value", ["", " , ", ["nats://a:1", ""]], ids=repr)
+    def test_empty_server_is_refused_instead_of_another_network(self, write: Write, value: str | list[str]) -> None:
+        write("port = 7500")
+        with pytest.raises(ValidationError, match="nats needs a server"):
+            connect("lab", nats=value)
+        with pytest.raises(ValidationError, match="connect needs an endpoint"):
+            connect("lab", connect=value)
+        with pytest.raises(ValidationError, match="listen needs an endpoint"):
+            connect(listen=value)
+
+    def test_no_server_at_all_leaves_the_files(self, write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
+        links: list[LinkConfig] = []
+        monkeypatch.setattr(
+            "strands_robots.fleet.device_connect.network.DeviceConnectNetwork.__init__",
+            lambda self, link, source: links.append(link),
+        )
+        write('nats = "nats://127.0.0.1:4333"')
+        for empty in ((), [], iter(())):
+            connect("lab", nats=empty, connect=empty, listen=empty)  # type: ignore[arg-type]
+        assert [each.connect for each in links] == [("nats://127.0.0.1:4333",)] * 3
+
     def test_default_profile_is_left_out_beside_another_network(
         self, write: Write, monkeypatch: pytest.MonkeyPatch
     ) -> None:
@@ -226,6 +292,8 @@ class TestEnvironment:
             "ZENOH_LISTEN": "tcp/0.0.0.0:7447",
             "ZENOH_CONNECT": "tcp/192.0.2.9:7447",
             "TENANT": "other",
+            "STRANDS_DC_PORT": "7555",
+            "STRANDS_MESH_PORT": "7556",
         }
         for name, value in other.items():
             monkeypatch.setenv(name, value)
@@ -234,6 +302,10 @@ class TestEnvironment:
         write('name = "bench"')
         link = read_profile("lab").flags({}).link()
         assert (link.loopback_only, link.meet_port, link.tenant, link.ca) == (True, 7447, "default", "")
+
+    def test_mesh_without_a_port_has_the_usual_one(self, write: Write) -> None:
+        write("[mesh]")
+        assert (read_profile("lab").mesh or {})["STRANDS_MESH_PORT"] == "7447"
 
     def test_credentials_alone_name_the_network(self, write: Write, tmp_path: Path) -> None:
         (tmp_path / "lab.json").write_text('{"tenant": "lab", "nats": {"urls": ["nats://127.0.0.1:4333"]}}')
@@ -307,35 +379,84 @@ class TestMesh:
 
 
 class TestMeshOfOneProcess:
-    def test_settings_hold_while_a_fleet_is_joined(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    @pytest.fixture
+    def no_session(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setenv("STRANDS_MESH_PORT", "7001")
+        monkeypatch.setattr(session, "opened_with", lambda: None)
+
+    @pytest.fixture
+    def opened(self, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], None]]:
+        """Opens a session with the settings of the moment, as a robot of this process does."""
+        monkeypatch.setenv("STRANDS_MESH_PORT", "7001")
+        monkeypatch.setattr(session, "make_transport", MemoryTransport)
+        references = list[object]()
+        yield lambda: references.append(session.dial())
+        for _ in references:
+            session.release_session()
+
+    @pytest.mark.usefixtures("no_session")
+    def test_settings_hold_while_a_fleet_is_joined(self) -> None:
         one, two = (MeshSettings({"STRANDS_MESH_PORT": "7002"}) for _ in range(2))
-        one.take(alive=lambda: False)
-        two.take(alive=lambda: True)
+        one.take()
+        two.take()
         assert settings.raw("STRANDS_MESH_PORT") == "7002"
         one.give_back()
         assert settings.raw("STRANDS_MESH_PORT") == "7002"
         two.give_back()
         assert settings.raw("STRANDS_MESH_PORT") == "7001"
 
+    @pytest.mark.usefixtures("no_session")
     def test_fleet_of_another_profile_is_refused_meanwhile(self) -> None:
         one, other, none = MeshSettings({"STRANDS_MESH_PORT": "7002"}), MeshSettings({}), MeshSettings({})
-        one.take(alive=lambda: False)
+        one.take()
         with pytest.raises(UnreachableError, match="another connection profile"):
-            other.take(alive=lambda: True)
+            other.take()
         one.give_back()
-        other.take(alive=lambda: True)
-        none.take(alive=lambda: True)
+        other.take()
+        none.take()
         with pytest.raises(UnreachableError, match="another connection profile"):
-            one.take(alive=lambda: False)
+            one.take()
         other.give_back()
         none.give_back()
 
-    def test_session_of_a_robot_here_is_not_taken_for_the_profiles(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setenv("STRANDS_MESH_PORT", "7001")
-        with pytest.raises(UnreachableError, match="on a mesh already"):
-            MeshSettings({"STRANDS_MESH_PORT": "7002"}).take(alive=lambda: True)
+    def test_session_of_a_robot_here_is_not_taken_for_the_profiles(self, opened: Callable[[], None]) -> None:
+        opened()
+        with pytest.raises(UnreachableError, match="on a mesh already, with other settings than the profile's"):
+            MeshSettings({"STRANDS_MESH_PORT": "7002"}).take()
         assert settings.raw("STRANDS_MESH_PORT") == "7001"
-        same = MeshSettings({"STRANDS_MESH_PORT": "7001", "STRANDS_MESH_NAMESPACE": ""})
-        same.take(alive=lambda: True)
+        same = MeshSettings({"STRANDS_MESH_NAMESPACE": "", **mesh_at(7001)})
+        same.take()
         same.give_back()
+
+    def test_session_that_outlives_its_profile_is_not_taken_for_the_environments(
+        self, opened: Callable[[], None]
+    ) -> None:
+        lab, here = MeshSettings({"STRANDS_MESH_PORT": "7002"}), MeshNetwork("tool")
+        lab.take()
+        opened()
+        lab.give_back()
+        assert settings.raw("STRANDS_MESH_PORT") == "7001"
+        with pytest.raises(UnreachableError, match="on a mesh already, with other settings than the environment's"):
+            here.open()
+        lab.take()
+        lab.give_back()
+        session.release_session()
+        here.open()
+        here.close()
+
+    @pytest.mark.usefixtures("opened")
+    def test_settings_are_restored_where_the_mesh_is_not_left_in_good_order(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def close(mesh: Mesh) -> None:
+            left(mesh)
+            raise OSError("the link is gone")
+
+        left = Mesh.close
+        monkeypatch.setattr(Mesh, "close", close)
+        lab = MeshNetwork("tool", {"STRANDS_MESH_PORT": "7002"})
+        lab.open()
+        assert settings.raw("STRANDS_MESH_PORT") == "7002"
+        with pytest.raises(OSError, match="the link is gone"):
+            lab.close()
+        assert settings.raw("STRANDS_MESH_PORT") == "7001"

@@ -11,11 +11,13 @@ import threading
 
 import pytest
 from fixtures.devices import RecordingDevice
+from fixtures.toy_robots import ToyRobot
 from fixtures.waiting import eventually, free_port
 
 from strands_robots import HardwareRobot
 from strands_robots.device_connect import loopback_config
 from strands_robots.device_connect.client import open_client
+from strands_robots.mesh import Mesh
 from strands_robots.robot import run
 from strands_robots.safety.stopping import StopVerdict
 
@@ -72,6 +74,20 @@ def test_run_serves_until_the_event_and_halts_the_robot(patient_halts: None) -> 
     assert verdicts[0].stopped is True
     assert verdicts[0].halted == ("task",)
     robot.cleanup()
+
+
+def test_robot_whose_tags_are_none_of_ours_is_served_on_both_networks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STRANDS_MESH_BACKEND", "memory")
+    joined, until, toy = list[Mesh](), threading.Event(), ToyRobot("toy")
+    start = Mesh.start
+    monkeypatch.setattr(Mesh, "start", lambda mesh: (joined.append(mesh), start(mesh)))
+    toy.tags = {"serial": 12}  # type: ignore[attr-defined]
+    until.set()
+    try:
+        run(toy, peer_id="tagged", until=until, mesh=True, link=loopback_config(free_port()))
+    finally:
+        toy.close()
+    assert [mesh.peer_id for mesh in joined] == ["tagged"]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -5,6 +5,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,8 +14,11 @@ from fixtures.barista import Barista
 from fixtures.mesh_robots import Arm, World
 from fixtures.waiting import eventually
 
+from strands_robots import settings
+from strands_robots.device_connect.backends import LinkConfig
 from strands_robots.device_connect.discovery import Peer
 from strands_robots.envelope import Envelope, success
+from strands_robots.errors import UnreachableError
 from strands_robots.fleet.device_connect.network import DeviceConnectNetwork
 from strands_robots.fleet.mesh import network
 from strands_robots.fleet.mesh.joining import joined_mesh
@@ -326,3 +330,78 @@ def test_peers_name_own_verbs_with_their_parameters_and_devices_that_cannot_be_s
     assert bar["own_verbs"] == {"brewCoffee": "(cups: integer, 1 to 8) Brew coffee."}
     assert "note" not in bar
     assert echo["note"] == "This device has no lockout, no lease and no stop."
+
+
+class TestDefaultProfile:
+    """``STRANDS_FLEET`` says which fleet the tool reaches, and its emergency stop with it."""
+
+    @pytest.fixture
+    def joined(self, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+        """The networks that were joined, none of which answers."""
+        found: list[str] = []
+
+        def device_connect(_self: object, link: LinkConfig, _source: str) -> None:
+            found.append(f"device connect {link.meet_port} {link.tenant}")
+            raise UnreachableError("no answer")
+
+        def mesh(*_: object) -> None:
+            found.append(f"mesh {settings.raw('STRANDS_MESH_PORT')} {settings.raw('STRANDS_MESH_NAMESPACE')}")
+            raise UnreachableError("no answer")
+
+        monkeypatch.setenv("STRANDS_MESH_PORT", "7001")
+        monkeypatch.setenv("STRANDS_DC_PORT", "7002")
+        monkeypatch.setattr(DeviceConnectNetwork, "__init__", device_connect)
+        monkeypatch.setattr("strands_robots.fleet.mesh.joining.joined_mesh", mesh)
+        return found
+
+    @pytest.fixture
+    def write(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[str], None]:
+        monkeypatch.setenv("STRANDS_FLEET", str(tmp_path / "lab.toml"))
+
+        def written(content: str) -> None:
+            (tmp_path / "lab.toml").write_text(content)
+            (tmp_path / "lab.toml").chmod(0o644)
+
+        return written
+
+    @pytest.mark.parametrize("action", ["emergency_stop", "stop", "peers"])
+    def test_both_networks_are_those_of_the_profile(
+        self, joined: list[str], write: Callable[[str], None], monkeypatch: pytest.MonkeyPatch, action: str
+    ) -> None:
+        write('port = 7101\ntenant = "lab"\n[mesh]\nport = 7102\nnamespace = "lab"')
+        assert robot_mesh(action=action)["status"] == "error"
+        monkeypatch.setenv("STRANDS_ROBOT_MESH_DC", "off")
+        assert robot_mesh(action=action)["status"] == "error"
+        assert joined == ["device connect 7101 lab", "mesh 7102 lab"]
+        assert settings.raw("STRANDS_MESH_PORT") == "7001"
+
+    def test_without_a_profile_they_are_those_of_the_environment(
+        self, joined: list[str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        robot_mesh(action="emergency_stop")
+        monkeypatch.setenv("STRANDS_ROBOT_MESH_DC", "off")
+        robot_mesh(action="emergency_stop")
+        assert joined == ["device connect 7002 default", "mesh 7001 strands"]
+
+    def test_fleet_on_the_mesh_alone_is_reached_there(self, joined: list[str], write: Callable[[str], None]) -> None:
+        write("[mesh]\nport = 7102")
+        robot_mesh(action="emergency_stop")
+        assert joined == ["mesh 7102 strands"]
+
+    def test_fleet_without_a_mesh_is_not_stopped_on_another_ones(
+        self, joined: list[str], write: Callable[[str], None], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        write("port = 7101")
+        monkeypatch.setenv("STRANDS_ROBOT_MESH_DC", "off")
+        answer = robot_mesh(action="emergency_stop")
+        assert (answer["status"], "has no mesh" in answer["reason"], joined) == ("error", True, [])
+
+    @pytest.mark.parametrize("value", ["auto", "off"])
+    def test_profile_that_cannot_be_read_is_an_error_that_stops_no_other_fleet(
+        self, joined: list[str], write: Callable[[str], None], monkeypatch: pytest.MonkeyPatch, value: str
+    ) -> None:
+        write("tennant = 1")
+        monkeypatch.setenv("STRANDS_ROBOT_MESH_DC", value)
+        answer = robot_mesh(action="emergency_stop")
+        assert (answer["status"], answer["stopped"], joined) == ("error", None, [])
+        assert "unknown key 'tennant'" in answer["reason"]

@@ -8,6 +8,7 @@ import logging
 import math
 import re
 from collections.abc import Callable, Iterable
+from copy import copy
 from inspect import Parameter
 from typing import Annotated, Any, TypeVar
 
@@ -48,6 +49,8 @@ def command(app: typer.Typer, name: str, *, network: bool = False) -> Callable[[
 
     def register(body: Body) -> Body:
         own = {name: each for name, each in _parameters(body).items() if name not in ("screen", "network")}
+        if network and "source" in own and own["source"].default == SOURCE:
+            own["source"] = _profiles_name(own["source"])
         # A command may define a network flag of its own meaning, as serve does with --port.
         shared = {name: each for name, each in _parameters(Network).items() if network and name not in own}
         parameters = [*own.values(), *shared.values(), _JSON]
@@ -83,8 +86,16 @@ def _use_profile(name: str, arguments: dict[str, Any]) -> None:
     network: Network = arguments["network"]
     if network.profile is not None and name not in WITHOUT_CHECK:
         network.check()
-    if arguments.get("source") == SOURCE:
+    if "source" in arguments and arguments["source"] is None:
         arguments["source"] = network.caller()
+
+
+def _profiles_name(source: Parameter) -> Parameter:
+    """Return ``--as`` without a default, so that one that is given is told from none."""
+    (option,) = source.annotation.__metadata__
+    shown_default = copy(option)
+    shown_default.show_default = SOURCE
+    return source.replace(default=None, annotation=Annotated[str | None, shown_default])
 
 
 def _parameters(function: Callable[..., Any]) -> dict[str, Parameter]:

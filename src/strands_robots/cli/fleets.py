@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import typer
@@ -22,35 +23,67 @@ def register(app: typer.Typer) -> None:
 
 def fleets(screen: Screen) -> None:
     """List the connection profiles that --fleet takes, and their networks."""
-    default = settings.raw("STRANDS_FLEET")
-    found = [_facts(name) for name in profile_names()]
+    default, names = settings.raw("STRANDS_FLEET"), profile_names()
+    found = [_facts(name) for name in names]
+    unfit = _problem(default) if default and default not in names else ""
     screen.data(
-        {"status": "success", "folder": str(profiles_folder()), "default": default or None, "fleets": found},
+        {
+            "status": "success",
+            "folder": str(profiles_folder()),
+            "default": default or None,
+            "default_problem": unfit,
+            "fleets": found,
+        },
     )
+    if unfit:
+        screen.say(f"STRANDS_FLEET names none that can be used. {unfit}")
     if not found:
         screen.say(f"No connection profile is in {profiles_folder()}; docs/python.md says what one has.")
         return
     rows = (
         (
             f"{each['name']} (default)" if each["name"] == default else each["name"],
-            label(each["problem"], "bold red") if each["problem"] else each["network"],
+            label(each["problem"], "bold red") if each["problem"] else each["network"] or "none",
             each["tenant"] or "",
             each["caller"] or "",
-            "" if each["mesh"] is None else "yes" if each["mesh"] else "no",
+            "" if each["mesh"] is None else each["mesh_network"] or "none",
         )
         for each in found
     )
-    screen.show(table(str(profiles_folder()), ("fleet", "network", "tenant", "caller", "mesh"), rows))
+    screen.show(table(str(profiles_folder()), ("fleet", "Device Connect", "tenant", "caller", "mesh"), rows))
 
 
 def _facts(name: str) -> dict[str, Any]:
     """Return a profile in words; ``problem`` says why it cannot be used."""
-    facts: dict[str, Any] = {"name": name, "network": None, "tenant": None, "caller": None, "mesh": None}
+    absent = ("network", "tenant", "caller", "mesh", "mesh_network")
+    facts: dict[str, Any] = {"name": name, **dict.fromkeys(absent)}
     try:
         profile = read_profile(name)
-        link = profile.flags({}).link(as_flag)
-        facts |= {"network": described(link), "tenant": link.tenant, "file": str(profile.file)}
-        facts |= {"caller": profile.name or SOURCE, "mesh": profile.mesh is not None}
+        facts["file"] = str(profile.file)
+        if profile.reaches_devices({}):
+            link = profile.flags({}).link(as_flag)
+            facts |= {"network": described(link), "tenant": link.tenant}
+        stated = profile.mesh
+        facts |= {"caller": profile.name or SOURCE, "mesh": stated is not None}
+        facts["mesh_network"] = None if stated is None else _mesh_in_words(stated)
     except (ValidationError, MissingExtraError) as exc:
         return {**facts, "problem": str(exc)}
     return {**facts, "problem": ""}
+
+
+def _problem(wanted: str) -> str:
+    try:
+        read_profile(wanted).check()
+    except ValidationError as exc:
+        return str(exc)
+    return ""
+
+
+def _mesh_in_words(stated: Mapping[str, str]) -> str:
+    """Describe in one sentence where the peers of a profile's mesh meet."""
+    ends = {"connects to": stated["STRANDS_MESH_CONNECT"], "listens on": stated["STRANDS_MESH_LISTEN"]}
+    ways = [f"{how} {', '.join(each.split(','))}" for how, each in ends.items() if each != settings.NO_ENDPOINT]
+    hub = [] if ways else [f"meets at 127.0.0.1:{stated['STRANDS_MESH_PORT']}"]
+    multicast = ["finds peers by multicast"] if stated["STRANDS_MESH_MULTICAST"] == "true" else []
+    text = "; ".join((*hub, *ways, *multicast))
+    return f"{text[0].upper()}{text[1:]}."

@@ -129,17 +129,17 @@ class Network:
         return self._flags_over(self._profile)
 
     @contextmanager
-    def fleet(self, source: str = SOURCE) -> Iterator[FleetClient]:
+    def fleet(self, source: str | None = None) -> Iterator[FleetClient]:
         """Connect to the robots on this network for the length of the block.
 
         Args:
-            source: the caller's name; :data:`SOURCE` gives way to that of the connection profile.
+            source: the caller's name; by default that of :meth:`caller`.
 
         Raises:
             CliError: the network cannot be reached, or fails in use.
         """
         link = self.link()
-        name = self.caller() if source == SOURCE else source
+        name = self.caller() if source is None else source
         from device_connect_edge.messaging import MessagingError  # noqa: PLC0415 - loaded when a network is used
 
         from strands_robots.device_connect import FleetClient  # noqa: PLC0415 - as above
@@ -153,12 +153,14 @@ class Network:
             raise CliError(plain(f"The network does not carry this: {refusal.why}", 2000), Exit.SILENT) from refusal
 
     @contextmanager
-    def joined(self, *, on_mesh: bool = False, source: str = SOURCE, peer: str = "console") -> Iterator[NetworkAdapter]:
+    def joined(
+        self, *, on_mesh: bool = False, source: str | None = None, peer: str = "console"
+    ) -> Iterator[NetworkAdapter]:
         """Join Device Connect, or the native mesh, for the length of the block.
 
         Args:
             on_mesh: the native mesh.
-            source: the caller's name on Device Connect.
+            source: the caller's name on Device Connect, as in :meth:`fleet`.
             peer: the first part of this peer's id on the mesh.
 
         Raises:
@@ -198,9 +200,9 @@ class Network:
         return profile is not None and not profile.reaches_devices(self._given)
 
     def beside(self) -> list[NetworkAdapter]:
-        """Return the networks of the connection profile besides Device Connect, which a stop of all has to reach.
+        """Return the connection profile's networks besides Device Connect.
 
-        A mesh that cannot be used is left out, as :meth:`link` says in the log.
+        A stop of all has to reach them. A mesh that cannot be used is left out, as :meth:`link` says in the log.
         """
         from strands_robots.fleet.mesh.network import MeshNetwork  # noqa: PLC0415 - loaded when it is used
 
@@ -228,8 +230,7 @@ class Network:
                 raise CliError(f"--mesh: the connection profile {profile.label} has no mesh.", Exit.USAGE)
             put_settings(profile.mesh)
         if self.port is not None:
-            number = port("--port", self.port)
-            put_settings({"STRANDS_MESH_PORT": str(number)} if profile is None else mesh_at(number))
+            put_settings(mesh_at(port("--port", self.port)))
 
 
 def _mesh_beside(profile: FleetProfile) -> Mapping[str, str]:

@@ -100,7 +100,7 @@ def connect(
         "insecure": insecure,
         **{each: None if file is None else Path(file).expanduser() for each, file in files.items()},
     }
-    given = {each: value for each, value in arguments.items() if value is not None and value != []}
+    given = {each: value for each, value in arguments.items() if value is not None}
     profile = profile_for(fleet, given)
     flags = LinkFlags(**given) if profile is None else profile.flags(given)
     source = device_id("name", name if name is not None else (profile and profile.name) or SOURCE)
@@ -443,8 +443,8 @@ class Fleet:
 
 
 def _items(stated: Sequence[str] | str | None) -> Sequence[str] | None:
-    """Return one text as a list of one."""
-    return [stated] if isinstance(stated, str) else stated
+    """Return one text as a list of one; None for an empty list."""
+    return [stated] if isinstance(stated, str) else list(stated or ()) or None
 
 
 def _opened(network: NetworkAdapter) -> str | Exception:

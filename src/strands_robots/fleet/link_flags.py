@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from strands_robots import settings
-from strands_robots.utils import ValidationError, missing_extra, redacted
+from strands_robots.utils import ValidationError, device_id, missing_extra, redacted, shown
 
 if TYPE_CHECKING:
     from strands_robots.device_connect.backends import LinkConfig
@@ -39,8 +39,11 @@ class LinkFlags:
         tls_cert: this side's certificate.
         tls_key: this side's private key.
         credentials: Device Connect credentials file.
-        alone: they say all, as those of a connection profile do: no variable that names a network, a tenant or
+        alone: they say all, as those of a connection profile do: no variable that names a network, a port, a tenant or
             certificates counts besides.
+
+    Raises:
+        ValidationError: a tenant, a server or an endpoint that is given and empty.
     """
 
     nats: Sequence[str] | None = None
@@ -55,6 +58,23 @@ class LinkFlags:
     tls_key: Path | None = None
     credentials: Path | None = None
     alone: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse what is given and empty: another network or tenant would take its place.
+
+        Raises:
+            ValidationError: naming it.
+        """
+        if self.tenant is not None:
+            device_id("tenant", self.tenant)
+        for name in ("nats", "connect", "listen"):
+            stated: Sequence[str] = getattr(self, name) or ()
+            for each in stated:
+                if not each.replace(",", "").strip():
+                    what = (
+                        "a server, such as nats://host:4222" if name == "nats" else "an endpoint, such as tcp/host:7447"
+                    )
+                    raise ValidationError(f"{name} needs {what}, not {shown(each)}.")
 
     @property
     def opted_in(self) -> bool:
@@ -104,7 +124,8 @@ class LinkFlags:
                 verify_hostname=True,
             )
         if self.alone and (self.port is not None or not self.credentials):
-            link = backends.loopback_config(self.port, tenant)
+            meets = int(settings.default("STRANDS_DC_PORT")) if self.port is None else self.port
+            link = backends.loopback_config(meets, tenant)
             return link
         if self.alone:
             link = backends.link_from_environment(tenant, credentials_file=self.credentials, alone=True)

@@ -7,7 +7,8 @@ fleet of that profile is joined, and a fleet of another one is refused meanwhile
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import ClassVar
 
 from strands_robots import settings
@@ -24,44 +25,53 @@ class MeshSettings:
     def __init__(self, stated: Mapping[str, str]) -> None:
         self._stated = dict(stated)
 
-    def take(self, *, alive: Callable[[], bool]) -> bool:
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Hold the settings for the length of a block; raises as :meth:`take`."""
+        self.take()
+        try:
+            yield
+        finally:
+            self.give_back()
+
+    def take(self) -> None:
         """Put the settings, until as many fleets of them have given them back.
-
-        True where the process is on another mesh than before.
-
-        Args:
-            alive: returns whether this process has a session already.
 
         Raises:
             UnreachableError: the process is on another mesh.
         """
+        from strands_robots.mesh import session  # noqa: PLC0415 - the network is loaded when it is used
+
         with self._lock:
             if self._joined and self._joined[0] != self._stated:
                 raise UnreachableError("this process is on the mesh of another connection profile")
+            live = session.opened_with()
+            # A session outlives its profile's fleet while a robot of this process uses it.
+            if live is not None and live != session.stated_mesh(self._stated):
+                whose = "the profile's" if self._stated else "the environment's"
+                raise UnreachableError(f"this process is on a mesh already, with other settings than {whose}")
             if not self._joined:
-                before = {name: settings.verbatim(name) for name in self._stated}
-                if (
-                    any(settings.raw(name) != (value or settings.default(name)) for name, value in self._stated.items())
-                    and alive()
-                ):
-                    raise UnreachableError("this process is on a mesh already, with other settings than the profile's")
-                self._before.update(before)
+                self._before.update({name: settings.verbatim(name) for name in self._stated})
                 put_settings(self._stated)
+                self._forget_peers()
             self._joined.append(self._stated)
-            return bool(self._stated) and len(self._joined) == 1
 
-    def give_back(self) -> bool:
-        """Restore what was before, with the last fleet of these settings.
-
-        True where that is another mesh.
-        """
+    def give_back(self) -> None:
+        """Restore what was before, with the last fleet of these settings."""
         with self._lock:
             self._joined.pop()
             if self._joined:
-                return False
+                return
             put_settings(self._before)
             self._before.clear()
-            return bool(self._stated)
+            self._forget_peers()
+
+    def _forget_peers(self) -> None:
+        """Forget the peers of the mesh that this process was on."""
+        from strands_robots.mesh import session  # noqa: PLC0415 - as above
+
+        if self._stated and not session.session_alive():
+            session.clear_peers()
 
 
 def put_settings(stated: Mapping[str, str]) -> None:

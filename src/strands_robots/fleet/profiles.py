@@ -1,8 +1,8 @@
 """Connection profiles: one TOML file a fleet, with its network and certificates.
 
 A profile decides which authority is trusted and which robots a stop reaches. So a file that others can write is
-refused, an unknown key is never skipped, and the file says all: the environment's networks, tenant and certificates do
-not count besides.
+refused, an unknown key is never skipped, and the file says all: the environment's networks, ports, tenant and
+certificates do not count besides.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class FleetProfile:
     Attributes:
         label: the name or the path by which it was asked for.
         file: where it stands.
-        network: the fields of :class:`LinkFlags` that it states. No variable that names a network counts besides.
+        network: the fields of :class:`LinkFlags` that it states; no variable of another one counts besides.
         stated_name: the caller's name, None for none; or why it cannot be used.
         stated_mesh: the mesh's settings by variable, None where the mesh is left out; or why they cannot be used.
     """
@@ -225,7 +225,7 @@ def _mesh(value: object, file: Path) -> Mapping[str, str] | None:
     named = {_VARIABLES[key]: each if isinstance(each, str) else _spelled(each) for key, each in stated.items()}
     return {
         **dict.fromkeys(_OF_NO_MESH, ""),
-        **mesh_at(),
+        **mesh_at(int(settings.default("STRANDS_MESH_PORT"))),
         "STRANDS_MESH_AUTH_MODE": "none" if insecure else "mtls",
         "STRANDS_MESH_I_KNOW_THIS_IS_INSECURE": _spelled(insecure),
         "STRANDS_MESH_LOCAL_DEV": "false",
@@ -233,19 +233,18 @@ def _mesh(value: object, file: Path) -> Mapping[str, str] | None:
     }
 
 
-def mesh_at(port_number: int | None = None) -> dict[str, str]:
+def mesh_at(port_number: int) -> dict[str, str]:
     """Return the settings of a mesh that meets on this machine, and nowhere else.
 
     Args:
-        port_number: the loopback port of its hub; that of the environment by default.
+        port_number: the loopback port of its hub.
     """
-    at = {} if port_number is None else {"STRANDS_MESH_PORT": str(port_number)}
     return {
         "STRANDS_MESH_BACKEND": "zenoh",
         "STRANDS_MESH_CONNECT": settings.NO_ENDPOINT,
         "STRANDS_MESH_LISTEN": settings.NO_ENDPOINT,
         "STRANDS_MESH_MULTICAST": "false",
-        **at,
+        "STRANDS_MESH_PORT": str(port_number),
     }
 
 
@@ -263,7 +262,15 @@ def _urls(name: str, value: object, _file: Path) -> tuple[str, ...]:
 
 
 def _path(name: str, value: object, file: Path) -> Path:
-    return file.parent / _expanded(Path(text(name, value, longest=1000)))
+    """Return a file that a profile names, refused where others can write it."""
+    named = file.parent / _expanded(Path(text(name, value, longest=1000)))
+    try:
+        status = named.stat()
+    except (OSError, ValueError):
+        # What needs the file says so.
+        return named
+    _require_own(named, status)
+    return named
 
 
 def _expanded(path: Path) -> Path:

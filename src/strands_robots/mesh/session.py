@@ -12,6 +12,7 @@ import atexit
 import logging
 import os
 import threading
+from collections.abc import Mapping
 from typing import Any
 
 from strands_robots import settings
@@ -35,17 +36,38 @@ __all__ = [
     "get_peers",
     "get_session",
     "network",
+    "opened_with",
     "pacer",
     "prune_peers",
     "put",
     "registry",
     "release_session",
     "session_alive",
+    "stated_mesh",
     "update_peer",
     "zenoh_error_types",
 ]
 
 logger = logging.getLogger(__name__)
+
+_NAMES_THE_MESH = (
+    "STRANDS_MESH_BACKEND",
+    "STRANDS_MESH_PORT",
+    "STRANDS_MESH_CONNECT",
+    "STRANDS_MESH_LISTEN",
+    "ZENOH_CONNECT",
+    "ZENOH_LISTEN",
+    "STRANDS_MESH_MULTICAST",
+    "STRANDS_MESH_NAMESPACE",
+    "STRANDS_MESH_AUTH_MODE",
+    "STRANDS_MESH_I_KNOW_THIS_IS_INSECURE",
+    "STRANDS_MESH_LOCAL_DEV",
+    "STRANDS_MESH_TLS_CA",
+    "STRANDS_MESH_TLS_CERT",
+    "STRANDS_MESH_TLS_KEY",
+    "STRANDS_MESH_ACL_FILE",
+    "STRANDS_IOT_ENDPOINT",
+)
 
 _registry = PeerRegistry(
     most=lambda: settings.integer("STRANDS_MESH_MAX_PEERS"),
@@ -60,6 +82,7 @@ class _Shared:
     def __init__(self) -> None:
         self.lock = threading.Lock()
         self.transport: Transport | None = None
+        self.opened_with: Mapping[str, str] = {}
         self.references = 0
 
     def acquire(self) -> Transport | None:
@@ -68,13 +91,14 @@ class _Shared:
             return None
         with self.lock:
             if self.transport is None:
+                stated = stated_mesh()
                 try:
                     transport = make_transport()
                     transport.connect()
                 except (TransportError, MissingExtraError) as exc:
                     logger.error("The mesh has no session: %s", exc)  # noqa: TRY400 - one sentence, no trace
                     return None
-                self.transport = transport
+                self.transport, self.opened_with = transport, stated
             # A robot of this process may become the hub, though the first user of the session only dialled.
             self.transport.dials_only = False
             self.references += 1
@@ -91,10 +115,11 @@ class _Shared:
             raise TransportError("STRANDS_MESH switches the mesh off.")
         with self.lock:
             if self.transport is None:
+                stated = stated_mesh()
                 transport = make_transport()
                 transport.dials_only = True
                 transport.connect()
-                self.transport = transport
+                self.transport, self.opened_with = transport, stated
             self.references += 1
             return self.transport
 
@@ -144,6 +169,29 @@ def session_alive() -> bool:
     """True while the session is open."""
     transport = _shared.transport
     return transport is not None and transport.is_alive()
+
+
+def opened_with() -> Mapping[str, str] | None:
+    """Return :func:`stated_mesh` of the open session; None without a session."""
+    with _shared.lock:
+        return None if _shared.transport is None else _shared.opened_with
+
+
+def stated_mesh(instead: Mapping[str, str] | None = None) -> dict[str, str]:
+    """Return the settings that say which mesh is joined, equal for the same mesh.
+
+    Args:
+        instead: settings by variable that count instead of the environment's; an empty one is the default.
+    """
+    values = {name: settings.raw(name) for name in _NAMES_THE_MESH}
+    values |= {name: value or settings.default(name) for name, value in (instead or {}).items()}
+    for way in ("CONNECT", "LISTEN"):
+        stated, shared = values.pop(f"STRANDS_MESH_{way}"), values.pop(f"ZENOH_{way}")
+        values[way] = "" if stated == settings.NO_ENDPOINT else stated or shared
+    if values["CONNECT"] or values["LISTEN"]:
+        # The port is where peers without an endpoint meet.
+        del values["STRANDS_MESH_PORT"]
+    return values
 
 
 def put(key: str, data: dict[str, Any]) -> None:

@@ -12,10 +12,13 @@ from typing import TYPE_CHECKING, Any
 
 from strands_robots import settings
 from strands_robots.envelope import Envelope, error, success
-from strands_robots.errors import RefusalError, StrandsRobotsError
+from strands_robots.errors import RefusalError, StrandsRobotsError, UnreachableError
+from strands_robots.fleet.mesh_settings import MeshSettings
+from strands_robots.fleet.profiles import profile_for
 from strands_robots.fleet.refusals import said
 from strands_robots.fleet.stop_answers import combined_verdict, roster_verdict
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
+from strands_robots.utils import ValidationError
 
 if TYPE_CHECKING:
     from strands_robots.fleet.adapter import FoundRobot, NetworkAdapter
@@ -31,10 +34,22 @@ OWN_BYTES = 16_000
 
 
 def network() -> Robots:
-    """Return those of Device Connect, of the mesh where it is absent or off."""
+    """Return those of Device Connect, of the mesh where it is absent or off.
+
+    They are of the default connection profile, ``STRANDS_FLEET``, if there is one.
+    """
     absent = importlib.util.find_spec("device_connect_edge") is None
     off = settings.raw("STRANDS_ROBOT_MESH_DC").lower() in settings.FALSE_SPELLINGS
-    return Robots(on_mesh if absent or off else on_device_connect)
+    return Robots(on_mesh if absent or off or _on_mesh_alone() else on_device_connect)
+
+
+def _on_mesh_alone() -> bool:
+    try:
+        profile = profile_for(None, {})
+    except ValidationError:
+        # Joining says what is wrong with it.
+        return False
+    return profile is not None and not profile.reaches_devices({})
 
 
 class Robots:
@@ -120,24 +135,41 @@ class Robots:
 
 @contextmanager
 def on_mesh() -> Iterator[NetworkAdapter]:
-    """Join the native mesh as a peer without a robot."""
+    """Join the native mesh as a peer without a robot.
+
+    Raises:
+        UnreachableError: the default connection profile has no mesh, or this process is on another one.
+        ValidationError: that profile cannot be used.
+    """
     from strands_robots.fleet.mesh import joining  # noqa: PLC0415 - the network is loaded when it is used
     from strands_robots.fleet.mesh.network import MeshNetwork  # noqa: PLC0415 - as above
     from strands_robots.mesh.wire_identity import visitor_id  # noqa: PLC0415 - as above
 
-    with joining.joined_mesh(None, visitor_id(SOURCE), "tool") as mesh:
+    profile = profile_for(None, {})
+    stated = None if profile is None else profile.mesh
+    if profile is not None and stated is None:
+        # The mesh of the environment may be another fleet's.
+        raise UnreachableError(f"the connection profile {profile.label} has no mesh")
+    with MeshSettings(stated or {}).held(), joining.joined_mesh(None, visitor_id(SOURCE), "tool") as mesh:
         yield MeshNetwork.joined(mesh)
 
 
 @contextmanager
 def on_device_connect() -> Iterator[NetworkAdapter]:
-    """Join Device Connect where the environment says, else on this machine."""
+    """Join Device Connect where the profile or the environment says, else here.
+
+    Raises:
+        UnreachableError: it cannot be reached.
+        ValidationError: the default connection profile cannot be used, or the network needs authentication.
+    """
     from strands_robots.device_connect.links import insecure_opt_in, usual_link  # noqa: PLC0415 - the network is loaded when it is used
     from strands_robots.fleet.device_connect.network import DeviceConnectNetwork  # noqa: PLC0415 - as above
 
-    link = usual_link()
+    profile = profile_for(None, {})
+    flags = None if profile is None else profile.flags({})
+    link = usual_link() if flags is None else flags.link()
     if not link.loopback_only:
-        insecure_opt_in(None, link, stated=True)
+        insecure_opt_in(None if flags is None else flags.opted_in, link, stated=True)
     network = DeviceConnectNetwork(link, SOURCE)
     network.open()
     try:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
@@ -20,6 +20,7 @@ from strands_robots.device_connect import init_device_connect_sync, stop_device_
 from strands_robots.device_connect.backends import link_from_environment
 from strands_robots.errors import UnreachableError
 from strands_robots.fleet.adapter import MESH
+from strands_robots.mesh import init_mesh
 from strands_robots.mesh.session import clear_peers
 
 pytestmark = pytest.mark.timeout(300)
@@ -98,6 +99,22 @@ def test_commands_reach_it_by_the_profile_alone(broker: NatsServer, fleets: Path
     for words in (("estop",), ("stop", "--all")):
         ended = machine.run(*words, "--fleet", "lab")
         assert (ended.returncode, "others may write it" in ended.stderr) == (2, True)
+
+
+def test_fleet_without_a_profile_does_not_reach_that_of_the_profile_just_left(fleets: Path, tmp_path: Path) -> None:
+    there = free_port()
+    write(fleets, f"port = {free_port()}\n[mesh]\nport = {there}")
+    with mesh_robot("lab-1", there, tmp_path / "there"), ExitStack() as stack:
+        with connect("lab") as fleet:
+            eventually(lambda: "lab-1" in fleet, what="the robot of the profile")
+            mine = init_mesh(None, "mine", "tool")
+            assert mine is not None
+            stack.callback(mine.close)
+        with connect() as fleet:
+            assert "other settings than the environment's" in fleet.absent[MESH]
+            assert fleet.robots() == []
+            assert "lab-1" not in fleet.stop()
+    clear_peers()
 
 
 @contextmanager

@@ -88,10 +88,7 @@ class MeshNetwork:
 
     def open(self) -> None:
         """Join; raise :class:`UnreachableError` where there is no mesh."""
-        from strands_robots.mesh import session  # noqa: PLC0415 - the network is loaded when it is used
-
-        if self._settings.take(alive=session.session_alive):
-            _forget_peers()
+        self._settings.take()
         self._key = mesh_network()
         try:
             self._mesh = self._dialled()
@@ -101,7 +98,7 @@ class MeshNetwork:
         self._joined, self._requests = time.monotonic(), PeerRequests()
 
     def _dialled(self) -> Mesh:
-        from strands_robots.mesh import session  # noqa: PLC0415 - as above
+        from strands_robots.mesh import session  # noqa: PLC0415 - the network is loaded when it is used
         from strands_robots.mesh.core import Mesh, Parts  # noqa: PLC0415 - as above
         from strands_robots.mesh.transport import TransportError  # noqa: PLC0415 - as above
         from strands_robots.mesh.wire_identity import IdentityError, visitor_id  # noqa: PLC0415 - as above
@@ -352,10 +349,12 @@ class MeshNetwork:
         if self._given:
             return
         mesh, self._mesh = self._mesh, None
-        if mesh is not None:
+        if mesh is None:
+            return
+        try:
             mesh.close()
-            if self._settings.give_back():
-                _forget_peers()
+        finally:
+            self._settings.give_back()
 
     @property
     def _joined_mesh(self) -> Mesh:
@@ -410,14 +409,6 @@ def _carried(robot: str, verb: str, arguments: Mapping[str, Any]) -> Mapping[str
     if problem and verb != "stop":
         raise ArgumentsError(problem, robot=robot, verb=verb)
     return {} if problem else arguments
-
-
-def _forget_peers() -> None:
-    """Forget the peers of the mesh that this process was on."""
-    from strands_robots.mesh import session  # noqa: PLC0415 - loaded when it is used
-
-    if not session.session_alive():
-        session.clear_peers()
 
 
 def _has_robot(row: Mapping[str, Any]) -> bool:
