@@ -136,7 +136,7 @@ class NetworkAdapter(Protocol):
         """Return the public key that is enrolled for this id; None for none."""
 
     def announced_functions(self, robot: str) -> object:
-        """Return the robot's functions as far as its announcement tells them; asks no one."""
+        """Return the functions that a robot's announcement tells; asks no one."""
 
     def describe(self, robot: str, *, anew: bool = False) -> object:
         """Return the robot's functions as they came over the wire.

@@ -41,7 +41,10 @@ class NetworkVerdict:
 
     @property
     def counted(self) -> frozenset[str]:
-        """Robots that had to answer; a name that was only heard need not where robots are enrolled."""
+        """Robots that had to answer.
+
+        Where robots are enrolled, a name that was only heard need not.
+        """
         if self.outcome is None or not self.outcome.size:
             return frozenset(self.verdicts())
         report = self.outcome.report

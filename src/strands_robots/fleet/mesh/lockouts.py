@@ -1,4 +1,4 @@
-"""The native mesh's side of ``lockout --mesh`` and ``resume --mesh``."""
+"""Lockouts of peers on the mesh, asked for and cleared."""
 
 from __future__ import annotations
 

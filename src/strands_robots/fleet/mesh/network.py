@@ -395,7 +395,7 @@ class MeshNetwork:
 
 
 def _carried(robot: str, verb: str, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the arguments; raise :class:`ArgumentsError` where the mesh cannot carry them.
+    """Return the arguments as the mesh can carry them, else raise.
 
     A stop is never refused for its arguments: without them it stops all that the robot has.
     """
