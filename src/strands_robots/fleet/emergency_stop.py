@@ -131,9 +131,15 @@ class EmergencyStop:
             self._search.start()
 
     def _progress(self, progress: Progress) -> None:
-        self.latest = progress
-        self._begun.set()
+        first, self.latest = self.latest is None, progress
         self._search.begin(progress)
+        if first:
+            threading.Thread(target=self._begin_search, name="estop lookup", daemon=True).start()
+
+    def _begin_search(self) -> None:
+        # What a search hears is written into the memory that the roster is read from, so that is read before.
+        self._search.roster.wait_until_read()
+        self._begun.set()
 
     def _find(self, devices: Devices) -> None:
         for last in (False, True):

@@ -228,6 +228,10 @@ class StopRoster:
             others = [row.name for row in roster.rows if row.name in heard and not counts(roster, row)]
             return frozenset((*(row.name for row in roster.rows if counts(roster, row)), *others[:OTHERS_AWAITED]))
 
+    def wait_until_read(self) -> bool:
+        """Wait at most :data:`READ_WITHIN_S` for the disk; False where it hangs."""
+        return self._is_read.wait(READ_WITHIN_S)
+
     def outcome(self, report: StopReport, sending: Sending | None = None, problem: str = "") -> StopOutcome:
         """Measure the report of the stop.
 
@@ -241,7 +245,7 @@ class StopRoster:
             self.widen()
         report = replace(report, scope=self._asked, widened=self.scope != self._asked)
         # The stop is over; a disk that hangs is given this long.
-        self._is_read.wait(READ_WITHIN_S)
+        self.wait_until_read()
         with self._lock:
             roster, found = self._whole(report.answered.items()), dict(self._found)
             unproven = _missed_by(self._unproven, roster)
