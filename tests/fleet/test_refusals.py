@@ -9,7 +9,7 @@ from strands_robots.errors import RefusalError, StrandsRobotsError
 from strands_robots.fleet.refusals import BY_REASON, refusal_of_text
 from strands_robots.mesh import commands
 from strands_robots.safety.approval import Approval
-from strands_robots.serving.leave import RefusalReason
+from strands_robots.serving.refused import RefusalReason
 
 
 @pytest.mark.parametrize(

@@ -17,8 +17,9 @@ from strands_robots.envelope import error, success
 from strands_robots.safety.approval import Approval, Grants, Leave, digest
 from strands_robots.safety.gate import MotionRequest
 from strands_robots.serving import starting_motions
-from strands_robots.serving.leave import Command, RefusalReason, Refused
+from strands_robots.serving.leave import Command
 from strands_robots.serving.pipeline import Pipeline, Result
+from strands_robots.serving.refused import RefusalReason, Refused
 from strands_robots.serving.robot_verbs import ARM_VERBS
 from strands_robots.serving.verbs import Arguments
 

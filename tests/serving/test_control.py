@@ -16,8 +16,9 @@ from strands_robots.serving.control import ControlLease, NotHolderError, leases_
 from strands_robots.serving.control_changes import ControlChange
 from strands_robots.serving.control_verbs import CONTROL_VERBS
 from strands_robots.serving.lease_watch import LeaseWatch
-from strands_robots.serving.leave import Command, RefusalReason
+from strands_robots.serving.leave import Command
 from strands_robots.serving.pipeline import Pipeline, Result
+from strands_robots.serving.refused import RefusalReason
 from strands_robots.serving.robot_verbs import ARM_VERBS, WORLD_VERBS
 from strands_robots.serving.take_assertion import PURPOSE, VERSION, sign_take
 from strands_robots.utils import canonical_json

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from strands_robots import settings
-from strands_robots.cli.network import SOURCE
 from strands_robots.cli.output import Screen
+from strands_robots.fleet.callers import SOURCE
 from strands_robots.fleet.link_flags import described
 from strands_robots.safety.approval import listed
 from strands_robots.safety.authorization import motion_refusal

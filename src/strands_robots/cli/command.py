@@ -14,9 +14,10 @@ from typing import Annotated, Any, TypeVar
 
 import typer
 
-from strands_robots.cli.network import SOURCE, Network
+from strands_robots.cli.network import Network
 from strands_robots.cli.output import CliError, Exit, Screen
 from strands_robots.errors import StrandsRobotsError
+from strands_robots.fleet.callers import SOURCE
 from strands_robots.utils import ValidationError, shown
 
 Body = TypeVar("Body", bound=Callable[..., None])

@@ -9,8 +9,8 @@ import typer
 
 from strands_robots import settings
 from strands_robots.cli.command import command
-from strands_robots.cli.network import SOURCE
 from strands_robots.cli.output import Screen, label, table
+from strands_robots.fleet.callers import SOURCE
 from strands_robots.fleet.link_flags import as_flag, described
 from strands_robots.fleet.profiles import profile_names, profiles_folder, read_profile
 from strands_robots.utils import MissingExtraError, ValidationError

@@ -16,6 +16,7 @@ from strands_robots import settings
 from strands_robots.cli.output import CliError, Exit, plain
 from strands_robots.envelope import Envelope
 from strands_robots.errors import ArgumentsError, NoSuchRobotError, RefusalError, UnknownVerbError, UnreachableError
+from strands_robots.fleet.callers import SOURCE
 from strands_robots.fleet.link_flags import LinkFlags, as_flag
 from strands_robots.fleet.mesh_settings import put_settings
 from strands_robots.fleet.profiles import FleetProfile, mesh_at, profile_for, profile_name
@@ -28,9 +29,6 @@ if TYPE_CHECKING:
     from strands_robots.mesh import Mesh
 
 logger = logging.getLogger(__name__)
-
-SOURCE = "strands-robots"
-"""Caller's name that goes with the calls of the command line."""
 
 
 def _option(flag: str, text: str, **more: Any) -> Any:
@@ -204,14 +202,16 @@ class Network:
 
         A stop of all has to reach them. A mesh that cannot be used is left out, as :meth:`link` says in the log.
         """
-        from strands_robots.fleet.mesh.network import MeshNetwork  # noqa: PLC0415 - loaded when it is used
-
         profile = self._profile
         try:
             mesh = None if profile is None else profile.mesh
         except ValidationError:
             mesh = None
-        return [] if mesh is None else [MeshNetwork(self.caller(), mesh)]
+        if mesh is None:
+            return []
+        from strands_robots.fleet.mesh.network import MeshNetwork  # noqa: PLC0415 - loaded when it is used
+
+        return [MeshNetwork(self.caller(), mesh)]
 
     def use_mesh(self) -> None:
         """Apply the flags to the native mesh, which takes ``--fleet`` and ``--port``.

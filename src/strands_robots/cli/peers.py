@@ -10,13 +10,12 @@ import typer
 from rich.text import Text
 
 from strands_robots.cli.command import OnMesh, Timeout, assignments, command
-from strands_robots.cli.network import SOURCE, Network, answering
+from strands_robots.cli.network import Network, answering
 from strands_robots.cli.output import LATE_S, CliError, Exit, Screen, label, plain, readable, table, with_tags
 from strands_robots.cli.readiness import other_user
 from strands_robots.envelope import is_error, text_of
-from strands_robots.safety.statements import ALARM
+from strands_robots.fleet.callers import SOURCE, TOOL
 from strands_robots.serving.known_verbs import QUICK, TEXTS, VERBS, WAITING
-from strands_robots.tools.networks import SOURCE as PEER
 from strands_robots.utils import WAIT_S, ValidationError, device_id, number
 
 if TYPE_CHECKING:
@@ -97,7 +96,7 @@ def call(
     if on_mesh and function is None:
         raise CliError("call --mesh takes a function, such as status.", Exit.USAGE)
     flags = f"{' --mesh' if on_mesh else ''}{network.flags}"
-    with network.joined(on_mesh=on_mesh, source=source, peer=PEER) as there:
+    with network.joined(on_mesh=on_mesh, source=source, peer=TOOL) as there:
         try:
             with answering(there, device, function or ""):
                 if function is None:
@@ -197,6 +196,8 @@ def _status(robot: FoundRobot) -> str | Text:
     if facts.get("estop_unheard"):
         return label("CANNOT RECEIVE STOPS", "bold red")
     if why := str(facts.get("distrusted", "")):
+        from strands_robots.safety.statements import ALARM  # noqa: PLC0415 - only a peer with a wrong key needs it
+
         return label(why, "bold red" if why.startswith(ALARM) else "yellow")
     return label("LOCKED", "bold red") if facts.get("locked") is True else robot.status
 

@@ -13,7 +13,7 @@ import typer
 
 from strands_robots.cli.command import OnMesh, Timeout, command
 from strands_robots.cli.keys import PassphraseFile, operator_key, signing_key
-from strands_robots.cli.network import SOURCE, Network, near_robots
+from strands_robots.cli.network import Network, near_robots
 from strands_robots.cli.output import POLL_S, CliError, Exit, Screen, captured_log, label, plain, table
 from strands_robots.cli.readiness import meeting_user
 from strands_robots.cli.stop_report import (
@@ -26,6 +26,7 @@ from strands_robots.cli.stop_report import (
     stop_table,
 )
 from strands_robots.envelope import Envelope, text_of
+from strands_robots.fleet.callers import SOURCE, TOOL
 from strands_robots.fleet.device_connect.stops import devices_on, network_key
 from strands_robots.fleet.emergency_stop import EmergencyStop
 from strands_robots.fleet.fleet_verdict import NetworkVerdict
@@ -36,7 +37,6 @@ from strands_robots.safety.controller import DEADLINE_S, Progress
 from strands_robots.safety.orders import new_epoch
 from strands_robots.safety.stop_roster import StopOutcome
 from strands_robots.serving.stop_arguments import robot_of_world, stop_reason, stop_robot, stop_scope
-from strands_robots.tools.networks import SOURCE as PEER
 from strands_robots.utils import ValidationError, device_id, number
 
 if TYPE_CHECKING:
@@ -221,7 +221,7 @@ def _stopping(screen: Screen, network: Network, *, on_mesh: bool) -> Iterator[Ne
     # The table of a stop on the mesh names what the log would report.
     with captured_log() if on_mesh and screen.live else nullcontext():
         try:
-            with network.joined(on_mesh=on_mesh, peer=PEER) as there:
+            with network.joined(on_mesh=on_mesh, peer=TOOL) as there:
                 yield there
         except CliError as failure:
             if on_mesh and failure.code is Exit.REFUSED:

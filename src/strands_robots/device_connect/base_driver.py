@@ -44,10 +44,11 @@ from strands_robots.safety.orders import REASON_MAX, epoch_of
 from strands_robots.safety.stop_executor import stop_executor
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.control_changes import ControlChange
-from strands_robots.serving.leave import Command, RefusalReason, Refused
+from strands_robots.serving.leave import Command
 from strands_robots.serving.offered_verbs import Offers
 from strands_robots.serving.own_verbs import own_verbs
 from strands_robots.serving.pipeline import Pipeline, Result, busy
+from strands_robots.serving.refused import RefusalReason, Refused
 from strands_robots.serving.stop_arguments import noted
 from strands_robots.serving.verb_schema import described, labels_of, text_of
 from strands_robots.serving.verbs import REQUIRED, Arguments, Kind, Verb

@@ -112,6 +112,11 @@ class Peer:
         return next((verb for verb in ("stop", "stopMotion") if verb in names), None)
 
     @property
+    def lockable(self) -> bool:
+        """True for a device that can be locked and resumed."""
+        return any(each.get("name") == "resume" for each in self.functions)
+
+    @property
     def cell(self) -> str | None:
         """Its cell, "" for none; None where it states neither, and reads no scope."""
         cell = self.status.get("cell")

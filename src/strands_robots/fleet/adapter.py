@@ -8,13 +8,13 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
 from strands_robots.envelope import Envelope
-from strands_robots.fleet.lockout_report import LockoutReport, Resumed
-from strands_robots.fleet.stop_button import StopSender
-from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope
-from strands_robots.safety.stop_roster import StopOutcome
 
 if TYPE_CHECKING:
+    from strands_robots.fleet.lockout_report import LockoutReport, Resumed
+    from strands_robots.fleet.stop_button import StopSender
+    from strands_robots.safety.network_key import NetworkKey
+    from strands_robots.safety.stop_roster import StopOutcome
     from strands_robots.serving.advertised import AdvertisedVerb
 
 DEVICE_CONNECT, MESH = "device_connect", "mesh"

@@ -12,6 +12,7 @@ from typing import Any, Self
 from strands_robots._mesh_switch import mesh_env_request
 from strands_robots.errors import NoSuchRobotError, RefusalError, UnreachableError
 from strands_robots.fleet.adapter import DEVICE_CONNECT, FIND_S, MESH, STOP_S, FoundRobot, NetworkAdapter
+from strands_robots.fleet.callers import SOURCE
 from strands_robots.fleet.enrollment import Enrolled, Enrolment, enroll, shown_key
 from strands_robots.fleet.fleet_verdict import FleetVerdict, NetworkVerdict
 from strands_robots.fleet.link_flags import LinkFlags
@@ -31,9 +32,6 @@ from strands_robots.tags import own_tags
 from strands_robots.utils import DURATION_MAX_S, ValidationError, device_id, near, number, plain_text, shown
 
 logger = logging.getLogger(__name__)
-
-SOURCE = "strands-robots"
-"""Caller's name where none is given."""
 
 
 def connect(

@@ -23,7 +23,7 @@ from strands_robots.errors import (
     UnknownVerbError,
     UnreachableError,
 )
-from strands_robots.serving.leave import RefusalReason
+from strands_robots.serving.refused import RefusalReason
 from strands_robots.utils import plain_text
 
 WHY_MAX = 500

@@ -20,9 +20,10 @@ from strands_robots.mesh.wire_identity import IdentityError
 from strands_robots.safety.identity import SigningIdentity
 from strands_robots.safety.peer_answers import with_stop_statement
 from strands_robots.safety.stopping import Outcome, StopVerdict, explain, grade
-from strands_robots.serving.leave import Command, RefusalReason, Refused
+from strands_robots.serving.leave import Command
 from strands_robots.serving.peer_verbs import PEER_VERBS
 from strands_robots.serving.pipeline import Own, Pipeline, Result, busy
+from strands_robots.serving.refused import RefusalReason, Refused
 from strands_robots.serving.robot_verbs import peer_stop_answer, run_to_end
 from strands_robots.serving.stop_requests import Request as StopRequest
 from strands_robots.serving.stop_requests import StopRequests

@@ -9,49 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
-from enum import Enum
 from typing import Any
 
 from strands_robots.contract import Robot
-from strands_robots.envelope import Envelope, error
-from strands_robots.errors import StrandsRobotsError
+from strands_robots.envelope import error
 from strands_robots.safety.approval import Approval, Leave, digest
 from strands_robots.safety.gate import MotionRefused, MotionRequest
 from strands_robots.serving.control import ControlLeases, NotHolderError
 from strands_robots.serving.policy_arguments import MOCK, mock_refusal
+from strands_robots.serving.refused import RefusalReason, Refused
 from strands_robots.serving.verbs import LEASE_ID, LEASE_NAMES, LEASE_TTL_S, Arguments, Kind, Verb
-
-
-class RefusalReason(Enum):
-    """The part of the pipeline that refused a command."""
-
-    ARGUMENTS = "arguments"
-    CALLER = "caller"
-    CONTROL = "control"
-    LOCKOUT = "lockout"
-    APPROVAL = "approval"
-    BUSY = "busy"
-    FAILED = "failed"
-
-    def noted(self, envelope: Envelope) -> Envelope:
-        """Return the envelope with the part that refused, for callers that are programs."""
-        return {**envelope, "refused": self.value}
-
-
-class Refused(StrandsRobotsError):  # noqa: N818 - a refusal, not a fault
-    """A command that did not reach the robot, or failed in it.
-
-    Args:
-        text: what the caller is told.
-        reason: what the audit is told; ``text`` by default.
-        envelope: the whole answer, where it is more than ``text``.
-    """
-
-    def __init__(self, why: RefusalReason, text: str, reason: str = "", envelope: Envelope | None = None) -> None:
-        super().__init__(text)
-        self.why = why
-        self.reason = reason or text
-        self.envelope = why.noted(error(text) if envelope is None else envelope)
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,8 @@ from strands_robots.identity_map import IdentityMap
 from strands_robots.safety.approval import Leave
 from strands_robots.safety.gate import REFUSALS, MotionGate, MotionRequest, refusal_envelope
 from strands_robots.serving.control import NotHolderError, leases_of
-from strands_robots.serving.leave import Command, MotionRules, RefusalReason, Refused
+from strands_robots.serving.leave import Command, MotionRules
+from strands_robots.serving.refused import RefusalReason, Refused
 from strands_robots.serving.verbs import Arguments, Kind, Verb
 from strands_robots.serving.workers import Share, Shares, shares_of
 from strands_robots.stop_log import stop_logger

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from strands_robots import settings
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.errors import RefusalError, StrandsRobotsError, UnreachableError
+from strands_robots.fleet.callers import TOOL
 from strands_robots.fleet.mesh_settings import MeshSettings
 from strands_robots.fleet.profiles import profile_for
 from strands_robots.fleet.refusals import said
@@ -22,9 +23,6 @@ from strands_robots.utils import ValidationError
 
 if TYPE_CHECKING:
     from strands_robots.fleet.adapter import FoundRobot, NetworkAdapter
-
-SOURCE = "robot-mesh-tool"
-"""Caller's name in the tool's calls; an allowlist of a robot must include it."""
 
 ANSWER_S = 10.0
 STOP_S = 5.0
@@ -150,7 +148,7 @@ def on_mesh() -> Iterator[NetworkAdapter]:
     if profile is not None and stated is None:
         # The mesh of the environment may be another fleet's.
         raise UnreachableError(f"the connection profile {profile.label} has no mesh")
-    with MeshSettings(stated or {}).held(), joining.joined_mesh(None, visitor_id(SOURCE), "tool") as mesh:
+    with MeshSettings(stated or {}).held(), joining.joined_mesh(None, visitor_id(TOOL), "tool") as mesh:
         yield MeshNetwork.joined(mesh)
 
 
@@ -170,7 +168,7 @@ def on_device_connect() -> Iterator[NetworkAdapter]:
     link = usual_link() if flags is None else flags.link()
     if not link.loopback_only:
         insecure_opt_in(None if flags is None else flags.opted_in, link, stated=True)
-    network = DeviceConnectNetwork(link, SOURCE)
+    network = DeviceConnectNetwork(link, TOOL)
     network.open()
     try:
         yield network

@@ -20,7 +20,6 @@ from strands_robots.utils import plain_text
 if TYPE_CHECKING:
     from strands_robots.device_connect import FleetClient
     from strands_robots.device_connect.backends import LinkConfig
-    from strands_robots.device_connect.discovery import Peer
 
 logger = logging.getLogger(__name__)
 
@@ -29,12 +28,7 @@ KEYS_UNUSABLE = "the enrolled keys cannot be used"
 
 def lockable_robots(fleet: FleetClient, seconds: float = 2.0) -> list[str]:
     """Return the devices on the network that can be locked and resumed."""
-    return [peer.id for peer in fleet.peers(seconds) if is_lockable(peer)]
-
-
-def is_lockable(peer: Peer) -> bool:
-    """Return True for a device that can be locked and resumed."""
-    return any(each.get("name") == "resume" for each in peer.functions)
+    return [peer.id for peer in fleet.peers(seconds) if peer.lockable]
 
 
 def ask_robots(

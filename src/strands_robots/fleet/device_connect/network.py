@@ -18,31 +18,19 @@ from strands_robots.errors import (
     UnreachableError,
 )
 from strands_robots.fleet.adapter import CLOSED, DEVICE_CONNECT, FIND_S, STOP_S, FoundRobot, OnEvent
-from strands_robots.fleet.cached_keys import CachedKeys
-from strands_robots.fleet.device_connect.events import robot_event
-from strands_robots.fleet.device_connect.lockouts import (
-    ask_robot,
-    ask_robots,
-    enrolled_keys,
-    is_lockable,
-    lockable_robots,
-    resume_robots,
-    usable_keys,
-)
-from strands_robots.fleet.device_connect.stops import network_key, silence_of, stop_found, stopped_and_locked
 from strands_robots.fleet.link_flags import described
-from strands_robots.fleet.lockout_report import LockoutReport, Resumed
-from strands_robots.fleet.stop_button import StopSender
-from strands_robots.safety.identity import KeyFileError
-from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope
-from strands_robots.safety.stop_roster import StopOutcome
 from strands_robots.utils import ValidationError, plain_text
 
 if TYPE_CHECKING:
     from strands_robots.device_connect.backends import LinkConfig
     from strands_robots.device_connect.client import FleetClient
     from strands_robots.device_connect.discovery import Peer
+    from strands_robots.fleet.cached_keys import CachedKeys
+    from strands_robots.fleet.lockout_report import LockoutReport, Resumed
+    from strands_robots.fleet.stop_button import StopSender
+    from strands_robots.safety.network_key import NetworkKey
+    from strands_robots.safety.stop_roster import StopOutcome
     from strands_robots.serving.advertised import AdvertisedVerb
 
 T = TypeVar("T")
@@ -87,11 +75,15 @@ class DeviceConnectNetwork:
         self._client, self._open, self._given = client, joined, joined
         self._peers: dict[str, Peer] = {}
         self._discoveries = 0
-        self._keys = CachedKeys(lambda: usable_keys(client.link))
+        self._keys: CachedKeys | None = None
 
     def open(self) -> None:
         """Connect; raise :class:`UnreachableError` where that fails."""
         from device_connect_edge.messaging import MessagingError  # noqa: PLC0415 - loaded when it is used
+
+        # A program that stays for a while loads now what a stop must not wait for.
+        import strands_robots.device_connect.safety_controller  # noqa: PLC0415
+        import strands_robots.fleet.device_connect.stops  # noqa: PLC0415, F401
 
         try:
             self._client.__enter__()
@@ -128,6 +120,9 @@ class DeviceConnectNetwork:
 
     def enrolled_key(self, robot: str) -> bytes | None:
         """Return the device's enrolled key."""
+        from strands_robots.fleet.device_connect.lockouts import enrolled_keys  # noqa: PLC0415 - a call need not load it
+        from strands_robots.safety.identity import KeyFileError  # noqa: PLC0415 - as above
+
         try:
             return enrolled_keys(self._client.link).get(robot)
         except KeyFileError as exc:
@@ -176,6 +171,8 @@ class DeviceConnectNetwork:
 
     def silence(self, robot: str) -> str:
         """Return what this machine remembers of the device's last messages."""
+        from strands_robots.fleet.device_connect.stops import silence_of  # noqa: PLC0415 - a call need not load it
+
         return silence_of(self._connected, robot)
 
     async def call_async(self, robot: str, verb: str, arguments: Mapping[str, Any], within: float) -> Envelope:
@@ -197,6 +194,8 @@ class DeviceConnectNetwork:
     @property
     def key(self) -> NetworkKey:
         """The name of the tenant's network."""
+        from strands_robots.fleet.device_connect.stops import network_key  # noqa: PLC0415 - a call need not load it
+
         return network_key(self._client.link)
 
     @property
@@ -211,6 +210,8 @@ class DeviceConnectNetwork:
 
     def stop_all(self, timeout: float = STOP_S) -> tuple[dict[str, Envelope], StopOutcome]:
         """Stop each device when it is found."""
+        from strands_robots.fleet.device_connect.stops import stop_found  # noqa: PLC0415 - a call need not load it
+
         with _carried():
             return stop_found(self._connected, timeout)
 
@@ -227,6 +228,8 @@ class DeviceConnectNetwork:
 
         A device in reach that did not act on it gets a plain ``stop`` as well.
         """
+        from strands_robots.fleet.device_connect.stops import stopped_and_locked  # noqa: PLC0415 - a call need not load it
+
         with _carried():
             return stopped_and_locked(
                 self._connected,
@@ -261,16 +264,26 @@ class DeviceConnectNetwork:
 
     def lockable(self, timeout: float = FIND_S) -> list[str]:
         """Return the devices that have a ``resume``."""
+        from strands_robots.fleet.device_connect.lockouts import lockable_robots  # noqa: PLC0415 - a call need not load it
+
         with _carried():
             return lockable_robots(self._connected, timeout)
 
     def lockouts(self, robots: Iterable[str], timeout: float, *, signed: bool = False) -> list[LockoutReport]:
         """Ask each device for its status."""
+        from strands_robots.fleet.device_connect.lockouts import ask_robots  # noqa: PLC0415 - a call need not load it
+
         with _carried():
             return ask_robots(self._connected, dict.fromkeys(robots), timeout, signed=signed)
 
     async def lockout_async(self, robot: str, within: float) -> LockoutReport:
         """Ask the device for its status."""
+        from strands_robots.fleet.cached_keys import CachedKeys  # noqa: PLC0415 - a call need not load it
+        from strands_robots.fleet.device_connect.lockouts import ask_robot, usable_keys  # noqa: PLC0415 - as above
+        from strands_robots.fleet.lockout_report import LockoutReport  # noqa: PLC0415 - as above
+
+        if self._keys is None:
+            self._keys = CachedKeys(lambda: usable_keys(self._client.link))
         try:
             return await ask_robot(self._connected, robot, within, self._keys.read())
         except UnreachableError as exc:
@@ -278,11 +291,15 @@ class DeviceConnectNetwork:
 
     def resume(self, reports: Sequence[LockoutReport], signer: Any, timeout: float) -> dict[str, Resumed]:
         """Send each device a resume of each of its lockouts."""
+        from strands_robots.fleet.device_connect.lockouts import resume_robots  # noqa: PLC0415 - a call need not load it
+
         with _carried():
             return resume_robots(self._connected, reports, signer, timeout)
 
     def subscribe(self, robot: str, on_event: OnEvent) -> Callable[[], None]:
         """Receive the device's events."""
+        from strands_robots.fleet.device_connect.events import robot_event  # noqa: PLC0415 - a call need not load it
+
         with _carried():
             subscription = self._connected.subscription(robot, lambda event: on_event(robot_event(event)))
 
@@ -329,7 +346,7 @@ def _found(peer: Peer) -> FoundRobot:
         plain_text(peer.type, 100),
         plain_text(peer.model, 100),
         peer.tags,
-        must_answer=peer.stop_verb is not None or is_lockable(peer),
+        must_answer=peer.stop_verb is not None or peer.lockable,
         status=plain_text(peer.status.get("availability"), 100),
         age_s=age,
         facts={
