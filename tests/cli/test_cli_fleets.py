@@ -49,6 +49,15 @@ def test_flag_names_the_network_and_explicit_flags_win(write: Write) -> None:
     assert Network(profile="lab", nats=[], connect=[]).link().meet_port == 7633
 
 
+def test_file_that_changes_gives_one_command_no_second_fleet(write: Write) -> None:
+    write("port = 7633")
+    network = Network(profile="lab")
+    assert network.link().meet_port == 7633
+    write("port = 7634")
+    assert network.link().meet_port == 7633
+    assert Network(profile="lab").link().meet_port == 7634
+
+
 def test_default_profile_is_that_of_the_setting(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
     file = write("port = 7633")
     for value in ("lab", str(file)):

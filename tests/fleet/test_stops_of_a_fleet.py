@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
+import threading
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
@@ -16,6 +17,7 @@ from strands_robots.fleet import Fleet
 from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
 from strands_robots.fleet.enrollment import Enrolled, enrolled_robots
 from strands_robots.safety.identity import ROBOTS, KeyFile
+from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.roster import Roster, RosterRow
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.safety.sightings import Known
@@ -269,3 +271,41 @@ def test_two_keys_of_one_id_are_both_left_out(fleet: Fleet, near: ScriptedNetwor
         ("arm-1", "arm-2"), Enrolled.NEW
     )
     assert sorted(enrolled_robots()) == ["arm-1", "arm-2"]
+
+
+def test_log_of_an_argument_is_written_after_the_stop_has_left(fleet: Fleet, near: ScriptedNetwork) -> None:
+    class Noting(logging.Handler):
+        """A handler that may block: it notes how many stops have left before it is called."""
+
+        left: ClassVar[list[int]] = []
+
+        def emit(self, record: logging.LogRecord) -> None:
+            self.left.append(len(near.estops))
+
+    log, handler = logging.getLogger("strands_robots.fleet.fleet"), Noting()
+    log.addHandler(handler)
+    try:
+        fleet.estop(signing_key="no key")
+    finally:
+        log.removeHandler(handler)
+    assert handler.left == [1]
+
+
+def test_disk_that_hangs_hides_no_verdict_of_another_network(
+    near: ScriptedNetwork, far: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    far.unreachable, released, waited = "no hub", threading.Event(), list[bool]()
+    read = Roster.of
+
+    def hang(network: NetworkKey, *pressed: float) -> Roster:
+        if network == far.key:
+            waited.append(released.wait(20))
+        return read(network, *pressed)
+
+    monkeypatch.setattr(Roster, "of", hang)
+    try:
+        with Fleet([near, far]) as fleet:
+            assert fleet.stop()["arm-1"].stopped is True
+        assert waited == []
+    finally:
+        released.set()

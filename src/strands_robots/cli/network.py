@@ -7,6 +7,7 @@ import shlex
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, fields
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -35,7 +36,7 @@ def _option(flag: str, text: str, **more: Any) -> Any:
     return typer.Option(flag, help=text, rich_help_panel="Network", **more)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Network:
     """Network flags as the user gave them, over a connection profile."""
 
@@ -115,8 +116,9 @@ class Network:
         given = {each.name: getattr(self, each.name) for each in fields(self) if each.name != "profile"}
         return {name: value for name, value in given.items() if value is not None and value not in (False, [])}
 
-    @property
+    @cached_property
     def _profile(self) -> FleetProfile | None:
+        # Read once: a file that changes meanwhile must not give one command two fleets.
         return profile_for(self.profile, self._given)
 
     def _flags_over(self, profile: FleetProfile | None) -> LinkFlags:

@@ -271,8 +271,6 @@ class Fleet:
         scope, unread = stop_scope(named or None, cell)
         signer, unfit = _signer(signing_key)
         notes = tuple(filter(None, (cut, unread, unfit)))
-        for note in notes:
-            logger.warning("Ignored: %s.", note)
 
         def remembers(meant: Scope) -> bool:
             # Of the robots that a stop means none need be on each network; only where none is on any all are stopped.
@@ -291,6 +289,9 @@ class Fleet:
             return NetworkVerdict(network.name, outcome, not_here=_not_remembered(network, strange))
 
         stops = [*side_by_side(stopped, joined), *self._not_reached(joined)]
+        # After the stop: a handler of the log may block.
+        for note in notes:
+            logger.warning("Ignored: %s.", note)
         return FleetVerdict(stops, estop_id, tuple(self._robots) if scope.everything else tuple(scope.only), notes)
 
     def lockouts(self, timeout: float = FIND_S) -> dict[str, LockoutReport]:

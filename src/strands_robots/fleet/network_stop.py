@@ -22,7 +22,8 @@ def not_left(network: NetworkAdapter, why: object) -> NetworkVerdict:
     said = plain_text(str(why)) or type(why).__name__
     try:
         roster = StopRoster(network.key)
-        roster.read()
+        # On a thread: a disk that hangs is waited for within a bound, by the outcome.
+        threading.Thread(target=roster.read, name="stop roster", daemon=True).start()
         outcome = measured({}, roster, Sending(left=False))
     except Exception as exc:  # noqa: BLE001 - the roster's disk must not hide the verdicts of other networks
         logger.warning("The roster of %s cannot be read: %s", network.name, exc)
