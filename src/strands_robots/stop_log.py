@@ -76,9 +76,8 @@ class LogWriter(logging.Filter):
                 dropped, self.dropped = self.dropped, 0
                 try:
                     if dropped:
-                        text = "%d log records were dropped while a handler was blocked."
                         logger.callHandlers(
-                            logger.makeRecord(logger.name, logging.WARNING, "", 0, text, (dropped,), None)
+                            logger.makeRecord(logger.name, logging.WARNING, "", 0, DROPPED, (dropped,), None)
                         )
                     logger.callHandlers(record)
                 except Exception:  # noqa: BLE001 - a handler of somebody else's must not end the log of the others

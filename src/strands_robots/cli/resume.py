@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -21,9 +21,6 @@ from strands_robots.safety.persistence import LockoutStore, StoredLockout
 from strands_robots.safety.unheard import Unheard, unheard_now, unheard_since
 from strands_robots.state_files import state_dir
 from strands_robots.utils import device_id, number, operator
-
-if TYPE_CHECKING:
-    pass
 
 THEN = "They move again when they get a new command."
 

@@ -61,6 +61,7 @@ class EmergencyStop:
         controller.press(estop_id)
         self._found: Future[FoundDevices] = Future()
         look_up = None if devices is None else self._found.result
+        self._looks_up = devices is not None
         self._search = RosterSearch(controller, estop_id, network, look_up, scope, named=named)
         threading.Thread(target=self._run, name="estop", daemon=True).start()
         if devices is not None:
@@ -133,7 +134,7 @@ class EmergencyStop:
     def _progress(self, progress: Progress) -> None:
         first, self.latest = self.latest is None, progress
         self._search.begin(progress)
-        if first:
+        if first and self._looks_up:
             threading.Thread(target=self._begin_search, name="estop lookup", daemon=True).start()
 
     def _begin_search(self) -> None:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from strands_robots import settings
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.errors import RefusalError, StrandsRobotsError, UnreachableError
+from strands_robots.fleet.adapter import STOP_S
 from strands_robots.fleet.callers import TOOL
 from strands_robots.fleet.mesh_settings import MeshSettings
 from strands_robots.fleet.profiles import profile_for
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
     from strands_robots.fleet.adapter import FoundRobot, NetworkAdapter
 
 ANSWER_S = 10.0
-STOP_S = 5.0
 
 OWN_BYTES = 16_000
 """Size of what the list of robots says on one robot's own verbs."""

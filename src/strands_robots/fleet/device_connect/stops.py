@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from strands_robots.envelope import Envelope
+from strands_robots.fleet.adapter import FIND_S, STOP_S
 from strands_robots.fleet.emergency_stop import Devices, EmergencyStop
 from strands_robots.fleet.stop_answers import measured, roster_verdict, with_plain_stops, with_reasons
 from strands_robots.safety.roster_search import FoundDevices
@@ -19,17 +20,11 @@ if TYPE_CHECKING:
     from strands_robots.device_connect.backends import LinkConfig
     from strands_robots.safety.network_key import NetworkKey
 
-STOP_S = 5.0
-"""Seconds in which a device has to answer a plain stop."""
-
 ESTOP_S = 1.5
 """Seconds in which robots answer an emergency stop; it is repeated until then."""
 
-SEARCH_S = 2.0
-"""Seconds at most in which the devices in reach are looked for."""
-
 SEARCH_SHARE = 2 / 3
-"""Part of the deadline in which they are looked for; the rest is for their answers."""
+"""Part of the deadline in which devices are looked for; the rest is for their answers."""
 
 
 def stop_everything(fleet: FleetClient) -> Envelope:
@@ -129,7 +124,7 @@ def devices_on(link: LinkConfig, deadline_s: float) -> Devices:
 
         with FleetClient(link) as fleet:
             begun.wait()
-            return _in_reach(fleet, min(SEARCH_S, deadline_s * SEARCH_SHARE), thorough=True)
+            return _in_reach(fleet, min(FIND_S, deadline_s * SEARCH_SHARE), thorough=True)
 
     return found
 
@@ -141,6 +136,6 @@ def network_key(link: LinkConfig) -> NetworkKey:
     return network_of(link)
 
 
-def _in_reach(fleet: FleetClient, timeout: float = SEARCH_S, **options: bool) -> FoundDevices:
+def _in_reach(fleet: FleetClient, timeout: float = FIND_S, **options: bool) -> FoundDevices:
     peers = fleet.peers(timeout, **options)
     return FoundDevices({peer.id: (peer.stop_verb is not None, peer.cell) for peer in peers}, fleet.stale)
