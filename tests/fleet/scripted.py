@@ -126,6 +126,10 @@ class ScriptedNetwork:
     def bears(self, robot: str) -> bool:
         return robot in self.robots
 
+    def reaches(self, robot: str) -> bool:
+        self.asked.append(robot)
+        return robot in self.robots
+
     def session(self, robot: str) -> object:
         return self.sessions
 
@@ -174,8 +178,8 @@ class ScriptedNetwork:
         except RefusalError as exc:
             return error(exc.why)
 
-    async def stop_async(self, robot: str, within: float = STOP_S) -> Envelope:
-        return self.stop(robot, within) or error("none", stopped=None)
+    async def stop_async(self, robot: str, within: float = STOP_S, robot_name: str = "") -> Envelope:
+        return self.stop(robot, within, robot_name) or error("none", stopped=None)
 
     @property
     def key(self) -> NetworkKey:

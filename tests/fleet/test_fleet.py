@@ -193,15 +193,22 @@ def test_network_that_fails_is_absent_and_the_others_go_on(
 
 
 def test_other_network_is_left_where_one_fails(
-    device_connect: ScriptedNetwork, mesh: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch
+    device_connect: ScriptedNetwork,
+    mesh: ScriptedNetwork,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     def lost() -> None:
         raise Lost("bad certificate")
 
     with monkeypatch.context() as patch:
         patch.setattr(device_connect, "open", lost)
-        with pytest.raises(Lost), Fleet([device_connect, mesh]):
+        with pytest.raises(Lost), Fleet([device_connect]):
             pytest.fail("joined")
+        with Fleet([device_connect, mesh]) as fleet:
+            assert [each.id for each in fleet.robots()] == ["arm-2", "both"]
+            assert fleet.absent == {DEVICE_CONNECT: "Lost: bad certificate"}
+    assert "device_connect cannot be joined" in caplog.text
     assert not mesh.joined
     with Fleet([device_connect, mesh]):
         monkeypatch.setattr(device_connect, "close", lost)

@@ -247,7 +247,7 @@ class TestGivenBesides:
         links: list[LinkConfig] = []
         monkeypatch.setattr(
             "strands_robots.fleet.device_connect.network.DeviceConnectNetwork.__init__",
-            lambda self, link, source: links.append(link),
+            lambda self, link, source, preload: links.append(link),
         )
         write('nats = "nats://127.0.0.1:4333"')
         for empty in ((), [], iter(())):
@@ -269,7 +269,7 @@ class TestGivenBesides:
         named: list[str] = []
         monkeypatch.setattr(
             "strands_robots.fleet.device_connect.network.DeviceConnectNetwork.__init__",
-            lambda self, link, source: named.append(source),
+            lambda self, link, source, preload: named.append(source),
         )
         write('name = "bench"')
         connect("lab")

@@ -164,7 +164,7 @@ def test_resume_of_an_absent_robot_is_refused_and_frees_none(fleet: Fleet, near:
 def test_robots_that_are_not_heard_are_named_before_others_are_freed(
     fleet: Fleet, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    from strands_robots.fleet import fleet as module  # noqa: PLC0415 - this test alone
+    from strands_robots.fleet import all_lockouts as module  # noqa: PLC0415 - this test alone
     from strands_robots.safety.unheard import Unheard  # noqa: PLC0415 - as above
 
     monkeypatch.setattr(module, "unheard_now", lambda *_: Unheard(("arm-7",)))

@@ -129,6 +129,15 @@ class NetworkAdapter(Protocol):
     def bears(self, robot: str) -> bool:
         """Return whether a robot of this id is known here; asks no one."""
 
+    def reaches(self, robot: str) -> bool:
+        """Return whether a robot of this id is in reach, once that can be known.
+
+        It may be asked.
+
+        Raises:
+            RefusalError: the network does not carry the question.
+        """
+
     def session(self, robot: str) -> object:
         """Return what differs once another robot may answer to this id; asks no one."""
 
@@ -187,8 +196,10 @@ class NetworkAdapter(Protocol):
     async def call_async(self, robot: str, verb: str, arguments: Mapping[str, Any], within: float) -> Envelope:
         """Call a verb from an event loop; every failure is an answer of status error."""
 
-    async def stop_async(self, robot: str, within: float = STOP_S) -> Envelope:
-        """Stop a robot from an event loop, and wait for no other call; never raises.
+    async def stop_async(self, robot: str, within: float = STOP_S, robot_name: str = "") -> Envelope:
+        """Stop a robot, or one of a world, from an event loop; never raises.
+
+        It waits for no other call.
 
         It is sent whether or not the robot is known. ``stopped`` is None without an answer.
         """

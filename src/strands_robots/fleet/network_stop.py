@@ -1,4 +1,4 @@
-"""Stop on one network that cannot fail the stops on others."""
+"""Verdict of a network that a stop did not reach."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from concurrent.futures import Future
 from strands_robots.fleet.adapter import NetworkAdapter
 from strands_robots.fleet.fleet_verdict import NetworkVerdict
 from strands_robots.fleet.stop_answers import measured
+from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.silence import Sending
 from strands_robots.safety.stop_roster import StopOutcome, StopRoster
 from strands_robots.utils import plain_text
@@ -17,18 +18,24 @@ from strands_robots.utils import plain_text
 logger = logging.getLogger(__name__)
 
 
-def not_left(network: NetworkAdapter, why: object) -> NetworkVerdict:
-    """Return the verdict of a network that a stop did not reach."""
+def not_left(network: str, key: Callable[[], NetworkKey], why: object) -> NetworkVerdict:
+    """Return the verdict of a network that a stop did not reach.
+
+    Args:
+        network: its name.
+        key: returns the name under which its robots are remembered.
+        why: the reason.
+    """
     said = plain_text(str(why)) or type(why).__name__
     try:
-        roster = StopRoster(network.key)
+        roster = StopRoster(key())
         # On a thread: a disk that hangs is waited for within a bound, by the outcome.
         threading.Thread(target=roster.read, name="stop roster", daemon=True).start()
         outcome = measured({}, roster, Sending(left=False))
     except Exception as exc:  # noqa: BLE001 - the roster's disk must not hide the verdicts of other networks
-        logger.warning("The roster of %s cannot be read: %s", network.name, exc)
-        return NetworkVerdict(network.name, absent=said)
-    return NetworkVerdict(network.name, outcome, absent=said)
+        logger.warning("The roster of %s cannot be read: %s", network, exc)
+        return NetworkVerdict(network, absent=said)
+    return NetworkVerdict(network, outcome, absent=said)
 
 
 def stop_beside(network: NetworkAdapter, stop: Callable[[NetworkAdapter], StopOutcome]) -> Future[NetworkVerdict]:
@@ -50,7 +57,7 @@ def stop_beside(network: NetworkAdapter, stop: Callable[[NetworkAdapter], StopOu
             finally:
                 network.close()
         except Exception as exc:  # noqa: BLE001 - a stop that fails is a verdict, whatever it raised
-            verdict.set_result(not_left(network, exc))
+            verdict.set_result(not_left(network.name, lambda: network.key, exc))
         else:
             verdict.set_result(NetworkVerdict(network.name, outcome))
 

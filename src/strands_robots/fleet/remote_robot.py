@@ -16,14 +16,14 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Self
 
 from strands_robots.envelope import Envelope, is_error
-from strands_robots.errors import AmbiguousRobotError, NoSuchRobotError, RefusalError, RobotError, UnknownVerbError
+from strands_robots.errors import NoSuchRobotError, RefusalError, RobotError, UnknownVerbError
 from strands_robots.fleet.adapter import STOP_S, FoundRobot, NetworkAdapter
 from strands_robots.fleet.description import docstring, python_name, signature
 from strands_robots.fleet.event_feed import EventFeed
 from strands_robots.fleet.fleet_verdict import combined, verdict_of_answer
 from strands_robots.fleet.lease import HeldLease, SharedLease
 from strands_robots.fleet.refusals import refusal_of
-from strands_robots.fleet.shared_id import SharedId
+from strands_robots.fleet.shared_id import SharedId, decided
 from strands_robots.fleet.side_by_side import side_by_side
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.advertised import AdvertisedVerb, RobotDescription
@@ -391,17 +391,10 @@ class RemoteRobot:
         bearers = [each for each in networks if each.bears(self.address)] if len(networks) > 1 else ()
         if len(bearers) < 2:
             return False
-        decided = self._shared_id.decide(self.address, bearers)
-        if decided is None:
-            named = " and ".join(each.name for each in bearers)
-            raise AmbiguousRobotError(
-                f"{verb} is sent to neither: {named} both have a robot of this id, and no key decides",
-                robot=self.id,
-                verb=verb,
-            )
-        if decided is self._network:
+        network = decided(self._shared_id, self.address, verb, bearers)
+        if network is self._network:
             return False
-        self._network, self._described_as = decided, None
+        self._network, self._described_as = network, None
         return True
 
     def _unknown(self, verb: str) -> UnknownVerbError:

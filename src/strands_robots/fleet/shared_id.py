@@ -6,7 +6,7 @@ import secrets
 import threading
 from collections.abc import Mapping, Sequence
 
-from strands_robots.errors import RefusalError
+from strands_robots.errors import AmbiguousRobotError, RefusalError
 from strands_robots.fleet.adapter import NetworkAdapter
 from strands_robots.fleet.side_by_side import side_by_side
 from strands_robots.safety.statements import Purpose, own_key
@@ -45,6 +45,23 @@ class SharedId:
                 # A robot that did not answer, or not signed, is asked again.
                 self._asked = asked if self.decided is not None else ()
             return self.decided
+
+
+def decided(shared_id: SharedId, robot: str, verb: str, bearers: Sequence[NetworkAdapter]) -> NetworkAdapter:
+    """Return the network that a motion goes to.
+
+    Raises:
+        AmbiguousRobotError: no key decides.
+    """
+    network = shared_id.decide(robot, bearers)
+    if network is None:
+        named = " and ".join(each.name for each in bearers)
+        raise AmbiguousRobotError(
+            f"{verb} is sent to neither: {named} both have a robot of this id, and no key decides",
+            robot=robot,
+            verb=verb,
+        )
+    return network
 
 
 def _proven(robot: str, bearers: Sequence[NetworkAdapter], keys: Sequence[bytes | None]) -> NetworkAdapter | None:

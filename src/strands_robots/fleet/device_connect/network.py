@@ -52,6 +52,7 @@ class DeviceConnectNetwork:
     Args:
         link: how to reach it.
         source: the caller's name that goes with every call.
+        preload: load at joining what a stop must not wait for.
     """
 
     name = DEVICE_CONNECT
@@ -59,10 +60,11 @@ class DeviceConnectNetwork:
     reads: Mapping[str, str] = {"status": "getStatus", "state": "getState", "features": "getFeatures"}
     starts = "execute"
 
-    def __init__(self, link: LinkConfig, source: str) -> None:
+    def __init__(self, link: LinkConfig, source: str, *, preload: bool = False) -> None:
         from strands_robots.device_connect.client import FleetClient  # noqa: PLC0415 - loaded when it is used
 
         self._take(FleetClient(link, source), joined=False)
+        self._preload = preload
 
     @classmethod
     def joined(cls, client: FleetClient) -> Self:
@@ -81,9 +83,9 @@ class DeviceConnectNetwork:
         """Connect; raise :class:`UnreachableError` where that fails."""
         from device_connect_edge.messaging import MessagingError  # noqa: PLC0415 - loaded when it is used
 
-        # A program that stays for a while loads now what a stop must not wait for.
-        import strands_robots.device_connect.safety_controller  # noqa: PLC0415
-        import strands_robots.fleet.device_connect.stops  # noqa: PLC0415, F401
+        if self._preload:
+            import strands_robots.device_connect.safety_controller  # noqa: PLC0415
+            import strands_robots.fleet.device_connect.stops  # noqa: PLC0415, F401
 
         try:
             self._client.__enter__()
@@ -113,6 +115,15 @@ class DeviceConnectNetwork:
     def bears(self, robot: str) -> bool:
         """Return whether a device of this id was found or has announced itself."""
         return robot in self._peers or (self._open and robot in self._client.known())
+
+    def reaches(self, robot: str) -> bool:
+        """Return whether a device of this id is known, answers, or is slow to answer."""
+        try:
+            return self.bears(robot) or self.describe(robot, anew=True) is not None or self.bears(robot)
+        except NoSuchRobotError:
+            return False
+        except NoAnswerError:
+            return True
 
     def session(self, robot: str) -> object:
         """Return the number of discoveries: a device has no session."""
@@ -184,10 +195,10 @@ class DeviceConnectNetwork:
                 raise
             return error(_why(exc))
 
-    async def stop_async(self, robot: str, within: float = STOP_S) -> Envelope:
+    async def stop_async(self, robot: str, within: float = STOP_S, robot_name: str = "") -> Envelope:
         """Stop the device by ``stop``, else by ``stopMotion``."""
         try:
-            return await self._connected.stop_async(robot, within)
+            return await self._connected.stop_async(robot, within, robot_name)
         except Exception as exc:  # noqa: BLE001 - a stop that fails is a verdict, whatever it raised
             return error(_why(exc), stopped=None)
 

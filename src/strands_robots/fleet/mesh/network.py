@@ -155,6 +155,10 @@ class MeshNetwork:
         mesh = self._joined_mesh
         return is_in_reach(mesh, robot) and _has_robot(mesh.get_peer(robot) or {})
 
+    def reaches(self, robot: str) -> bool:
+        """Return whether a robot of this id is in reach, once peers are known."""
+        return self._waited_for(robot) and self.bears(robot)
+
     def session(self, robot: str) -> object:
         """Return the session of the peer, and the number of discoveries."""
         return self._joined_mesh.peer_wire_zid(robot), self._discoveries
@@ -251,10 +255,12 @@ class MeshNetwork:
         except RefusalError as exc:
             return error(exc.why)
 
-    async def stop_async(self, robot: str, within: float = STOP_S) -> Envelope:
+    async def stop_async(self, robot: str, within: float = STOP_S, robot_name: str = "") -> Envelope:
         """Stop the peer on a thread that no call takes."""
         mesh = self._mesh
-        return error(CLOSED, stopped=None) if mesh is None else await self._requests.stop(mesh, robot, within)
+        if mesh is None:
+            return error(CLOSED, stopped=None)
+        return await self._requests.stop(mesh, robot, within, robot_name)
 
     @property
     def key(self) -> NetworkKey:

@@ -49,9 +49,13 @@ class PeerRequests:
         result = reply.get("result")
         return dict(result) if isinstance(result, Mapping) else error(f"{robot} answered with an unknown result shape.")
 
-    async def stop(self, mesh: Mesh, robot: str, seconds: float) -> Envelope:
+    async def stop(self, mesh: Mesh, robot: str, seconds: float, robot_name: str = "") -> Envelope:
         """Stop a peer; *stopped* counts only where an enrolled robot has signed it."""
-        return await _done(self._stops, lambda: _stopped(mesh, robot, seconds), lambda why: error(why, stopped=None))
+        return await _done(
+            self._stops,
+            lambda: _stopped(mesh, robot, seconds, robot_name),
+            lambda why: error(why, stopped=None),
+        )
 
     async def lockout(self, mesh: Mesh, robot: str, seconds: float) -> LockoutReport:
         """Ask a peer for its status."""
@@ -67,8 +71,9 @@ class PeerRequests:
             pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _stopped(mesh: Mesh, robot: str, seconds: float) -> Envelope:
-    reply = mesh.send(robot, {"action": "stop"}, seconds)
+def _stopped(mesh: Mesh, robot: str, seconds: float, robot_name: str) -> Envelope:
+    one = {"robot_name": robot_name} if robot_name else {}
+    reply = mesh.send(robot, {"action": "stop", **one}, seconds)
     return stop_answer(robot, reply, enrolled_peers())
 
 

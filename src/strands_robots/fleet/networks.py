@@ -1,0 +1,520 @@
+"""Networks of one caller as one: each robot is called on the network that has it."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import threading
+import time
+from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any, Self
+
+from strands_robots.envelope import Envelope, error
+from strands_robots.errors import NoSuchRobotError, RefusalError, UnreachableError
+from strands_robots.fleet.adapter import FIND_S, STOP_S, FoundRobot, NetworkAdapter, OnEvent
+from strands_robots.fleet.fleet_verdict import combined, verdict_of_answer
+from strands_robots.fleet.shared_id import SharedId, decided
+from strands_robots.fleet.side_by_side import side_by_side
+from strands_robots.safety.stopping import StopVerdict
+from strands_robots.utils import near, plain_text
+
+if TYPE_CHECKING:
+    from strands_robots.safety.network_key import NetworkKey
+    from strands_robots.serving.advertised import AdvertisedVerb
+
+logger = logging.getLogger(__name__)
+
+AGAIN_S, AGAIN_MAX_S = 1.0, 5.0
+"""Seconds until a network that could not be joined is tried again: the first time, and at most."""
+
+SHARED_IDS_MAX = 1024
+"""Ids on several networks of which the decided network is remembered."""
+
+CLOSED = "the networks were left"
+
+
+class _Joining:
+    """One network, from the first attempt to join it to its end.
+
+    Attributes:
+        attempted: set once the first attempt is over.
+        why: the reason of the last attempt that failed; empty before the first.
+        unexpected: what an attempt raised that is no refusal.
+    """
+
+    def __init__(self, network: NetworkAdapter, *, again: bool, changed: Callable[[_Joining], None]) -> None:
+        self.network = network
+        self.attempted = threading.Event()
+        self.why = ""
+        self.unexpected: Exception | None = None
+        self._again, self._changed = again, changed
+        self._lock = threading.Lock()
+        self._closing = threading.Event()
+        self._up = False
+
+    @property
+    def up(self) -> bool:
+        """True while the network is joined."""
+        return self._up
+
+    def start(self) -> None:
+        """Join on a thread of its own, or here where the interpreter ends."""
+        try:
+            threading.Thread(target=self.run, name=f"join {self.network.name}", daemon=True).start()
+        except RuntimeError:
+            self.run()
+
+    def run(self) -> None:
+        """Join; go on trying where that is wanted."""
+        pause = AGAIN_S
+        while not self._attempt() and self._again and not self._closing.wait(pause):
+            pause = min(2 * pause, AGAIN_MAX_S)
+
+    def close(self) -> None:
+        """Leave the network; one that is being joined is left once it is."""
+        with self._lock:
+            self._closing.set()
+            joined, self._up = self._up, False
+        if joined:
+            self._leave()
+
+    def _attempt(self) -> bool:
+        try:
+            self.network.open()
+        except UnreachableError as exc:
+            self.why = exc.why
+        except Exception as exc:
+            if self.unexpected is None:
+                # The other networks are joined all the same.
+                logger.exception("%s cannot be joined.", self.network.name)
+            self.unexpected, self.why = exc, plain_text(f"{type(exc).__name__}: {exc}")
+        else:
+            self.why, self.unexpected = "", None
+            with self._lock:
+                self._up = not self._closing.is_set()
+            if not self._up:
+                self._leave()
+        self.attempted.set()
+        self._changed(self)
+        return not self.why
+
+    def _leave(self) -> None:
+        try:
+            self.network.close()
+        except Exception as exc:  # noqa: BLE001 - the others are left all the same
+            logger.warning("%s was not left in good order: %s", self.network.name, exc)
+
+
+class Networks:
+    """Networks as one: robots of all of them, each called on the network that has it.
+
+    An id on several networks is one robot where one key signs both of its answers, as
+    :class:`~strands_robots.fleet.shared_id.SharedId` decides; motions go to the network that it names. A stop goes to
+    every network, as soon as that is joined.
+
+    Args:
+        stated: the networks to join, the one whose robots win an id first.
+        absent: networks that are not joined, with the reason.
+        keys: names of absent networks under which their robots are remembered, so that a stop names these.
+        stays: go on trying to join those that are not there yet.
+
+    Attributes:
+        stated: as given.
+        keys: as given.
+        absent: networks that are not joined or do not answer, with the reason.
+    """
+
+    def __init__(
+        self,
+        stated: Sequence[NetworkAdapter],
+        absent: Mapping[str, str] | None = None,
+        keys: Mapping[str, Callable[[], NetworkKey]] | None = None,
+        *,
+        stays: bool = False,
+    ) -> None:
+        self.stated = tuple(stated)
+        self.absent: dict[str, str] = dict(absent or {})
+        self.keys = dict(keys or {})
+        self._stays = stays
+        self._joinings: tuple[_Joining, ...] = ()
+        self._change = threading.Condition()
+        self._listeners: list[Callable[[NetworkAdapter], None]] = []
+        self._told: list[NetworkAdapter] = []
+        self._shared_ids: dict[str, SharedId] = {}
+
+    def __enter__(self) -> Self:
+        self.open()
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self.close()
+
+    def open(self) -> None:
+        """Begin to join all networks; return once one of them is joined.
+
+        Raises:
+            UnreachableError: none of them can be reached, and they do not stay.
+        """
+        self._joinings = tuple(_Joining(each, again=self._stays, changed=self._changed) for each in self.stated)
+        if len(self._joinings) == 1 and not self._stays:
+            self._joinings[0].run()
+        else:
+            for each in self._joinings:
+                each.start()
+        with self._change:
+            self._change.wait_for(lambda: self.joined or all(each.attempted.is_set() for each in self._joinings))
+        unexpected = next((each.unexpected for each in self._joinings if each.unexpected), None)
+        if not self.joined and (unexpected or not self._stays):
+            self.close()
+            raise unexpected or UnreachableError(self.absences)
+
+    def close(self) -> None:
+        """Leave the networks."""
+        with self._change:
+            joinings, self._joinings = self._joinings, ()
+            self._told.clear()
+        for each in joinings:
+            each.close()
+
+    def on_joined(self, callback: Callable[[NetworkAdapter], None]) -> None:
+        """Call back with each network that is joined, now or later; on any thread."""
+        with self._change:
+            self._listeners.append(callback)
+            joined = tuple(self._told)
+        for each in joined:
+            callback(each)
+
+    @property
+    def joined(self) -> tuple[NetworkAdapter, ...]:
+        """The networks that are joined now."""
+        return tuple(each.network for each in self._joinings if each.up)
+
+    def check_opened(self) -> None:
+        """Refuse networks that were not opened, or are closed.
+
+        Raises:
+            UnreachableError: as it says.
+        """
+        if not self._joinings:
+            raise UnreachableError("not joined: use it as a context manager", remedy="with connect() as fleet: ...")
+
+    def settled(self) -> tuple[NetworkAdapter, ...]:
+        """Return the joined networks, once the first attempt to join each is over.
+
+        Raises:
+            UnreachableError: there is none.
+        """
+        self.check_opened()
+        for each in self._joinings:
+            each.attempted.wait()
+        joined = self.joined
+        if not joined:
+            raise UnreachableError(self.absences or CLOSED)
+        return joined
+
+    def awaited(self, network: NetworkAdapter) -> str:
+        """Wait for the first attempt to join; return why it is not joined, or ""."""
+        joining = next((each for each in self._joinings if each.network is network), None)
+        if joining is None:
+            return CLOSED
+        joining.attempted.wait()
+        return "" if joining.up else joining.why or CLOSED
+
+    @property
+    def absences(self) -> str:
+        """The absent networks with their reasons, as one text."""
+        return "; ".join(f"{name}: {why.rstrip('.')}" for name, why in self.absent.items())
+
+    @property
+    def reach(self) -> str:
+        """The places where robots are looked for, in words."""
+        return " ".join(each.reach for each in self.joined)
+
+    @property
+    def stale(self) -> str:
+        """Reasons why the last search may have missed robots, or ""."""
+        return " ".join(filter(None, (each.stale for each in self.joined)))
+
+    def on_each(
+        self,
+        work: Callable[[NetworkAdapter], list[Any]],
+        failed: str,
+        fatal: tuple[type[Exception], ...] = (),
+    ) -> list[tuple[NetworkAdapter, list[Any]]]:
+        """Return what ``work`` lists on each network, side by side.
+
+        One that fails is named in :attr:`absent` until it answers again.
+
+        Args:
+            work: asks one network.
+            failed: the log's words for one that fails.
+            fatal: exceptions that are raised, because no network is at fault.
+
+        Raises:
+            UnreachableError: all fail.
+        """
+
+        def asked(network: NetworkAdapter) -> list[Any] | str:
+            try:
+                return work(network)
+            except RefusalError as exc:
+                return exc.why
+            except fatal:
+                raise
+            except Exception as exc:  # noqa: BLE001 - the other networks have their robots
+                return plain_text(f"{type(exc).__name__}: {exc}")
+
+        joined, listed = self.settled(), list[tuple[NetworkAdapter, list[Any]]]()
+        for network, answer in zip(joined, side_by_side(asked, joined), strict=True):
+            self.absent.pop(network.name, None)
+            if isinstance(answer, str):
+                logger.warning("%s: %s: %s", network.name, failed, answer)
+                self.absent[network.name] = answer
+            else:
+                listed.append((network, answer))
+        if not listed:
+            raise UnreachableError(self.absences)
+        return listed
+
+    def find(self, timeout: float = FIND_S) -> dict[str, tuple[FoundRobot, NetworkAdapter]]:
+        """Look for robots; return each with the network that it is called on.
+
+        Raises:
+            UnreachableError: no network answers.
+        """
+        return _by_id(self.on_each(lambda each: each.find(timeout), "robots cannot be looked for"))
+
+    def listed(self, timeout: float | None = None) -> dict[str, tuple[FoundRobot, NetworkAdapter]]:
+        """Return all that are in reach, peers without a robot included; as :meth:`find`."""
+        return _by_id(self.on_each(lambda each: each.listed(timeout), "robots cannot be looked for"))
+
+    def bearers(self, robot: str) -> list[NetworkAdapter]:
+        """Return the networks on which a robot of this id is known; asks no one."""
+        return [each for each in self.joined if _bears(each, robot)]
+
+    def of(self, robot: str, verb: str = "", *, moves: bool = False) -> NetworkAdapter:
+        """Return the network on which a robot is called.
+
+        It is waited for as long as a network takes to know its robots; a motion waits for every network.
+
+        Args:
+            robot: its id.
+            verb: for the refusal.
+            moves: the verb moves the robot, so that only one robot of this id may get it.
+
+        Raises:
+            NoSuchRobotError: no network has it; the message names similar ones.
+            AmbiguousRobotError: two have it, and no key decides.
+        """
+        joined = self.settled()
+        if len(joined) == 1:
+            return joined[0]
+        bearers = [each for each in joined if _bears(each, robot)]
+        if not bearers or (moves and len(bearers) < len(joined)):
+            bearers = _waited_for(robot, joined, every=moves)
+        if not bearers:
+            remedy = near(robot, {name for each in joined for name in each.announced()}).strip()
+            raise NoSuchRobotError(f"No robot {robot[:100]!r} is in reach", robot=robot, verb=verb, remedy=remedy)
+        if len(bearers) == 1 or not moves:
+            return self._decided(robot, bearers) or bearers[0]
+        return decided(self._shared_id(robot), robot, verb, bearers)
+
+    def session(self, robot: str) -> object:
+        """Return what differs once another robot may answer to this id; asks no one."""
+        return tuple((each.name, each.session(robot)) for each in self.bearers(robot))
+
+    def known(self, robot: str) -> FoundRobot:
+        """Return what is known of a robot; asks no one."""
+        bearers = self.bearers(robot)
+        return bearers[0].known(robot) if bearers else FoundRobot(robot)
+
+    def announced(self) -> Collection[str]:
+        """Return robots that have announced themselves; asks no one."""
+        return {name: None for each in self.joined for name in each.announced()}
+
+    def describe(self, robot: str, *, anew: bool = False) -> object:
+        """Return the robot's functions as they came over the wire; raises as :meth:`of`."""
+        return self.of(robot).describe(robot, anew=anew)
+
+    def verb(self, robot: str, name: str) -> AdvertisedVerb | None:
+        """Return a verb as its robot describes it; raises as :meth:`of`."""
+        return self.of(robot, name).verb(robot, name)
+
+    def call(
+        self, robot: str, verb: str, arguments: Mapping[str, Any], timeout: float, *, moves: bool = True
+    ) -> Envelope:
+        """Call a verb on the network that has the robot.
+
+        Raises:
+            RefusalError: as :meth:`NetworkAdapter.call`, or as :meth:`of`.
+        """
+        return self.of(robot, verb, moves=moves).call(robot, verb, arguments, timeout)
+
+    async def call_async(
+        self, robot: str, verb: str, arguments: Mapping[str, Any], within: float, *, moves: bool = True
+    ) -> Envelope:
+        """Call a verb from an event loop; every failure is an answer of status error."""
+        try:
+            network = await self.of_async(robot, verb, moves=moves)
+        except RefusalError as exc:
+            return error(f"{exc.why}. {exc.remedy}".strip())
+        return await network.call_async(robot, verb, arguments, within)
+
+    async def of_async(self, robot: str, verb: str = "", *, moves: bool = False) -> NetworkAdapter:
+        """Do as :meth:`of`, without blocking the event loop."""
+        joined = self.joined
+        if len(joined) == 1 and all(each.attempted.is_set() for each in self._joinings):
+            return joined[0]
+        return await asyncio.to_thread(partial(self.of, robot, verb, moves=moves))
+
+    def stop(self, robot: str, timeout: float = STOP_S, robot_name: str = "") -> dict[str, Envelope]:
+        """Stop every bearer of an id; return the answers by network.
+
+        A network that does not know the robot has no answer; without any the robot is on none of them. It never
+        raises for a network that fails.
+
+        Args:
+            robot: its id.
+            timeout: seconds in which it has to answer.
+            robot_name: stops one robot of a world alone.
+        """
+        alone = len(self.stated) == 1
+        stopped = self._stopped(robot, timeout, robot_name, insist=alone)
+        # A robot that no network knows may be slow to answer: it is stopped again, and waited for.
+        return stopped or ({} if alone else self._stopped(robot, timeout, robot_name, insist=True))
+
+    def halt(self, robot: str, robot_name: str = "") -> StopVerdict:
+        """Stop every bearer of an id; return the verdict."""
+        began, answers = time.monotonic(), self.stop(robot, robot_name=robot_name)
+        name = f"{robot}/{robot_name}" if robot_name else robot
+        verdicts = [
+            verdict_of_answer(said, name if len(answers) == 1 else f"{name} on {network}")
+            for network, said in answers.items()
+        ]
+        return combined(name, verdicts, (time.monotonic() - began) * 1000)
+
+    async def stop_async(self, robot: str, within: float = STOP_S, robot_name: str = "") -> dict[str, Envelope]:
+        """Stop every bearer of an id from an event loop; return the answers by network.
+
+        It is sent on every joined network. Once a robot has answered, networks that do not know it are not waited for.
+        """
+        sent = {asyncio.ensure_future(each.stop_async(robot, within, robot_name)): each for each in self.joined}
+        answers, graded, pending = dict[NetworkAdapter, Envelope](), set[NetworkAdapter](), set(sent)
+        while pending:
+            done, pending = await asyncio.wait(pending, return_when=asyncio.FIRST_COMPLETED)
+            answers |= {sent[each]: each.result() for each in done}
+            graded = {each for each, said in answers.items() if said.get("stopped") is not None}
+            if graded and not any(_bears(sent[each], robot) for each in pending):
+                break
+        of_bearers = {each.name: said for each, said in answers.items() if each in graded or _bears(each, robot)}
+        return of_bearers or {each.name: said for each, said in answers.items()}
+
+    def subscribe(self, robot: str, on_event: OnEvent) -> Callable[[], None]:
+        """Receive a robot's events on every network, also on those that are joined later.
+
+        Returns:
+            What ends it.
+        """
+        ends, lock, over = list[Callable[[], None]](), threading.Lock(), threading.Event()
+
+        def follow(network: NetworkAdapter) -> None:
+            try:
+                end = network.subscribe(robot, on_event)
+            except RefusalError as exc:
+                logger.warning("Events on %s cannot be received: %s", network.name, exc)
+                return
+            with lock:
+                if not over.is_set():
+                    ends.append(end)
+                    return
+            end()
+
+        self.on_joined(follow)
+
+        def end_all() -> None:
+            with self._change:
+                self._listeners.remove(follow)
+            with lock:
+                over.set()
+            for end in ends:
+                end()
+
+        return end_all
+
+    def _changed(self, joining: _Joining) -> None:
+        if joining.up:
+            self.absent.pop(joining.network.name, None)
+        elif joining.why:
+            self.absent[joining.network.name] = joining.why
+        with self._change:
+            self._change.notify_all()
+            listeners = list(self._listeners) if joining.up else []
+            self._told += [joining.network] if joining.up else []
+        for each in listeners:
+            each(joining.network)
+
+    def _stopped(self, robot: str, timeout: float, robot_name: str, *, insist: bool) -> dict[str, Envelope]:
+        def stopped(network: NetworkAdapter) -> Envelope | None:
+            try:
+                # Each stop leaves as soon as its network is up.
+                if why := self.awaited(network):
+                    return error(why, stopped=None) if insist and not self.joined else None
+                return network.stop(robot, timeout, robot_name, insist=insist)
+            except NoSuchRobotError:
+                return None
+            except Exception as exc:  # noqa: BLE001 - a stop that fails is a verdict, whatever it raised
+                return error(f"{type(exc).__name__}: {exc}", stopped=None)
+
+        answers = side_by_side(stopped, self.stated)
+        return {each.name: said for each, said in zip(self.stated, answers, strict=True) if said is not None}
+
+    def _shared_id(self, robot: str) -> SharedId:
+        with self._change:
+            if len(self._shared_ids) >= SHARED_IDS_MAX and robot not in self._shared_ids:
+                del self._shared_ids[next(iter(self._shared_ids))]
+            return self._shared_ids.setdefault(robot, SharedId())
+
+    def _decided(self, robot: str, bearers: Sequence[NetworkAdapter]) -> NetworkAdapter | None:
+        """Return the network that was decided on, where it still has the robot."""
+        known = self._shared_ids.get(robot)
+        return known.decided if known is not None and known.decided in bearers else None
+
+
+def _by_id(listed: Sequence[tuple[NetworkAdapter, list[FoundRobot]]]) -> dict[str, tuple[FoundRobot, NetworkAdapter]]:
+    found: dict[str, tuple[FoundRobot, NetworkAdapter]] = {}
+    # The first network is the last to write, so its robots win an id.
+    for network, robots in reversed(listed):
+        found |= {each.id: (each, network) for each in robots}
+    return found
+
+
+def _bears(network: NetworkAdapter, robot: str) -> bool:
+    """Return whether a network has a robot now; False for a network that was left."""
+    try:
+        return network.bears(robot)
+    except RefusalError:
+        return False
+
+
+def _waited_for(robot: str, networks: Sequence[NetworkAdapter], *, every: bool) -> list[NetworkAdapter]:
+    """Return the networks that have a robot: all, or the first one that is known to."""
+    found: dict[NetworkAdapter, bool] = {}
+    change = threading.Condition()
+
+    def ask(network: NetworkAdapter) -> None:
+        try:
+            there = network.reaches(robot)
+        except RefusalError as exc:
+            logger.debug("%s: %s cannot be looked for: %s", network.name, robot, exc)
+            there = False
+        with change:
+            found[network] = there
+            change.notify_all()
+
+    for each in networks[1:]:
+        threading.Thread(target=ask, args=(each,), name=f"look on {each.name}", daemon=True).start()
+    ask(networks[0])
+    with change:
+        change.wait_for(lambda: len(found) == len(networks) or (not every and any(found.values())))
+        return [each for each in networks if found.get(each)]

@@ -1,0 +1,100 @@
+"""Networks of a caller: of a connection profile, of flags, or of this machine."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Callable, Mapping
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
+
+from strands_robots import settings
+from strands_robots._mesh_switch import mesh_env_request
+from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH, NetworkAdapter
+from strands_robots.fleet.link_flags import LinkFlags
+from strands_robots.fleet.networks import Networks
+from strands_robots.fleet.profiles import FleetProfile
+
+if TYPE_CHECKING:
+    from strands_robots.safety.network_key import NetworkKey
+
+HUB_S = 0.2
+"""Seconds in which the mesh's hub on this machine takes a connection."""
+
+
+def networks_of(
+    profile: FleetProfile | None,
+    given: Mapping[str, Any],
+    source: str,
+    *,
+    devices: bool = True,
+    mesh: bool | None = None,
+    stays: bool = False,
+    preload: bool = False,
+) -> Networks:
+    """Return the networks of a caller, not joined yet.
+
+    Device Connect is one where its extra is installed; the mesh where it is not switched off and has a hub on this
+    machine, a stated endpoint, or a profile. The caller only dials: it is never the hub.
+
+    Args:
+        profile: a connection profile, or None.
+        given: fields of :class:`LinkFlags` that the user stated.
+        source: the caller's name.
+        devices: False leaves Device Connect out.
+        mesh: True joins the mesh in any case, False leaves it out.
+        stays: go on trying to join what is not there yet.
+        preload: load now what a stop must not wait for, as a program does that lasts longer than a command.
+
+    Raises:
+        ValidationError: the profile or the flags cannot be used.
+    """
+    absent: dict[str, str] = {}
+    keys: dict[str, Callable[[], NetworkKey]] = {}
+    networks: list[NetworkAdapter] = []
+    if not devices:
+        absent[DEVICE_CONNECT] = "it is left out"
+    elif profile is not None and not profile.reaches_devices(given):
+        absent[DEVICE_CONNECT] = f"the connection profile {profile.label} has none of its networks"
+    elif given or (profile is not None and profile.network) or find_spec("device_connect_edge") is not None:
+        from strands_robots.fleet.device_connect.network import DeviceConnectNetwork  # noqa: PLC0415 - loaded when it is used
+
+        flags = LinkFlags(**given) if profile is None else profile.flags(given)
+        networks.append(DeviceConnectNetwork(flags.link(), source, preload=preload or stays))
+    else:
+        absent[DEVICE_CONNECT] = "the extra device-connect is not installed"
+    stated = None if profile is None else profile.mesh
+    if mesh is False or mesh_env_request() is False:
+        absent[MESH] = "it is switched off"
+    elif profile is not None and stated is None and mesh is None:
+        # The mesh of the environment may be another fleet's.
+        absent[MESH] = f"the connection profile {profile.label} has none"
+    elif mesh is None and stated is None and find_spec("zenoh") is None:
+        absent[MESH] = "the extra mesh is not installed"
+    elif mesh is None and stated is None and not stays and (why := _no_hub()):
+        # Its code is not loaded: most machines have no mesh.
+        absent[MESH], keys[MESH] = why, _mesh_key
+    else:
+        from strands_robots.fleet.mesh.network import MeshNetwork  # noqa: PLC0415 - as above
+
+        networks.append(MeshNetwork(source, stated))
+    return Networks(networks, absent, keys, stays=stays)
+
+
+def _no_hub() -> str:
+    """Return why this machine has no mesh, or "" where it may have one."""
+    if settings.raw("STRANDS_MESH_BACKEND").lower() != "zenoh" or mesh_env_request():
+        return ""
+    if any(settings.items(f"{whose}_{way}") for whose in ("STRANDS_MESH", "ZENOH") for way in ("CONNECT", "LISTEN")):
+        return ""
+    port = settings.integer("STRANDS_MESH_PORT")
+    try:
+        socket.create_connection(("127.0.0.1", port), HUB_S).close()
+    except OSError:
+        return f"no mesh answers on 127.0.0.1:{port}"
+    return ""
+
+
+def _mesh_key() -> NetworkKey:
+    from strands_robots.mesh.session import network  # noqa: PLC0415 - loaded when it is used
+
+    return network()
