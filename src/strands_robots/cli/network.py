@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from strands_robots.device_connect import FleetClient
     from strands_robots.device_connect.backends import LinkConfig
     from strands_robots.fleet.adapter import NetworkAdapter
+    from strands_robots.fleet.networks import Networks
     from strands_robots.mesh import Mesh
 
 logger = logging.getLogger(__name__)
@@ -127,6 +128,33 @@ class Network:
     @property
     def _stated(self) -> LinkFlags:
         return self._flags_over(self._profile)
+
+    def networks(self, *, on_mesh: bool = False, source: str | None = None, stays: bool = False) -> Networks:
+        """Return the networks of the flags, not joined yet.
+
+        Args:
+            on_mesh: the native mesh alone.
+            source: the caller's name; by default that of :meth:`caller`.
+            stays: the command lasts, and goes on trying to join what is not there yet.
+
+        Raises:
+            CliError: the flags contradict one another, or leave this machine without authentication.
+            MissingExtraError: no network is installed.
+        """
+        from strands_robots.fleet.stated_networks import networks_of  # noqa: PLC0415 - loaded when a network is used
+
+        name = self.caller() if source is None else source
+        if on_mesh:
+            self.use_mesh()
+            return networks_of(None, {}, name, devices=False, mesh=True, stays=stays)
+        try:
+            networks = networks_of(self._profile, self._given, name, stays=stays)
+        except ValidationError as exc:
+            raise CliError(str(exc), Exit.USAGE) from exc
+        if credentials := self._stated.credentials:
+            # For the processes that a command starts, and for what it prints.
+            settings.put("MESSAGING_CREDENTIALS_FILE", str(credentials))
+        return networks
 
     @contextmanager
     def fleet(self, source: str | None = None) -> Iterator[FleetClient]:
