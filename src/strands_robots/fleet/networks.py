@@ -14,6 +14,7 @@ from strands_robots.envelope import Envelope, error
 from strands_robots.errors import NoSuchRobotError, RefusalError, UnreachableError
 from strands_robots.fleet.adapter import FIND_S, STOP_S, FoundRobot, NetworkAdapter, OnEvent
 from strands_robots.fleet.fleet_verdict import combined, verdict_of_answer
+from strands_robots.fleet.refusals import answered
 from strands_robots.fleet.shared_id import SharedId, decided
 from strands_robots.fleet.side_by_side import side_by_side
 from strands_robots.safety.stopping import StopVerdict
@@ -364,11 +365,12 @@ class Networks:
         self, robot: str, verb: str, arguments: Mapping[str, Any], within: float, *, moves: bool = True
     ) -> Envelope:
         """Call a verb from an event loop; every failure is an answer of status error."""
-        try:
+
+        async def called() -> Envelope:
             network = await self.of_async(robot, verb, moves=moves)
-        except RefusalError as exc:
-            return error(f"{exc.why}. {exc.remedy}".strip())
-        return await network.call_async(robot, verb, arguments, within)
+            return await network.call_async(robot, verb, arguments, within)
+
+        return await answered(called())
 
     async def of_async(self, robot: str, verb: str = "", *, moves: bool = False) -> NetworkAdapter:
         """Do as :meth:`of`, without blocking the event loop."""

@@ -6,10 +6,10 @@ fields, and an answer of the mesh, which is a text, by its words.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Awaitable, Mapping
 from typing import Any
 
-from strands_robots.envelope import text_of
+from strands_robots.envelope import Envelope, error, text_of
 from strands_robots.errors import (
     ApprovalError,
     ArgumentsError,
@@ -80,6 +80,14 @@ def said(refusal: RefusalError) -> str:
         return refusal.why
     why = refusal.why if refusal.why.endswith((".", "!", "?")) else f"{refusal.why}."
     return f"{why} {refusal.remedy}" if isinstance(refusal, NoSuchRobotError) and refusal.remedy else why
+
+
+async def answered(call: Awaitable[Envelope]) -> Envelope:
+    """Await a call; return a refusal as an answer of status error."""
+    try:
+        return await call
+    except RefusalError as refusal:
+        return refusal.envelope or error(said(refusal))
 
 
 def refusal_of(robot: str, verb: str, answer: Mapping[str, Any]) -> RefusalError:
