@@ -318,10 +318,10 @@ class Networks:
             AmbiguousRobotError: two have it, and no key decides.
         """
         joined = self.settled()
-        if len(joined) == 1:
-            return joined[0]
-        bearers = [each for each in joined if _bears(each, robot)]
-        if not bearers or (moves and len(bearers) < len(joined)):
+        if (network := self._at_once(robot, moves=moves)) is not None:
+            return network
+        bearers = self.bearers(robot)
+        if len(bearers) < len(joined):
             bearers = _waited_for(robot, joined, every=moves)
         if not bearers:
             remedy = near(robot, {name for each in joined for name in each.announced()}).strip()
@@ -372,11 +372,18 @@ class Networks:
 
         return await answered(called())
 
+    async def describe_async(self, robot: str, within: float) -> FoundRobot:
+        """Return a robot with its functions, as it describes itself now.
+
+        Raises:
+            RefusalError: as :meth:`of`, or it does not answer.
+        """
+        return await (await self.of_async(robot)).describe_async(robot, within)
+
     async def of_async(self, robot: str, verb: str = "", *, moves: bool = False) -> NetworkAdapter:
         """Do as :meth:`of`, without blocking the event loop."""
-        joined = self.joined
-        if len(joined) == 1 and all(each.attempted.is_set() for each in self._joinings):
-            return joined[0]
+        if (network := self._at_once(robot, moves=moves)) is not None:
+            return network
         return await asyncio.to_thread(partial(self.of, robot, verb, moves=moves))
 
     def stop(self, robot: str, timeout: float = STOP_S, robot_name: str = "") -> dict[str, Envelope]:
@@ -408,9 +415,19 @@ class Networks:
     async def stop_async(self, robot: str, within: float = STOP_S, robot_name: str = "") -> dict[str, Envelope]:
         """Stop every bearer of an id from an event loop; return the answers by network.
 
-        It is sent on every joined network. Once a robot has answered, networks that do not know it are not waited for.
+        It is sent on every network, as soon as that is joined. Once a robot has answered, networks that do not know it
+        are not waited for.
         """
-        sent = {asyncio.ensure_future(each.stop_async(robot, within, robot_name)): each for each in self.joined}
+
+        async def stopped(joining: _Joining) -> Envelope:
+            if not joining.attempted.is_set():
+                await asyncio.to_thread(joining.attempted.wait)
+            if not joining.up:
+                return error(joining.why or CLOSED, stopped=None)
+            return await joining.network.stop_async(robot, within, robot_name)
+
+        joinings = [each for each in self._joinings if each.up or not each.attempted.is_set()]
+        sent = {asyncio.ensure_future(stopped(each)): each.network for each in joinings}
         answers, graded, pending = dict[NetworkAdapter, Envelope](), set[NetworkAdapter](), set(sent)
         while pending:
             done, pending = await asyncio.wait(pending, return_when=asyncio.FIRST_COMPLETED)
@@ -491,6 +508,14 @@ class Networks:
 
         answers = side_by_side(stopped, self.stated)
         return {each.name: said for each, said in zip(self.stated, answers, strict=True) if said is not None}
+
+    def _at_once(self, robot: str, *, moves: bool) -> NetworkAdapter | None:
+        """Return the network on which a robot is called, where that is known without a question."""
+        joined = self.joined
+        if len(joined) == 1 and all(each.attempted.is_set() for each in self._joinings):
+            return joined[0]
+        bearers = self.bearers(robot)
+        return None if moves or not bearers else self._decided(robot, bearers) or bearers[0]
 
     def _shared_id(self, robot: str) -> SharedId:
         with self._change:
