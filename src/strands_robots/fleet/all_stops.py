@@ -95,8 +95,14 @@ def _on_each(networks: Networks, stop: Callable[[NetworkAdapter], NetworkVerdict
             return not_left(network.name, lambda: network.key, exc), True
 
     networks.check_opened()
-    stops = side_by_side(stopped, networks.stated)
-    absent = [not_left(name, key, networks.absent.get(name, "it is not joined")) for name, key in networks.keys.items()]
+    stated = networks.stated
+    stops = side_by_side(stopped, stated)
+    # One of them may have come since the stop left.
+    absent = [
+        not_left(name, key, networks.absent.get(name, "it is not joined"))
+        for name, key in networks.keys.items()
+        if all(name != each.name for each in stated)
+    ]
     # Of a network whose roster cannot be read it is not known whether a robot is there.
     not_reached = [*(each for each, left in stops if not left), *absent]
     reached = [each for each, left in stops if left]

@@ -118,9 +118,10 @@ class Networks:
         absent: networks that are not joined, with the reason.
         keys: names of absent networks under which their robots are remembered, so that a stop names these.
         stays: go on trying to join those that are not there yet.
+        later: absent networks that may come: each returns its network once that is there, and is asked every second.
 
     Attributes:
-        stated: as given.
+        stated: as given, and those that came later.
         keys: as given.
         absent: networks that are not joined or do not answer, with the reason.
     """
@@ -132,11 +133,13 @@ class Networks:
         keys: Mapping[str, Callable[[], NetworkKey]] | None = None,
         *,
         stays: bool = False,
+        later: Sequence[Callable[[], NetworkAdapter | None]] = (),
     ) -> None:
         self.stated = tuple(stated)
         self.absent: dict[str, str] = dict(absent or {})
         self.keys = dict(keys or {})
-        self._stays = stays
+        self._stays, self._later = stays, later
+        self._left: threading.Event | None = None
         self._joinings: tuple[_Joining, ...] = ()
         self._change = threading.Condition()
         self._listeners: list[Callable[[NetworkAdapter], None]] = []
@@ -156,7 +159,10 @@ class Networks:
         Raises:
             UnreachableError: none of them can be reached, and they do not stay.
         """
+        self._left = left = threading.Event()
         self._joinings = tuple(_Joining(each, again=self._stays, changed=self._changed) for each in self.stated)
+        for came in self._later:
+            threading.Thread(target=self._await, args=(came, left), name="await a network", daemon=True).start()
         if len(self._joinings) == 1 and not self._stays:
             self._joinings[0].run()
         else:
@@ -173,7 +179,10 @@ class Networks:
         """Leave the networks."""
         with self._change:
             joinings, self._joinings = self._joinings, ()
+            left, self._left = self._left, None
             self._told.clear()
+        if left is not None:
+            left.set()
         for each in joinings:
             each.close()
 
@@ -196,7 +205,7 @@ class Networks:
         Raises:
             UnreachableError: as it says.
         """
-        if not self._joinings:
+        if self._left is None:
             raise UnreachableError("not joined: use it as a context manager", remedy="with connect() as fleet: ...")
 
     def settled(self) -> tuple[NetworkAdapter, ...]:
@@ -441,6 +450,18 @@ class Networks:
                 end()
 
         return end_all
+
+    def _await(self, came: Callable[[], NetworkAdapter | None], left: threading.Event) -> None:
+        """Join a network once it is there."""
+        while (network := came()) is None:
+            if left.wait(AGAIN_S):
+                return
+        joining = _Joining(network, again=True, changed=self._changed)
+        with self._change:
+            if left.is_set():
+                return
+            self.stated, self._joinings = (*self.stated, network), (*self._joinings, joining)
+        joining.run()
 
     def _changed(self, joining: _Joining) -> None:
         if joining.up:

@@ -42,7 +42,7 @@ def networks_of(
         source: the caller's name.
         devices: False leaves Device Connect out.
         mesh: True joins the mesh in any case, False leaves it out.
-        stays: go on trying to join what is not there yet.
+        stays: go on trying to join what is not there yet, such as the mesh once its hub has come.
         preload: load now what a stop must not wait for, as a program does that lasts longer than a command.
 
     Raises:
@@ -51,6 +51,7 @@ def networks_of(
     absent: dict[str, str] = {}
     keys: dict[str, Callable[[], NetworkKey]] = {}
     networks: list[NetworkAdapter] = []
+    later: list[Callable[[], NetworkAdapter | None]] = []
     if not devices:
         absent[DEVICE_CONNECT] = "it is left out"
     elif profile is not None and not profile.reaches_devices(given):
@@ -70,14 +71,19 @@ def networks_of(
         absent[MESH] = f"the connection profile {profile.label} has none"
     elif mesh is None and stated is None and find_spec("zenoh") is None:
         absent[MESH] = "the extra mesh is not installed"
-    elif mesh is None and stated is None and not stays and (why := _no_hub()):
+    elif mesh is None and stated is None and (why := _no_hub()):
         # Its code is not loaded: most machines have no mesh.
         absent[MESH], keys[MESH] = why, _mesh_key
+        later += [lambda: None if _no_hub() else _mesh(source, None)] if stays else []
     else:
-        from strands_robots.fleet.mesh.network import MeshNetwork  # noqa: PLC0415 - as above
+        networks.append(_mesh(source, stated))
+    return Networks(networks, absent, keys, stays=stays, later=later)
 
-        networks.append(MeshNetwork(source, stated))
-    return Networks(networks, absent, keys, stays=stays)
+
+def _mesh(source: str, stated: Mapping[str, str] | None) -> NetworkAdapter:
+    from strands_robots.fleet.mesh.network import MeshNetwork  # noqa: PLC0415 - loaded when it is used
+
+    return MeshNetwork(source, stated)
 
 
 def _no_hub() -> str:

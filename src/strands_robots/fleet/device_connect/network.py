@@ -90,6 +90,8 @@ class DeviceConnectNetwork:
         try:
             self._client.__enter__()
         except (MessagingError, TimeoutError, OSError) as exc:
+            # A client connects once; the next attempt has one of its own.
+            self._client = type(self._client)(self._client.link, self._client.source)
             raise UnreachableError(plain_text(str(exc))) from exc
         self._open = True
 
