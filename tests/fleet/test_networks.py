@@ -1,97 +1,368 @@
-"""Networks as one, from an event loop: where calls go, and stops that wait for a network alone."""
+"""Networks of one caller: joined side by side, each robot called where it is, stops that wait for no other network."""
 
 from __future__ import annotations
 
 import asyncio
 import threading
+from collections.abc import Iterator
+from typing import Any
 
 import pytest
-from tests.fleet.scripted import ScriptedNetwork
+from fixtures.waiting import eventually
+from tests.fleet.scripted import OURS, ScriptedNetwork
 
-from strands_robots.envelope import error, is_error, text_of
-from strands_robots.errors import NoSuchRobotError
-from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
+from strands_robots import errors
+from strands_robots.envelope import Envelope, error, success
+from strands_robots.fleet import networks as module
+from strands_robots.fleet.adapter import DEVICE_CONNECT, FIND_S, MESH, STOP_S, FoundRobot, NetworkAdapter
+from strands_robots.fleet.all_stops import estop_all, stop_all
+from strands_robots.fleet.fleet import Fleet
 from strands_robots.fleet.networks import Networks
 
 
 class SlowNetwork(ScriptedNetwork):
-    """A network that is joined once ``reached`` is set."""
+    """A network whose joining waits for a test, as for a broker that does not answer."""
 
-    def __init__(self, *robots: str) -> None:
-        super().__init__(MESH, dict.fromkeys(robots, ()))
-        self.reached = threading.Event()
+    def __init__(self, name: str, robots: dict[str, object]) -> None:
+        super().__init__(name, robots)
+        self.opening, self.may_open = threading.Event(), threading.Event()
 
     def open(self) -> None:
-        assert self.reached.wait(30)
+        self.opening.set()
+        assert self.may_open.wait(30)
         super().open()
 
 
 @pytest.fixture
 def near() -> ScriptedNetwork:
-    return ScriptedNetwork(DEVICE_CONNECT, {"arm-1": (), "both": ()})
+    return ScriptedNetwork(DEVICE_CONNECT, {"arm-1": OURS, "both": OURS})
 
 
 @pytest.fixture
-def far() -> ScriptedNetwork:
-    return ScriptedNetwork(MESH, {"arm-2": (), "both": ()})
+def far() -> Iterator[SlowNetwork]:
+    network = SlowNetwork(MESH, {"arm-2": OURS, "both": OURS})
+    yield network
+    network.may_open.set()
 
 
-def test_read_goes_to_the_first_network_that_has_the_robot_and_asks_none(
-    near: ScriptedNetwork, far: ScriptedNetwork
+@pytest.fixture
+def networks(near: ScriptedNetwork, far: SlowNetwork) -> Iterator[Networks]:
+    with Networks([near, far]) as joined:
+        yield joined
+
+
+def test_networks_are_open_once_one_of_them_is_joined(networks: Networks, far: SlowNetwork) -> None:
+    assert [each.name for each in networks.joined] == [DEVICE_CONNECT]
+    far.may_open.set()
+    assert [each.name for each in networks.settled()] == [DEVICE_CONNECT, MESH]
+
+
+def test_a_search_waits_for_the_network_that_is_being_joined(networks: Networks, far: SlowNetwork) -> None:
+    found: list[str] = []
+    looking = threading.Thread(target=lambda: found.extend(networks.find()))
+    looking.start()
+    assert far.opening.wait(30)
+    far.may_open.set()
+    looking.join(30)
+    assert sorted(found) == ["arm-1", "arm-2", "both"]
+
+
+@pytest.mark.parametrize("stop", [stop_all, lambda networks: estop_all(networks, "test")])
+def test_stop_leaves_on_one_network_while_the_other_is_being_joined(
+    stop: Any, networks: Networks, near: ScriptedNetwork, far: SlowNetwork
 ) -> None:
-    with Networks([near, far]) as networks:
-        networks.settled()
+    verdicts: list[Any] = []
+    stopping = threading.Thread(target=lambda: verdicts.append(stop(networks)))
+    stopping.start()
+    eventually(lambda: sorted(near.stopped) == ["arm-1", "both"], what="the stop on the joined network")
+    assert far.stopped == []
+    assert stopping.is_alive()
+    far.may_open.set()
+    stopping.join(30)
+    assert sorted(far.stopped) == ["arm-2", "both"]
+    assert verdicts[0].ok
 
-        async def read(robot: str) -> str:
-            return (await networks.of_async(robot)).name
 
-        assert [asyncio.run(read(each)) for each in ("arm-1", "arm-2", "both")] == [near.name, far.name, near.name]
-        assert near.asked == far.asked == []
-        with pytest.raises(NoSuchRobotError):
-            asyncio.run(read("arm-3"))
-
-
-def test_motion_of_an_id_on_two_networks_is_refused_where_no_key_decides(
-    near: ScriptedNetwork, far: ScriptedNetwork
+def test_stop_of_one_robot_leaves_on_one_network_while_the_other_is_being_joined(
+    networks: Networks, near: ScriptedNetwork, far: SlowNetwork
 ) -> None:
-    with Networks([near, far]) as networks:
-        refused = asyncio.run(networks.call_async("both", "moveTo", {}, 1.0))
-    assert is_error(refused)
-    assert "device_connect and mesh both have" in text_of(refused)
-    assert "moveTo" not in {verb for _, verb, *_ in near.calls + far.calls}
+    answers: dict[str, Envelope] = {}
+    stopping = threading.Thread(target=lambda: answers.update(networks.stop("both")))
+    stopping.start()
+    eventually(lambda: near.stopped == ["both"], what="the stop on the joined network")
+    far.may_open.set()
+    stopping.join(30)
+    assert far.stopped == ["both"]
+    assert sorted(answers) == [DEVICE_CONNECT, MESH]
 
 
-def test_robot_describes_itself_on_its_network(near: ScriptedNetwork, far: ScriptedNetwork) -> None:
-    far.robots["arm-2"] = ({"name": "moveTo"},)
-    with Networks([near, far]) as networks:
-        found = asyncio.run(networks.describe_async("arm-2", 1.0))
-    assert (found.id, found.functions) == ("arm-2", ({"name": "moveTo"},))
-
-
-def test_stop_leaves_on_a_network_as_soon_as_that_is_joined(near: ScriptedNetwork) -> None:
-    far = SlowNetwork("arm-2")
+def test_stop_from_a_loop_leaves_on_a_network_as_soon_as_that_is_joined(
+    networks: Networks, near: ScriptedNetwork, far: SlowNetwork
+) -> None:
     near.stops = error("no such robot", stopped=None)
-    with Networks([near, far]) as networks:
 
-        async def stop() -> object:
-            stopping = asyncio.ensure_future(networks.stop_async("arm-2"))
-            await asyncio.sleep(0)
-            assert far.stopped == []
-            far.reached.set()
-            return await stopping
+    async def stop() -> object:
+        stopping = asyncio.ensure_future(networks.stop_async("arm-2"))
+        await asyncio.sleep(0)
+        assert far.stopped == []
+        far.may_open.set()
+        return await asyncio.wait_for(stopping, 30)
 
-        assert asyncio.run(stop()) == {MESH: far.stops}
+    assert asyncio.run(stop()) == {MESH: far.stops}
     assert far.stopped == ["arm-2"]
 
 
-def test_stop_of_a_robot_waits_for_no_network_that_does_not_know_it(near: ScriptedNetwork) -> None:
-    far = SlowNetwork("arm-2")
+def test_stop_from_a_loop_waits_for_no_joining_once_the_robot_has_stopped(
+    networks: Networks, near: ScriptedNetwork, far: SlowNetwork
+) -> None:
+    async def stop() -> object:
+        answers = await asyncio.wait_for(networks.stop_async("arm-1"), 30)
+        far.may_open.set()
+        return answers
+
+    assert asyncio.run(stop()) == {DEVICE_CONNECT: near.stops}
+
+
+def test_network_that_is_gone_and_has_no_remembered_robot_fails_no_stop(near: ScriptedNetwork) -> None:
+    far = ScriptedNetwork(MESH, {})
+    far.unreachable = "no route"
     with Networks([near, far]) as networks:
-        stopped = asyncio.run(_both(networks, far))
-    assert stopped == {DEVICE_CONNECT: near.stops}
+        verdict = stop_all(networks)
+        assert networks.absent == {MESH: "no route"}
+    assert verdict.ok
+    assert near.stopped == ["arm-1", "both"]
 
 
-async def _both(networks: Networks, far: SlowNetwork) -> object:
-    answer = await asyncio.wait_for(networks.stop_async("arm-1"), 10.0)
-    far.reached.set()
-    return answer
+def test_none_in_reach_is_refused_with_each_reason(near: ScriptedNetwork) -> None:
+    near.unreachable = "no broker"
+    far = ScriptedNetwork(MESH)
+    far.unreachable = "no hub"
+    networks = Networks([near, far])
+    with pytest.raises(errors.UnreachableError, match="device_connect: no broker; mesh: no hub"):
+        networks.open()
+    with pytest.raises(errors.UnreachableError, match="not joined"):
+        networks.settled()
+
+
+def test_networks_that_are_left_while_one_is_being_joined_leave_it_too(near: ScriptedNetwork, far: SlowNetwork) -> None:
+    networks = Networks([near, far])
+    networks.open()
+    assert far.opening.wait(30)
+    networks.close()
+    left = threading.Event()
+    far.close = left.set  # type: ignore[method-assign]
+    far.may_open.set()
+    assert left.wait(30)
+    assert networks.joined == ()
+
+
+class TestStays:
+    """Networks of a face that lasts: what is not there yet is joined when it comes."""
+
+    @pytest.fixture(autouse=True)
+    def often(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(module, "AGAIN_S", 0.01)
+
+    def test_network_that_comes_later_is_joined_and_told_once(self, near: ScriptedNetwork) -> None:
+        far = ScriptedNetwork(MESH, {"arm-2": OURS})
+        far.unreachable = "no hub"
+        told: list[NetworkAdapter] = []
+        with Networks([near, far], stays=True) as networks:
+            networks.on_joined(told.append)
+            assert networks.absent[MESH] == "no hub"
+            assert told == [near]
+            far.unreachable = ""
+            eventually(lambda: len(told) == 2, what="the network that came later")
+            assert networks.absent == {}
+            assert sorted(networks.find()) == ["arm-1", "arm-2", "both"]
+        assert told == [near, far]
+
+    def test_none_in_reach_is_no_error(self, near: ScriptedNetwork) -> None:
+        near.unreachable = "no broker"
+        with Networks([near], stays=True) as networks:
+            assert networks.joined == ()
+            near.unreachable = ""
+            eventually(lambda: networks.joined == (near,), what="the broker")
+
+    def test_events_of_a_network_that_comes_later_are_received(self, near: ScriptedNetwork) -> None:
+        far = ScriptedNetwork(MESH, {"arm-2": OURS})
+        far.unreachable = "no hub"
+        events: list[str] = []
+        with Networks([near, far], stays=True) as networks:
+            end = networks.subscribe("*", lambda event: events.append(event.robot))
+            near.say("arm-1", "stateUpdate")
+            far.unreachable = ""
+            eventually(lambda: bool(far.subscribers), what="the subscription on the mesh")
+            far.say("arm-2", "stateUpdate")
+            assert events == ["arm-1", "arm-2"]
+            end()
+            assert (near.subscribers, far.subscribers) == ([], [])
+
+    def test_network_is_not_tried_again_once_the_face_has_ended(self, near: ScriptedNetwork) -> None:
+        far = ScriptedNetwork(MESH)
+        tries: list[int] = []
+
+        def absent() -> None:
+            tries.append(1)
+            raise errors.UnreachableError("no hub")
+
+        far.open = absent  # type: ignore[method-assign]
+        with Networks([near, far], stays=True):
+            eventually(lambda: len(tries) > 2, what="further attempts")
+        eventually(lambda: not _alive("join mesh"), what="the end of the attempts")
+
+
+class TestRouting:
+    """Where a call goes."""
+
+    @pytest.fixture
+    def far(self) -> ScriptedNetwork:
+        return ScriptedNetwork(MESH, {"arm-2": OURS, "both": OURS})
+
+    @pytest.fixture
+    def networks(self, near: ScriptedNetwork, far: ScriptedNetwork) -> Iterator[Networks]:
+        with Networks([near, far]) as joined:
+            joined.settled()
+            yield joined
+
+    def test_robot_is_called_on_the_network_that_has_it(self, networks: Networks, far: ScriptedNetwork) -> None:
+        assert networks.call("arm-2", "moveTo", {"x": 1}, 5.0)["status"] == "success"
+        assert [each[:2] for each in far.calls] == [("arm-2", "moveTo")]
+        assert asyncio.run(networks.call_async("arm-2", "getStatus", {}, 5.0, moves=False))["status"] == "success"
+
+    def test_read_of_an_id_on_both_goes_to_the_first(
+        self, networks: Networks, near: ScriptedNetwork, far: ScriptedNetwork
+    ) -> None:
+        networks.call("both", "getStatus", {}, 5.0, moves=False)
+        assert near.calls
+        assert not far.calls
+
+    def test_read_from_a_loop_asks_no_network_for_a_robot_that_is_known(
+        self, networks: Networks, near: ScriptedNetwork, far: ScriptedNetwork
+    ) -> None:
+        for robot, there in {"arm-1": near, "arm-2": far, "both": near}.items():
+            assert asyncio.run(networks.of_async(robot)) is there
+            assert asyncio.run(networks.describe_async(robot, 5.0)).functions == OURS
+        assert near.asked == far.asked == []
+
+    def test_motion_of_an_id_on_both_is_refused_naming_both(self, networks: Networks) -> None:
+        with pytest.raises(errors.AmbiguousRobotError, match="device_connect and mesh"):
+            networks.call("both", "moveTo", {}, 5.0)
+        answer = asyncio.run(networks.call_async("both", "moveTo", {}, 5.0))
+        assert "device_connect and mesh" in answer["content"][0]["text"]
+
+    def test_motion_asks_every_network_whether_it_has_the_robot(self, networks: Networks, far: ScriptedNetwork) -> None:
+        networks.call("arm-1", "getStatus", {}, 5.0, moves=False)
+        assert far.asked == []
+        networks.call("arm-1", "moveTo", {}, 5.0)
+        assert far.asked == ["arm-1"]
+
+    def test_read_waits_for_no_network_that_does_not_answer(
+        self, networks: Networks, near: ScriptedNetwork, far: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        hangs = threading.Event()
+        monkeypatch.setattr(near, "bears", lambda robot: False)
+        monkeypatch.setattr(near, "reaches", lambda robot: hangs.wait(30))
+        monkeypatch.setattr(far, "bears", lambda robot: False)
+        try:
+            assert networks.of("arm-2") is far
+        finally:
+            hangs.set()
+
+    def test_robot_that_no_network_has_is_refused_with_similar_names(self, networks: Networks) -> None:
+        with pytest.raises(errors.NoSuchRobotError, match="Near it: arm-"):
+            networks.call("arm-9", "getStatus", {}, 5.0, moves=False)
+        assert "arm-9" in asyncio.run(networks.call_async("arm-9", "getStatus", {}, 5.0))["content"][0]["text"]
+
+    def test_stop_goes_to_every_bearer(self, networks: Networks, near: ScriptedNetwork, far: ScriptedNetwork) -> None:
+        assert networks.halt("both").stopped is True
+        assert (near.stopped, far.stopped) == (["both"], ["both"])
+        far.stops = error("no brakes", stopped=False)
+        verdict = networks.halt("both")
+        assert verdict.stopped is False
+        assert list(verdict.not_stopped) == ["both on mesh"]
+
+    def test_stop_of_a_robot_that_is_slow_to_be_known_is_sent_again_and_waited_for(
+        self, networks: Networks, near: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        sent: list[bool] = []
+
+        def slow(robot: str, timeout: float = STOP_S, robot_name: str = "", *, insist: bool = False) -> Envelope | None:
+            sent.append(insist)
+            return success("stopped", stopped=True) if insist else None
+
+        monkeypatch.setattr(near, "stop", slow)
+        assert networks.stop("arm-7")[DEVICE_CONNECT]["stopped"] is True
+        assert sent == [False, True]
+
+    def test_stop_of_a_known_robot_does_not_wait_for_a_network_without_it(
+        self, networks: Networks, near: ScriptedNetwork, far: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        sent = threading.Event()
+
+        async def hangs(robot: str, within: float = STOP_S, robot_name: str = "") -> Envelope:
+            sent.set()
+            await asyncio.Event().wait()
+            raise AssertionError
+
+        monkeypatch.setattr(far, "stop_async", hangs)
+
+        async def stop() -> dict[str, Envelope]:
+            return await asyncio.wait_for(networks.stop_async("arm-1"), 30)
+
+        assert asyncio.run(stop())[DEVICE_CONNECT]["stopped"] is True
+        assert sent.is_set()
+
+    def test_stop_from_a_loop_names_a_bearer_that_does_not_answer(
+        self, networks: Networks, far: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        async def silent(robot: str, within: float = STOP_S, robot_name: str = "") -> Envelope:
+            return error("no answer", stopped=None)
+
+        monkeypatch.setattr(far, "stop_async", silent)
+        answers = asyncio.run(networks.stop_async("both"))
+        assert {name: said["stopped"] for name, said in answers.items()} == {DEVICE_CONNECT: True, MESH: None}
+
+    def test_remembered_decisions_are_bounded(
+        self, networks: Networks, near: ScriptedNetwork, far: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(module, "SHARED_IDS_MAX", 3)
+        for number in range(10):
+            near.robots[f"twin-{number}"] = far.robots[f"twin-{number}"] = OURS
+            with pytest.raises(errors.AmbiguousRobotError):
+                networks.call(f"twin-{number}", "moveTo", {}, 5.0)
+        assert len(networks._shared_ids) == 3
+
+
+def test_fleet_stops_on_a_network_while_the_other_is_being_joined(near: ScriptedNetwork, far: SlowNetwork) -> None:
+    with Fleet([near, far]) as fleet:
+        verdicts: list[Any] = []
+        stopping = threading.Thread(target=lambda: verdicts.append(fleet.estop("test")))
+        stopping.start()
+        eventually(lambda: "arm-1" in near.locked, what="the lockout on the joined network")
+        far.may_open.set()
+        stopping.join(30)
+        assert verdicts[0].ok
+        assert near.locked["both"] == far.locked["both"] == verdicts[0].estop_id
+
+
+def test_search_that_fails_on_one_network_gives_the_robots_of_the_other(
+    near: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    far = ScriptedNetwork(MESH, {"arm-2": OURS})
+
+    def broken(timeout: float = FIND_S) -> list[FoundRobot]:
+        raise KeyError("bug")
+
+    with Networks([near, far]) as networks:
+        networks.settled()
+        monkeypatch.setattr(far, "find", broken)
+        assert sorted(networks.find()) == ["arm-1", "both"]
+        assert "KeyError" in networks.absent[MESH]
+        monkeypatch.undo()
+        assert "arm-2" in networks.find()
+        assert networks.absent == {}
+
+
+def _alive(name: str) -> list[threading.Thread]:
+    return [each for each in threading.enumerate() if each.name == name]

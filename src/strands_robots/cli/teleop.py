@@ -5,8 +5,9 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,33 +15,67 @@ import typer
 from rich.control import Control
 
 from strands_robots.cli.command import Seconds, command
-from strands_robots.cli.network import temporary_mesh_id
-from strands_robots.cli.output import POLL_S, CliError, Screen, table, wait_until
+from strands_robots.cli.network import mesh_peer, temporary_mesh_id
+from strands_robots.cli.output import POLL_S, CliError, Exit, Screen, table, wait_until
 from strands_robots.cli.record import record_robot
-from strands_robots.cli.teleop_mesh import (
-    MESH_PREFIX,
-    NO_FOLLOWER,
-    NoFollower,
-    TeleopOptions,
-    announce,
-    check_keys,
-    follow_peer,
-    lead_peer,
-    publish_leader,
-)
 from strands_robots.envelope import is_error, text_of
+from strands_robots.errors import NoAnswerError, NoSuchRobotError, RefusalError
+from strands_robots.policies.base import Ranges
 from strands_robots.safety.stopping import StopVerdict
-from strands_robots.teleoperators.leader import FULL_RANGES_PER_S
-from strands_robots.utils import ValidationError, identifier
+from strands_robots.teleoperators.leader import FULL_RANGES_PER_S, LeaderPolicy
+from strands_robots.utils import ValidationError, identifier, number
 
 if TYPE_CHECKING:
     from strands_robots.hardware import LeaderArm
     from strands_robots.hardware.calibration import JointReach
 
+MESH_PREFIX = "mesh:"
+"""Prefix of the name of a leader or follower on the mesh."""
+
+NO_FOLLOWER = "none"
+"""Follower of a leader that is only published."""
+
 _NAME = "leader"
 _MANUAL = ("keyboard", "gamepad")
 FollowerId = Annotated[str | None, typer.Option("--id", help="Calibration id of the follower.")]
 Calibration = Annotated[Path | None, typer.Option("--calibration", help="Calibration file of the follower.")]
+
+
+@dataclass(frozen=True, slots=True)
+class TeleopOptions:
+    """Options of one teleoperation.
+
+    Args:
+        method: arm, gamepad or keyboard.
+        seconds: end after so many; None for no limit.
+        hz: frames a second.
+        max_speed: whole joint ranges a second that the follower may cross.
+    """
+
+    method: str = "arm"
+    seconds: float | None = None
+    hz: float = 50.0
+    max_speed: float = FULL_RANGES_PER_S
+
+    def timed(self, over: Callable[[], str]) -> Callable[[], str]:
+        """Return ``over``, or that the seconds are over."""
+        began = time.monotonic()
+
+        def timed_over() -> str:
+            late = self.seconds is not None and time.monotonic() - began >= self.seconds
+            return over() or (f"{self.seconds:g} s are over." if late else "")
+
+        return timed_over
+
+
+class NoFollower:
+    """Stand-in for a robot where none follows here."""
+
+    def body(self) -> NoFollower:
+        """Raise :class:`ValidationError`."""
+        raise ValidationError(
+            f"FOLLOWER must be a robot for this leader, which starts from the robot's joints, not {NO_FOLLOWER}."
+        )
 
 
 def register(app: typer.Typer) -> None:
@@ -163,25 +198,26 @@ def _drive(
         if publish is not None or record is not None:
             raise ValidationError("--publish and --record are for a follower of this machine, not of the mesh.")
         peer = identifier("follower", follower.removeprefix(MESH_PREFIX))
-        lead_peer(screen, leader, peer, connected, options)
+        with _refused():
+            _lead_peer(screen, leader, peer, connected, options)
         return
     if follower == NO_FOLLOWER:
         if publish is None or record is not None:
             raise ValidationError(f"the follower {NO_FOLLOWER} goes with --publish PEER, and has nothing to --record.")
         peer = identifier("--publish", publish)
         with connected(NoFollower()) as source:
-            publish_leader(screen, leader, peer, source, options)
+            _publish(screen, leader, peer, source, options)
         return
     on_mesh = {} if publish is None else {"peer_id": identifier("--publish", publish), "mesh": True}
     with _made_follower(screen, follower, arm, record, publish, **on_mesh) as robot, connected(robot) as source:
-        check_keys(follower, source, robot.body().bounds)
+        _check_keys(follower, source, robot.body().bounds)
         for answer in (
             robot.attach_teleop(source, _NAME, method=options.method, max_speed=options.max_speed),
             robot.teleoperate(_NAME, duration=options.seconds, hz=options.hz, publish=publish is not None),
         ):
             if is_error(answer):
                 raise CliError(text_of(answer))
-        announce(screen, leader, follower, source)
+        _announce(screen, leader, follower, source)
         if publish is not None:
             screen.say(f"Others may follow {publish}/{_NAME} on the mesh.")
         wait_until(
@@ -202,14 +238,108 @@ def _follow(
     screen: Screen, peer: str, follower: str, arm: dict[str, Any], *, options: TeleopOptions, record: Path | None
 ) -> None:
     """Let a leader published on the mesh drive a follower of this machine."""
+    from strands_robots.fleet.mesh.leading import DEVICE, followed  # noqa: PLC0415 - loaded when the network is used
+
     with _made_follower(screen, follower, arm, record, mesh=True, peer_id=temporary_mesh_id("follow")) as robot:
-        why, stats = follow_peer(screen, peer, robot, options)
+        with _refused(), followed(robot, peer, options.max_speed) as leading:
+            _announce(screen, f"{peer}/{DEVICE}", robot.tool_name_str, leading)
+            why, stats = wait_until(screen, options.timed(leading.over)), leading.stats
         verdict = _stop(screen, robot)
     row = {key: stats[key] for key in ("frames_received", "errors", "rejected", "slew_rejected", "rate_dropped")}
     screen.data({"event": "ended", **row, "why": why, "stopped": verdict.stopped})
     _check_stopped(verdict)
     left_out = row["errors"] + row["rejected"] + row["slew_rejected"] + row["rate_dropped"]
     screen.say(f"{why} {row['frames_received']} frames arrived, {left_out} of them were not applied.", "green")
+
+
+def _lead_peer(
+    screen: Screen,
+    leader: str,
+    peer: str,
+    connected: Callable[[Any], AbstractContextManager[Any]],
+    options: TeleopOptions,
+) -> None:
+    """Let a leader drive a peer of the mesh until it ends, then stop the peer."""
+    from strands_robots.fleet.mesh.leading import DEVICE, LedPeer, RemoteFollower, publisher  # noqa: PLC0415 - as above
+
+    rate = number("hz", options.hz, low=1, high=1000)
+    speed = number("max_speed", options.max_speed, above=0, high=20)
+    with mesh_peer(None, temporary_mesh_id("lead"), "tool") as mesh:
+        follower = RemoteFollower(mesh, peer)
+        with connected(follower) as source:
+            _check_keys(peer, source, follower.bounds)
+            policy = LeaderPolicy(source, device=DEVICE, method=options.method, max_speed=speed, period=1 / rate)
+            led = LedPeer(follower, mesh.peer_id, policy)
+            publishing = publisher(mesh, led.bounded, options.method, rate)
+            follower.open_stream(mesh.peer_id)
+            try:
+                publishing.start()
+                _announce(screen, leader, peer, source)
+                why = wait_until(screen, options.timed(led.over), getattr(source, "duration", None) or 0.0)
+            finally:
+                # The follower is stopped first; publishing ends even when it does not answer.
+                try:
+                    screen.say(f"Stopping {peer}...")
+                    follower.stop()
+                    screen.say(f"{peer} stands still.", "green")
+                finally:
+                    sent = publishing.stop()
+    row = {"frames": sent["frames"], "errors": policy.errors, "applied": led.counters.get("frames_received", 0)}
+    screen.data({"event": "ended", **row, "why": why, "stopped": True})
+    if led.bounded.error:
+        raise CliError(f"The leader failed: {led.bounded.error}", **row)
+    if why.startswith(peer):
+        raise CliError(f"Ended: {why.rstrip('.')}.", **row)
+    _report_sent(screen, why, row)
+
+
+def _publish(screen: Screen, leader: str, peer: str, source: Any, options: TeleopOptions) -> None:
+    """Publish a leader on the mesh as ``peer`` until it ends."""
+    from strands_robots.fleet.mesh.leading import DEVICE, PublishedLeader, publisher  # noqa: PLC0415 - as above
+
+    with mesh_peer(None, peer, "tool") as mesh:
+        published = PublishedLeader(source)
+        publishing = publisher(mesh, published, options.method, options.hz)
+        publishing.start()
+        screen.say(f"{leader} is published as {peer}/{DEVICE}. Ctrl-C ends it.")
+        over = options.timed(lambda: "The leader has finished." if published.finished else "")
+        try:
+            why = wait_until(screen, over, getattr(source, "duration", None) or 0.0)
+        finally:
+            sent = publishing.stop()
+    row = {"frames": sent["frames"], "errors": sent["errors"]}
+    screen.data({"event": "ended", **row, "why": why})
+    if not row["frames"]:
+        raise CliError(f"{leader} gave no frame that could be published.", **row)
+    _report_sent(screen, why, row)
+
+
+def _report_sent(screen: Screen, why: str, row: Mapping[str, Any]) -> None:
+    screen.say(f"{why} {row['frames']} frames sent, {row['errors']} of the leader's unusable.", "green")
+
+
+def _check_keys(follower: str, leader: Any, bounds: Ranges) -> None:
+    """Refuse a leader of joints that the follower lacks, before anything moves."""
+    unknown = [key for key in getattr(leader, "keys", ()) if key not in bounds]
+    if unknown:
+        raise ValidationError(f"{follower} has {', '.join(bounds)}, not {', '.join(unknown)}, which the leader leads.")
+
+
+def _announce(screen: Screen, leader: str, follower: str, source: Any) -> None:
+    """Print which leader leads which follower, and its keys."""
+    screen.say(f"{leader} leads {follower}. Ctrl-C stops the follower.")
+    for name, up, down in getattr(source, "help", []):
+        screen.say(f"  {up} and {down} move {name}")
+
+
+@contextmanager
+def _refused() -> Iterator[None]:
+    """Raise a refusal as the command's failure."""
+    try:
+        yield
+    except RefusalError as refusal:
+        silent = isinstance(refusal, NoAnswerError | NoSuchRobotError)
+        raise CliError(str(refusal), Exit.SILENT if silent else Exit.REFUSED) from refusal
 
 
 @contextmanager

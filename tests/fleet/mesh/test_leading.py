@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from fixtures.devices import RecordingDevice
 
-from strands_robots.cli.teleop_mesh import LimitedFollower, peer_in_reach
+from strands_robots.fleet.mesh.leading import LimitedFollower, await_peer
 from strands_robots.hardware import HardwareRobot
 from strands_robots.mesh.transport import zenoh_config
 from strands_robots.mesh.transport.zenoh_config import Posture
@@ -24,9 +24,9 @@ def test_peer_is_awaited_longer_than_its_link_may_pause(monkeypatch: pytest.Monk
 
     monkeypatch.setattr("strands_robots.mesh.core.wait_for_peer", wait)
     mesh: Any = None
-    assert peer_in_reach(mesh, "arm-1")
+    await_peer(mesh, "arm-1")
     monkeypatch.setenv(stated, "tcp/127.0.0.1:7447")
-    assert peer_in_reach(mesh, "arm-1")
+    await_peer(mesh, "arm-1")
     retry = zenoh_config.explicit(Posture.from_settings())["connect"]["retry"]
     assert waited[0] < retry["period_max_ms"] / 1000 < waited[1]
 
