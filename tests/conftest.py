@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fixtures.waiting import eventually
+from fixtures.waiting import eventually, free_port
 
 from strands_robots import audit, settings
 from strands_robots.audit import flush_audit
@@ -29,6 +29,9 @@ for setting in settings.declared():
 
 # What moves in the tests is no metal.
 os.environ["STRANDS_ALLOW_MOCK"] = "true"
+
+# Commands and callers that a test starts look for a mesh: never for one of this machine's user, or of another worker.
+os.environ["STRANDS_MESH_PORT"] = str(free_port())
 
 # An example takes as long as a busy machine lets it; the environments of real arms and DDS Security have no examples.
 if find_spec("hypothesis"):

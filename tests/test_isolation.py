@@ -25,4 +25,4 @@ def test_module_fixture_has_a_state_directory_of_its_own(shared: Path) -> None:
 
 def test_settings_of_the_shell_are_removed() -> None:
     left = {setting.name for setting in settings.declared() if settings.is_set(setting.name)}
-    assert left <= {"STRANDS_STATE_DIR", "STRANDS_ALLOW_MOCK", "DISPLAY", "MUJOCO_GL"}
+    assert left <= {"STRANDS_STATE_DIR", "STRANDS_ALLOW_MOCK", "STRANDS_MESH_PORT", "DISPLAY", "MUJOCO_GL"}

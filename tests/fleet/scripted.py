@@ -9,9 +9,10 @@ from dataclasses import replace
 from typing import Any
 
 from strands_robots.envelope import Envelope, error, success
-from strands_robots.errors import NoSuchRobotError, RefusalError, UnknownVerbError, UnreachableError
-from strands_robots.fleet.adapter import DEVICE_CONNECT, FIND_S, STOP_S, FoundRobot, OnEvent, RobotEvent
+from strands_robots.errors import NoSuchRobotError, UnknownVerbError, UnreachableError
+from strands_robots.fleet.adapter import DEVICE_CONNECT, FIND_S, STOP_S, FoundRobot, OnEvent, ReceivedCall, RobotEvent
 from strands_robots.fleet.lockout_report import LockoutReport, Resumed
+from strands_robots.fleet.refusals import answered
 from strands_robots.fleet.stop_answers import measured, roster_verdict, unanswered
 from strands_robots.safety import network_key
 from strands_robots.safety.controller import OnProgress
@@ -169,16 +170,21 @@ class ScriptedNetwork:
     ) -> Envelope | None:
         if robot not in self.robots:
             return unanswered(robot) if insist else None
-        self.stopped.append(robot)
+        self.stopped.append(f"{robot}/{robot_name}" if robot_name else robot)
         if isinstance(self.stops, Exception):
             raise self.stops
         return self.stops
 
     async def call_async(self, robot: str, verb: str, arguments: Mapping[str, Any], within: float) -> Envelope:
-        try:
-            return self.call(robot, verb, arguments, within)
-        except RefusalError as exc:
-            return error(exc.why)
+        return self.call(robot, verb, arguments, within)
+
+    async def describe_async(self, robot: str, within: float) -> FoundRobot:
+        if robot not in self.robots:
+            raise NoSuchRobotError("gone", robot=robot)
+        return FoundRobot(robot, "strands_robot", "so100", functions=self.robots[robot])
+
+    def received(self, robot: str, verb: str, arguments: Mapping[str, Any]) -> ReceivedCall:
+        return ReceivedCall("scripted", verb, arguments)
 
     async def stop_async(self, robot: str, within: float = STOP_S, robot_name: str = "") -> Envelope:
         return self.stop(robot, within, robot_name) or error("none", stopped=None)
@@ -269,7 +275,7 @@ class ScriptedNetwork:
         if robot in self.mute:
             await asyncio.sleep(within)
             return LockoutReport(robot, problem="it did not answer")
-        facts = await self.call_async(robot, "getStatus", {}, within)
+        facts = await answered(self.call_async(robot, "getStatus", {}, within))
         return replace(self.lockouts([robot], within)[0], facts=facts, round_trip_ms=1.0)
 
     def resume(self, reports: Sequence[LockoutReport], signer: Any, timeout: float) -> dict[str, Resumed]:

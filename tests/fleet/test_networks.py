@@ -96,6 +96,33 @@ def test_stop_of_one_robot_leaves_on_one_network_while_the_other_is_being_joined
     assert sorted(answers) == [DEVICE_CONNECT, MESH]
 
 
+def test_stop_from_a_loop_leaves_on_a_network_as_soon_as_that_is_joined(
+    networks: Networks, near: ScriptedNetwork, far: SlowNetwork
+) -> None:
+    near.stops = error("no such robot", stopped=None)
+
+    async def stop() -> object:
+        stopping = asyncio.ensure_future(networks.stop_async("arm-2"))
+        await asyncio.sleep(0)
+        assert far.stopped == []
+        far.may_open.set()
+        return await asyncio.wait_for(stopping, 30)
+
+    assert asyncio.run(stop()) == {MESH: far.stops}
+    assert far.stopped == ["arm-2"]
+
+
+def test_stop_from_a_loop_waits_for_no_joining_once_the_robot_has_stopped(
+    networks: Networks, near: ScriptedNetwork, far: SlowNetwork
+) -> None:
+    async def stop() -> object:
+        answers = await asyncio.wait_for(networks.stop_async("arm-1"), 30)
+        far.may_open.set()
+        return answers
+
+    assert asyncio.run(stop()) == {DEVICE_CONNECT: near.stops}
+
+
 def test_network_that_is_gone_and_has_no_remembered_robot_fails_no_stop(near: ScriptedNetwork) -> None:
     far = ScriptedNetwork(MESH, {})
     far.unreachable = "no route"
@@ -209,6 +236,14 @@ class TestRouting:
         networks.call("both", "getStatus", {}, 5.0, moves=False)
         assert near.calls
         assert not far.calls
+
+    def test_read_from_a_loop_asks_no_network_for_a_robot_that_is_known(
+        self, networks: Networks, near: ScriptedNetwork, far: ScriptedNetwork
+    ) -> None:
+        for robot, there in {"arm-1": near, "arm-2": far, "both": near}.items():
+            assert asyncio.run(networks.of_async(robot)) is there
+            assert asyncio.run(networks.describe_async(robot, 5.0)).functions == OURS
+        assert near.asked == far.asked == []
 
     def test_motion_of_an_id_on_both_is_refused_naming_both(self, networks: Networks) -> None:
         with pytest.raises(errors.AmbiguousRobotError, match="device_connect and mesh"):

@@ -9,13 +9,16 @@ from typing import Any, ClassVar
 
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from fixtures.waiting import eventually
 from tests.fleet.scripted import ScriptedNetwork, key_of
 
 from strands_robots import errors
 from strands_robots.envelope import error, success
 from strands_robots.fleet import Fleet
 from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
+from strands_robots.fleet.all_stops import stop_all
 from strands_robots.fleet.enrollment import Enrolled, enrolled_robots
+from strands_robots.fleet.networks import Networks
 from strands_robots.safety.identity import ROBOTS, KeyFile
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.roster import Roster, RosterRow
@@ -308,3 +311,16 @@ def test_disk_that_hangs_hides_no_verdict_of_another_network(
         assert waited == []
     finally:
         released.set()
+
+
+def test_network_that_came_later_is_stopped_and_not_called_absent(near: ScriptedNetwork, far: ScriptedNetwork) -> None:
+    there = threading.Event()
+    absent, keys = {MESH: "no hub"}, {MESH: lambda: key_of(MESH)}
+    later = [lambda: far if there.is_set() else None]
+    with Networks([near], absent, keys, stays=True, later=later) as networks:
+        assert "arm-2" not in stop_all(networks)
+        there.set()
+        eventually(lambda: len(networks.joined) == 2, what="the mesh")
+        verdict = stop_all(networks)
+        assert verdict["arm-2"].stopped
+        assert [each.network for each in verdict.networks if each.absent] == []

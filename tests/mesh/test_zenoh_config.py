@@ -12,6 +12,11 @@ from strands_robots.mesh.transport import TransportError, zenoh_config
 from strands_robots.mesh.transport.zenoh_config import Posture
 
 
+@pytest.fixture(autouse=True)
+def usual_port(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("STRANDS_MESH_PORT")
+
+
 def test_without_any_setting_the_mesh_stays_on_loopback_without_certificates() -> None:
     posture = Posture.from_settings()
     assert posture.hub == "tcp/127.0.0.1:7447"

@@ -18,6 +18,7 @@ from strands_robots.errors import RefusalError
 from strands_robots.fleet.adapter import DEVICE_CONNECT, EVERY, FoundRobot, NetworkAdapter, RobotEvent
 from strands_robots.fleet.joint_features import joint_limits, joint_units
 from strands_robots.fleet.lockout_report import Resumed
+from strands_robots.fleet.refusals import answered
 from strands_robots.fleet.robot_task import task_of
 from strands_robots.safety.identity import KeyFileError
 
@@ -105,7 +106,7 @@ class FleetFeed:
 
     async def call(self, robot: str, verb: str, params: Mapping[str, Any], seconds: float) -> Envelope:
         """Call a verb; every failure is an answer of status error."""
-        return await self._there.call_async(robot, verb, params, seconds)
+        return await answered(self._there.call_async(robot, verb, params, seconds))
 
     async def stop(self, robot: str) -> Envelope:
         """End a robot's motion without a lockout, as after a jog; graded, never raises."""

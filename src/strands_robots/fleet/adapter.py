@@ -40,6 +40,7 @@ class FoundRobot:
         status: what it says it is doing.
         age_s: seconds since its last own message; None where only a registry names it.
         facts: all that its network knows of it, for programs.
+        functions: as they came over the wire; None where it has not told them.
     """
 
     id: str
@@ -51,6 +52,22 @@ class FoundRobot:
     status: str = ""
     age_s: float | None = None
     facts: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
+    functions: object = field(default=None, compare=False, repr=False)
+
+
+@dataclass(frozen=True, slots=True)
+class ReceivedCall:
+    """A call as its robot receives it, which is what an operator approves.
+
+    Attributes:
+        caller: the caller's name on the network.
+        verb: its name on the network.
+        arguments: without those of the lease.
+    """
+
+    caller: str
+    verb: str
+    arguments: Mapping[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,8 +210,22 @@ class NetworkAdapter(Protocol):
                 all the time, and None is never returned.
         """
 
+    def received(self, robot: str, verb: str, arguments: Mapping[str, Any]) -> ReceivedCall:
+        """Return a call as the robot receives it; asks no one.
+
+        Raises:
+            ValidationError: it would refuse the arguments.
+        """
+
     async def call_async(self, robot: str, verb: str, arguments: Mapping[str, Any], within: float) -> Envelope:
-        """Call a verb from an event loop; every failure is an answer of status error."""
+        """Call a verb from an event loop; raises as :meth:`call`."""
+
+    async def describe_async(self, robot: str, within: float) -> FoundRobot:
+        """Return a robot with its functions, as it describes itself now.
+
+        Raises:
+            RefusalError: it is not known, or does not answer.
+        """
 
     async def stop_async(self, robot: str, within: float = STOP_S, robot_name: str = "") -> Envelope:
         """Stop a robot, or one of a world, from an event loop; never raises.
@@ -218,7 +249,7 @@ class NetworkAdapter(Protocol):
 
     @property
     def meeting_port(self) -> int | None:
-        """The loopback port where robots of this machine meet; None where that is not known."""
+        """The loopback port where robots meet; None where it is not known."""
 
     @property
     def stale(self) -> str:

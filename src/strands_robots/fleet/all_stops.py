@@ -6,17 +6,19 @@ import logging
 from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
+from strands_robots.envelope import Envelope, error, success
 from strands_robots.errors import UnreachableError
 from strands_robots.fleet.adapter import STOP_S, NetworkAdapter
 from strands_robots.fleet.fleet_verdict import FleetVerdict, NetworkVerdict
-from strands_robots.fleet.networks import Networks
+from strands_robots.fleet.networks import CLOSED, Networks
 from strands_robots.fleet.side_by_side import side_by_side
-from strands_robots.fleet.stop_answers import not_reached
+from strands_robots.fleet.stop_answers import not_reached, roster_verdict
 from strands_robots.safety.controller import Progress
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.orders import new_epoch
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.safety.stop_roster import robots_known_at
+from strands_robots.safety.stopping import StopVerdict
 from strands_robots.utils import plain_text
 
 logger = logging.getLogger(__name__)
@@ -116,6 +118,34 @@ def not_left(network: str, key: Callable[[], NetworkKey], why: object) -> Networ
         return NetworkVerdict(network, absent=said)
 
 
+def answer_of(verdict: FleetVerdict, networks: Networks) -> Envelope:
+    """Return the verdict as one answer; that of one network alone as this network words it.
+
+    With several, ``stopped`` is True, False, or None where it is not known, ``not_stopped`` and ``silent`` list robots,
+    ``robots`` has the answers by id and ``networks`` the facts of each network.
+    """
+    if not verdict.networks:
+        return error(f"{networks.absences or CLOSED}.", stopped=None)
+    first, *others = verdict.reporting or verdict.networks[:1]
+    if not others and first.outcome is not None and not first.absent:
+        (adapter,) = (each for each in networks.stated if each.name == first.network)
+        return adapter.verdict(first.outcome) if verdict.estop_id else roster_verdict(first.outcome)
+    outcomes = [each.outcome for each in verdict.networks if each.outcome is not None]
+    moving = [name for name, each in verdict.items() if each.stopped is False]
+    still = [name for name, each in verdict.items() if each.stopped]
+    scopes = [each.report.scope.field() for each in outcomes]
+    fields: dict[str, Any] = {
+        "stopped": False if moving else True if verdict.ok else None,
+        "not_stopped": moving,
+        "silent": [name for name in verdict.missing if name not in moving],
+        "robots": {name: _said(each) for name, each in verdict.items()},
+        "networks": {each.network: each.facts() for each in verdict.networks},
+        **({"estop_id": verdict.estop_id, **scopes[0]} if verdict.estop_id and scopes else {}),
+    }
+    said = " ".join([*([f"Stopped: {', '.join(still)}."] if still else []), str(verdict)])
+    return (success if verdict.ok else error)(said, **fields)
+
+
 Stopped = tuple[NetworkVerdict, bool]
 """Verdict of a network, and whether the stop left on it, or failed there."""
 
@@ -138,16 +168,19 @@ def _on_each(networks: Networks, stop: Callable[[NetworkAdapter], NetworkVerdict
             return not_left(network.name, lambda: network.key, exc), True
         return verdict, verdict.outcome is None or verdict.outcome.report.link
 
-    stops = side_by_side(stopped, networks.stated)
+    stated = networks.stated
+    stops = side_by_side(stopped, stated)
     stops += [
         (not_left(name, key, networks.absent.get(name, "it is not joined")), False)
         for name, key in networks.keys.items()
+        # One of them may have come since the stop left.
+        if all(name != each.name for each in stated)
     ]
     return stops
 
 
 def _told_once(verdicts: Sequence[Stopped], named: Collection[str]) -> list[Stopped]:
-    """Return the verdicts with each named robot silent where it is known, else on one network."""
+    """Return the verdicts; a named robot is silent where it is known, else once."""
     dropped = [set[str]() for _ in verdicts]
     for name in named:
         silent = [at for at, (each, _) in enumerate(verdicts) if name in each.silent]
@@ -158,7 +191,7 @@ def _told_once(verdicts: Sequence[Stopped], named: Collection[str]) -> list[Stop
 
 
 def _parted(verdicts: Sequence[Stopped]) -> tuple[list[NetworkVerdict], list[NetworkVerdict]]:
-    """Return the verdicts that count, and those of networks that are gone and have no robot."""
+    """Return the verdicts that count, and those of gone networks without robots."""
     reached = any(left for _, left in verdicts)
     counted, gone = list[NetworkVerdict](), list[NetworkVerdict]()
     for each, left in verdicts:
@@ -175,3 +208,7 @@ def _remembered(network: NetworkAdapter, meant: Scope) -> bool:
     except UnreachableError:
         # The mesh of a profile that could not be joined has no name.
         return False
+
+
+def _said(verdict: StopVerdict) -> str:
+    return "; ".join([*verdict.not_stopped.values(), *verdict.unknown.values()]) or "stopped"

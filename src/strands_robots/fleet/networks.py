@@ -14,9 +14,11 @@ from strands_robots.envelope import Envelope, error
 from strands_robots.errors import NoSuchRobotError, RefusalError, UnreachableError
 from strands_robots.fleet.adapter import FIND_S, STOP_S, FoundRobot, NetworkAdapter, OnEvent
 from strands_robots.fleet.fleet_verdict import combined, verdict_of_answer
+from strands_robots.fleet.refusals import answered
 from strands_robots.fleet.shared_id import SharedId, decided
 from strands_robots.fleet.side_by_side import side_by_side
 from strands_robots.safety.stopping import StopVerdict
+from strands_robots.serving.known_verbs import READS, RESUMES, STOPS
 from strands_robots.utils import near, plain_text
 
 if TYPE_CHECKING:
@@ -30,6 +32,9 @@ AGAIN_S, AGAIN_MAX_S = 1.0, 5.0
 
 SHARED_IDS_MAX = 1024
 """Ids on several networks of which the decided network is remembered."""
+
+STILL = READS | STOPS | RESUMES | {"wait"}
+"""Verbs of our robots that move nothing."""
 
 CLOSED = "the networks were left"
 
@@ -126,9 +131,10 @@ class Networks:
         absent: networks that are not joined, with the reason.
         keys: names of absent networks under which their robots are remembered, so that a stop names these.
         stays: go on trying to join those that are not there yet.
+        later: absent networks that may come: each returns its network once that is there, and is asked every second.
 
     Attributes:
-        stated: as given.
+        stated: as given, and those that came later.
         keys: as given.
         absent: networks that are not joined or do not answer, with the reason.
     """
@@ -140,11 +146,14 @@ class Networks:
         keys: Mapping[str, Callable[[], NetworkKey]] | None = None,
         *,
         stays: bool = False,
+        later: Sequence[Callable[[], NetworkAdapter | None]] = (),
     ) -> None:
         self.stated = tuple(stated)
         self.absent: dict[str, str] = dict(absent or {})
         self.keys = dict(keys or {})
-        self._stays, self._closed = stays, False
+        self._stays, self._later = stays, later
+        self._closed = self._waiting = False
+        self._left: threading.Event | None = None
         self._joinings: tuple[_Joining, ...] = ()
         self._change = threading.Condition()
         self._listeners: list[Callable[[NetworkAdapter], None]] = []
@@ -181,12 +190,19 @@ class Networks:
         self._closed = False
         for each in self._attempts():
             each.begin(here=here)
+        with self._change:
+            later, self._waiting, left = self._later if not self._waiting else (), True, self._left
+        for came in later:
+            threading.Thread(target=self._await, args=(came, left), name="await a network", daemon=True).start()
 
     def close(self) -> None:
         """Leave the networks."""
         with self._change:
             self._closed, joinings, self._joinings = True, self._joinings, ()
+            left, self._left, self._waiting = self._left, None, False
             self._told.clear()
+        if left is not None:
+            left.set()
         for each in joinings:
             each.close()
 
@@ -209,7 +225,7 @@ class Networks:
         Raises:
             UnreachableError: as it says.
         """
-        if not self._joinings:
+        if self._left is None:
             raise UnreachableError("not joined: use it as a context manager", remedy="with connect() as fleet: ...")
 
     def settled(self) -> tuple[NetworkAdapter, ...]:
@@ -327,10 +343,10 @@ class Networks:
             AmbiguousRobotError: two have it, and no key decides.
         """
         joined = self.settled()
-        if len(joined) == 1:
-            return joined[0]
-        bearers = [each for each in joined if _bears(each, robot)]
-        if not bearers or (moves and len(bearers) < len(joined)):
+        if (network := self._at_once(robot, moves=moves)) is not None:
+            return network
+        bearers = self.bearers(robot)
+        if len(bearers) < len(joined):
             bearers = _waited_for(robot, joined, every=moves)
         if not bearers:
             remedy = near(robot, {name for each in joined for name in each.announced()}).strip()
@@ -360,6 +376,21 @@ class Networks:
         """Return a verb as its robot describes it; raises as :meth:`of`."""
         return self.of(robot, name).verb(robot, name)
 
+    def described(self, robot: str, verb: str) -> tuple[NetworkAdapter, AdvertisedVerb | None]:
+        """Return the network that a call goes to, and the verb as its robot describes it.
+
+        Whether it moves the robot is known by its name, or else by that description.
+
+        Raises:
+            RefusalError: as :meth:`of`.
+        """
+        network = self.of(robot, verb)
+        described = network.verb(robot, verb)
+        if verb in STILL or (described is not None and described.kind != "motion"):
+            return network, described
+        decided = self.of(robot, verb, moves=True)
+        return decided, described if decided is network else decided.verb(robot, verb)
+
     def call(
         self, robot: str, verb: str, arguments: Mapping[str, Any], timeout: float, *, moves: bool = True
     ) -> Envelope:
@@ -374,17 +405,25 @@ class Networks:
         self, robot: str, verb: str, arguments: Mapping[str, Any], within: float, *, moves: bool = True
     ) -> Envelope:
         """Call a verb from an event loop; every failure is an answer of status error."""
-        try:
+
+        async def called() -> Envelope:
             network = await self.of_async(robot, verb, moves=moves)
-        except RefusalError as exc:
-            return error(f"{exc.why}. {exc.remedy}".strip())
-        return await network.call_async(robot, verb, arguments, within)
+            return await network.call_async(robot, verb, arguments, within)
+
+        return await answered(called())
+
+    async def describe_async(self, robot: str, within: float) -> FoundRobot:
+        """Return a robot with its functions, as it describes itself now.
+
+        Raises:
+            RefusalError: as :meth:`of`, or it does not answer.
+        """
+        return await (await self.of_async(robot)).describe_async(robot, within)
 
     async def of_async(self, robot: str, verb: str = "", *, moves: bool = False) -> NetworkAdapter:
         """Do as :meth:`of`, without blocking the event loop."""
-        joined = self.joined
-        if len(joined) == 1 and all(each.attempted.is_set() for each in self._joinings):
-            return joined[0]
+        if (network := self._at_once(robot, moves=moves)) is not None:
+            return network
         return await asyncio.to_thread(partial(self.of, robot, verb, moves=moves))
 
     def stop(self, robot: str, timeout: float = STOP_S, robot_name: str = "") -> dict[str, Envelope]:
@@ -421,9 +460,19 @@ class Networks:
     async def stop_async(self, robot: str, within: float = STOP_S, robot_name: str = "") -> dict[str, Envelope]:
         """Stop every bearer of an id from an event loop; return the answers by network.
 
-        It is sent on every joined network. Once a robot has answered, networks that do not know it are not waited for.
+        It is sent on every network, as soon as that is joined. Once a robot has answered, networks that do not know it
+        are not waited for.
         """
-        sent = {asyncio.ensure_future(each.stop_async(robot, within, robot_name)): each for each in self.joined}
+
+        async def stopped(joining: _Joining) -> Envelope:
+            if not joining.attempted.is_set():
+                await asyncio.to_thread(joining.attempted.wait)
+            if not joining.up:
+                return error(joining.why or CLOSED, stopped=None)
+            return await joining.network.stop_async(robot, within, robot_name)
+
+        joinings = [each for each in self._joinings if each.up or not each.attempted.is_set()]
+        sent = {asyncio.ensure_future(stopped(each)): each.network for each in joinings}
         answers, graded, pending = dict[NetworkAdapter, Envelope](), set[NetworkAdapter](), set(sent)
         while pending:
             done, pending = await asyncio.wait(pending, return_when=asyncio.FIRST_COMPLETED)
@@ -467,11 +516,24 @@ class Networks:
         return end_all
 
     def _attempts(self) -> tuple[_Joining, ...]:
-        """Return the attempts to join each network, made but not begun; none once the networks were left."""
+        """Return the attempts to join each network; none once they were left."""
         with self._change:
-            if not self._joinings and not self._closed:
+            if self._left is None and not self._closed:
+                self._left = threading.Event()
                 self._joinings = tuple(_Joining(each, again=self._stays, changed=self._changed) for each in self.stated)
             return self._joinings
+
+    def _await(self, came: Callable[[], NetworkAdapter | None], left: threading.Event) -> None:
+        """Join a network once it is there."""
+        while (network := came()) is None:
+            if left.wait(AGAIN_S):
+                return
+        joining = _Joining(network, again=True, changed=self._changed)
+        with self._change:
+            if left.is_set():
+                return
+            self.stated, self._joinings = (*self.stated, network), (*self._joinings, joining)
+        joining.begin(here=True)
 
     def _changed(self, joining: _Joining) -> None:
         if joining.up:
@@ -487,22 +549,30 @@ class Networks:
 
     def _stopped(self, robot: str, timeout: float, robot_name: str, *, insist: bool) -> dict[str, Envelope]:
         def stopped(network: NetworkAdapter) -> Envelope | None:
-            answer, why = None, ""
+            answer: Envelope | None = None
             try:
                 # Each stop leaves as soon as its network is up.
                 why = self.awaited(network)
                 if not why:
                     answer = network.stop(robot, timeout, robot_name, insist=insist)
-            except NoSuchRobotError:
-                pass
             except Exception as exc:  # noqa: BLE001 - a stop that fails is a verdict, whatever it raised
-                return error(f"{type(exc).__name__}: {exc}", stopped=None)
+                if not isinstance(exc, NoSuchRobotError):
+                    return error(f"{type(exc).__name__}: {exc}", stopped=None)
+                why = ""
             if insist:
                 return error(why, stopped=None) if why and not self.joined else answer
             return answer or _silent(network, robot, why)
 
         answers = side_by_side(stopped, self.stated)
         return {each.name: said for each, said in zip(self.stated, answers, strict=True) if said is not None}
+
+    def _at_once(self, robot: str, *, moves: bool) -> NetworkAdapter | None:
+        """Return the network on which a robot is called, where that is known without a question."""
+        joined = self.joined
+        if len(joined) == 1 and all(each.attempted.is_set() for each in self._joinings):
+            return joined[0]
+        bearers = self.bearers(robot)
+        return None if moves or not bearers else self._decided(robot, bearers) or bearers[0]
 
     def _shared_id(self, robot: str) -> SharedId:
         with self._change:
@@ -533,7 +603,7 @@ def _bears(network: NetworkAdapter, robot: str) -> bool:
 
 
 def _silent(network: NetworkAdapter, robot: str, why: str) -> Envelope | None:
-    """Return the answer of a robot that a network remembers, and that is silent there; None for another one.
+    """Return the answer of a silent robot that a network remembers, else None.
 
     Args:
         network: where it is remembered.

@@ -6,10 +6,10 @@ fields, and an answer of the mesh, which is a text, by its words.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Awaitable, Mapping
 from typing import Any
 
-from strands_robots.envelope import text_of
+from strands_robots.envelope import Envelope, error, text_of
 from strands_robots.errors import (
     ApprovalError,
     ArgumentsError,
@@ -73,13 +73,23 @@ def said(refusal: RefusalError) -> str:
     The ids near an absent one stay.
     """
     if refusal.envelope:
-        return text_of(refusal.envelope)
+        text = text_of(refusal.envelope)
+        # The mesh refuses with a word, of which an agent knows no meaning.
+        return f"{text}: {refusal.why}." if text.endswith(tuple(EXACT)) else text
     if isinstance(refusal, UnreachableError):
         return f"The network does not carry this: {refusal.why}"
     if isinstance(refusal, ValueError):
         return refusal.why
     why = refusal.why if refusal.why.endswith((".", "!", "?")) else f"{refusal.why}."
     return f"{why} {refusal.remedy}" if isinstance(refusal, NoSuchRobotError) and refusal.remedy else why
+
+
+async def answered(call: Awaitable[Envelope]) -> Envelope:
+    """Await a call; return a refusal as an answer of status error."""
+    try:
+        return await call
+    except RefusalError as refusal:
+        return refusal.envelope or error(said(refusal))
 
 
 def refusal_of(robot: str, verb: str, answer: Mapping[str, Any]) -> RefusalError:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
 from importlib.util import find_spec
-from typing import Any
+from typing import Any, NoReturn
 
 from strands_robots import settings
 from strands_robots._mesh_switch import mesh_env_request
@@ -15,6 +17,7 @@ from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.profiles import FleetProfile
 from strands_robots.safety import network_key
 from strands_robots.safety.network_key import NetworkKey
+from strands_robots.utils import MissingExtraError, ValidationError
 
 HUB_S = 0.2
 """Seconds in which the mesh's hub on this machine takes a connection."""
@@ -41,7 +44,7 @@ def networks_of(
         source: the caller's name.
         devices: False leaves Device Connect out.
         mesh: True joins the mesh in any case, False leaves it out.
-        stays: go on trying to join what is not there yet.
+        stays: go on trying to join what is not there yet, such as the mesh once its hub has come.
         preload: load now what a stop must not wait for, as a program does that lasts longer than a command.
 
     Raises:
@@ -50,6 +53,7 @@ def networks_of(
     absent: dict[str, str] = {}
     keys: dict[str, Callable[[], NetworkKey]] = {}
     networks: list[NetworkAdapter] = []
+    later: list[Callable[[], NetworkAdapter | None]] = []
     if not devices:
         absent[DEVICE_CONNECT] = "it is left out"
     elif profile is not None and not profile.reaches_devices(given):
@@ -69,14 +73,47 @@ def networks_of(
         absent[MESH] = f"the connection profile {profile.label} has none"
     elif mesh is None and stated is None and find_spec("zenoh") is None:
         absent[MESH] = "the extra mesh is not installed"
-    elif mesh is None and stated is None and not stays and (why := _no_hub()):
+    elif mesh is None and stated is None and (why := _no_hub()):
         # Its code is not loaded: most machines have no mesh.
         absent[MESH], keys[MESH] = why, _mesh_here
+        later += [lambda: None if _no_hub() else _mesh(source, None)] if stays else []
     else:
-        from strands_robots.fleet.mesh.network import MeshNetwork  # noqa: PLC0415 - as above
+        networks.append(_mesh(source, stated))
+    return Networks(networks, absent, keys, stays=stays, later=later)
 
-        networks.append(MeshNetwork(source, stated))
-    return Networks(networks, absent, keys, stays=stays)
+
+def _mesh(source: str, stated: Mapping[str, str] | None) -> NetworkAdapter:
+    from strands_robots.fleet.mesh.network import MeshNetwork  # noqa: PLC0415 - loaded when it is used
+
+    return MeshNetwork(source, stated)
+
+
+def networks_for_stop(
+    profile: FleetProfile | None, given: Mapping[str, Any], source: str, *, devices: bool = True
+) -> Networks:
+    """Return the networks of a stop, as :func:`networks_of`.
+
+    A stop leaves on one network though the settings of the other cannot be used; its verdict names that one.
+
+    Raises:
+        ValidationError: the settings of neither can be used.
+    """
+    try:
+        return networks_of(profile, given, source, devices=devices)
+    except (ValidationError, MissingExtraError) as exc:
+        unfit = exc
+    parts: list[tuple[str, FleetProfile | None, dict[str, bool]]] = [(DEVICE_CONNECT, profile, {"devices": False})]
+    if devices and profile is not None and profile.network:
+        parts.append((MESH, replace(profile, stated_mesh=None), {}))
+    for left_out, rest, without in parts:
+        try:
+            networks = networks_of(rest, given, source, **without)
+        except (ValidationError, MissingExtraError):
+            continue
+        networks.absent[left_out] = str(unfit)
+        networks.keys[left_out] = partial(_unusable, unfit)
+        return networks
+    raise unfit
 
 
 def _no_hub() -> str:
@@ -94,5 +131,10 @@ def _no_hub() -> str:
 
 
 def _mesh_here() -> NetworkKey:
-    """Return the name of this machine's mesh, as :func:`strands_robots.mesh.session.network` has it."""
+    """Return the name of this machine's mesh, as ``mesh.session`` has it."""
     return NetworkKey.of(network_key.MESH, [f"tcp/127.0.0.1:{settings.integer('STRANDS_MESH_PORT')}"])
+
+
+def _unusable(unfit: Exception) -> NoReturn:
+    """Raise what keeps a network from being used, so that its robots are not known."""
+    raise unfit

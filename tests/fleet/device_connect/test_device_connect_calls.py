@@ -8,9 +8,12 @@ from typing import Any
 import pytest
 from device_connect_edge.messaging import MessagingError
 
+from strands_robots import errors
 from strands_robots.device_connect import client as clients
 from strands_robots.device_connect.backends import loopback_config
+from strands_robots.device_connect.discovery import Peer
 from strands_robots.envelope import success
+from strands_robots.fleet.adapter import CLOSED
 from strands_robots.fleet.device_connect import lockouts
 from strands_robots.fleet.device_connect.network import DeviceConnectNetwork
 from strands_robots.safety.identity import KeyFileError
@@ -41,28 +44,51 @@ def there() -> Any:
     client.close()
 
 
-FAILURES = (
-    clients.NoSuchDeviceError("no device 'arm-1'"),
-    clients.DeviceTimeoutError("arm-1 did not answer"),
-    clients.ClientClosedError("closed"),
-    clients.CallRefusedError("\x1b[2Jbusy", -32000),
-    ValidationError("x must be a number"),
-    MessagingError("the broker is gone"),
+FAILURES: tuple[tuple[Exception, type[errors.RefusalError]], ...] = (
+    (clients.NoSuchDeviceError("no device 'arm-1'"), errors.NoSuchRobotError),
+    (clients.DeviceTimeoutError("arm-1 did not answer"), errors.NoAnswerError),
+    (clients.ClientClosedError(CLOSED), errors.NoAnswerError),
+    (clients.CallRefusedError("\x1b[2Jbusy", -32000), errors.RobotError),
+    (ValidationError("x must be a number"), errors.ArgumentsError),
+    (MessagingError("the broker is gone"), errors.UnreachableError),
 )
 
 
-@pytest.mark.parametrize("failure", FAILURES, ids=lambda each: type(each).__name__)
-def test_failure_is_an_answer_a_verdict_and_a_problem(there: Any, failure: Exception) -> None:
+@pytest.mark.parametrize("failure, refusal", FAILURES, ids=lambda each: getattr(each, "__name__", ""))
+def test_failure_is_a_refusal_a_verdict_and_a_problem(
+    there: Any, failure: Exception, refusal: type[errors.RefusalError]
+) -> None:
     there._client.answer = failure
 
     async def asked() -> Any:
-        called, stopped = await there.call_async("arm-1", "moveTo", {}, 1.0), await there.stop_async("arm-1", 1.0)
-        return called, stopped, await there.lockout_async("arm-1", 1.0)
+        with pytest.raises(refusal) as refused:
+            await there.call_async("arm-1", "moveTo", {}, 1.0)
+        with pytest.raises(refusal):
+            await there.describe_async("arm-1", 1.0)
+        return refused.value, await there.stop_async("arm-1", 1.0), await there.lockout_async("arm-1", 1.0)
 
-    called, stopped, report = asyncio.run(asked())
+    refused, stopped, report = asyncio.run(asked())
     said = str(failure).replace("\x1b[2J", "")
-    assert [called["content"][0]["text"], stopped["content"][0]["text"], report.problem] == [said] * 3
-    assert (called["status"], stopped["stopped"], dict(report.facts)) == ("error", None, {})
+    assert [refused.why, stopped["content"][0]["text"], report.problem] == [said] * 3
+    assert (stopped["stopped"], dict(report.facts)) == (None, {})
+
+
+def test_device_is_described_under_the_id_that_it_was_asked_by(there: Any) -> None:
+    functions = [{"name": "moveTo"}]
+    there._client.answer = {"device_id": "arm-9", "capabilities": {"functions": functions}}
+    found = asyncio.run(there.describe_async("arm-1", 1.0))
+    assert (found.id, list(found.functions)) == ("arm-1", functions)
+
+
+def test_device_that_is_gone_is_forgotten(there: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(there._client, "peers", lambda timeout: [Peer("arm-1")])
+    monkeypatch.setattr(there._client, "known", tuple)
+    there.find()
+    assert there.bears("arm-1")
+    there._client.answer = clients.NoSuchDeviceError("no device 'arm-1'")
+    with pytest.raises(errors.NoSuchRobotError):
+        asyncio.run(there.call_async("arm-1", "getStatus", {}, 1.0))
+    assert not there.bears("arm-1")
 
 
 def test_end_of_the_events_of_a_lost_connection_does_not_fail(there: Any, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,10 +13,13 @@ from fixtures.mesh_robots import Arm
 from fixtures.waiting import eventually
 from tests.mesh.peers import fleet
 
+from strands_robots.errors import ApprovalError, NoAnswerError, NoSuchRobotError, UnknownVerbError
 from strands_robots.fleet.adapter import CLOSED
 from strands_robots.fleet.mesh.network import MeshNetwork
 from strands_robots.fleet.mesh.requests import IN_FLIGHT
 from strands_robots.mesh import Mesh
+from strands_robots.safety.approval import Grants, digest
+from strands_robots.state_files import state_dir
 
 
 @pytest.fixture
@@ -61,25 +64,57 @@ def test_stop_and_question_wait_for_no_call(console: Any, monkeypatch: pytest.Mo
         assert (report.problem, report.lockouts) == ("", ())
         assert report.facts["task_status"] == "idle"
         busy.released.set()
-        assert {(await each)["status"] for each in calls} == {"error"}
+        assert {type(each) for each in await asyncio.gather(*calls, return_exceptions=True)} == {NoAnswerError}
 
     asyncio.run(both())
 
 
-def test_answers_and_failures_of_a_call_are_envelopes(console: Any) -> None:
-    _, there, _ = console
+def test_call_is_answered_or_refused(console: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    mesh, there, _ = console
 
-    async def answers() -> list[Any]:
-        return [
-            await there.call_async("arm-1", "getFeatures", {"nothing": None, "empty": ""}, 10.0),
-            await there.call_async("arm-1", "fly", {}, 10.0),
-            await there.call_async("arm-9", "getStatus", {}, 0.05),
-        ]
+    async def answers() -> Any:
+        features = await there.call_async("arm-1", "getFeatures", {"nothing": None, "empty": ""}, 10.0)
+        with pytest.raises(UnknownVerbError, match="action must be one of"):
+            await there.call_async("arm-1", "fly", {}, 10.0)
+        with pytest.raises(NoSuchRobotError):
+            await there.call_async("arm-9", "getStatus", {}, 0.05)
+        Busy(mesh, monkeypatch, "ping").released.set()
+        with pytest.raises(NoAnswerError, match="arm-1 did not answer"):
+            await there.call_async("arm-1", "ping", {}, 0.05)
+        return features
 
-    features, unknown, silent = asyncio.run(answers())
-    assert features["status"] == "success"
-    assert "action must be one of" in unknown["content"][0]["text"]
-    assert silent["content"][0]["text"] == "arm-9 did not answer."
+    assert asyncio.run(answers())["status"] == "success"
+
+
+def test_peer_describes_itself_and_an_older_one_is_described_by_its_kind(
+    console: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mesh, there, _ = console
+    arm = asyncio.run(there.describe_async("arm-1", 10.0))
+    assert {"start", "stop", "acquireControl"} <= {each["name"] for each in arm.functions}
+    send = mesh.send
+
+    def older(target: str, cmd: dict[str, Any], timeout: float) -> dict[str, Any]:
+        known = cmd["action"] != "describe"
+        refused = {"type": "error", "error": "validation: action must be one of stop, not 'describe'."}
+        return dict(send(target, cmd, timeout)) if known else refused
+
+    monkeypatch.setattr(mesh, "send", older)
+    by_kind = asyncio.run(there.describe_async("arm-1", 10.0))
+    assert {"start", "stop"} <= {each["name"] for each in by_kind.functions}
+
+
+def test_grant_for_a_call_as_it_is_received_lets_that_call_alone_begin(console: Any) -> None:
+    _, there, arm = console
+    task = {"instruction": "wave", "policy_provider": "mock", "duration": 0.2, "robot_name": ""}
+    sent = {**task, "lease_id": "secret", "lease_ttl_s": 5.0}
+    received = there.received("arm-1", "start", task)
+    bound = {"caller": received.caller, "arguments_digest": digest(received.arguments)}
+    Grants(state_dir() / "grants").grant(received.verb, "arm-1", 15.0, **bound)
+    with pytest.raises(ApprovalError):
+        asyncio.run(there.call_async("arm-1", "start", {**sent, "duration": 0.3}, 10.0))
+    asyncio.run(there.call_async("arm-1", "start", sent, 10.0))
+    assert arm.started == ["wave"]
 
 
 def test_silent_robot_has_neither_stopped_nor_reported(console: Any) -> None:
@@ -98,12 +133,12 @@ def test_closed_network_answers_at_once(console: Any) -> None:
     there.close()
 
     async def asked() -> Any:
-        called, stopped = await there.call_async("arm-1", "ping", {}, 10.0), await there.stop_async("arm-1", 10.0)
-        return called, stopped, await there.lockout_async("arm-1", 10.0)
+        with pytest.raises(NoAnswerError, match=CLOSED):
+            await there.call_async("arm-1", "ping", {}, 10.0)
+        return await there.stop_async("arm-1", 10.0), await there.lockout_async("arm-1", 10.0)
 
-    called, stopped, report = asyncio.run(asked())
-    assert [called["content"][0], stopped["content"][0]] == [{"text": CLOSED}] * 2
-    assert (stopped["stopped"], report.problem) == (None, CLOSED)
+    stopped, report = asyncio.run(asked())
+    assert (stopped["reason"], stopped["stopped"], report.problem) == (CLOSED, None, CLOSED)
 
 
 def test_hundredth_stop_begins_as_soon_as_the_first(console: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -128,11 +163,12 @@ def test_requests_answer_whatever_the_mesh_raises(console: Any, monkeypatch: pyt
     monkeypatch.setattr(mesh, "send", broken)
 
     async def asked() -> Any:
-        called, stopped = await there.call_async("arm-1", "ping", {}, 10.0), await there.stop_async("arm-1", 10.0)
-        return called, stopped, await there.lockout_async("arm-1", 10.0)
+        with pytest.raises(NoAnswerError, match="the cable"):
+            await there.call_async("arm-1", "ping", {}, 10.0)
+        return await there.stop_async("arm-1", 10.0), await there.lockout_async("arm-1", 10.0)
 
-    called, stopped, report = asyncio.run(asked())
-    assert [called["reason"], stopped["reason"], report.problem] == ["the cable"] * 3
+    stopped, report = asyncio.run(asked())
+    assert [stopped["reason"], report.problem] == ["the cable"] * 2
     assert stopped["stopped"] is None
 
 
@@ -142,13 +178,13 @@ def test_request_that_waits_for_a_thread_is_answered_where_the_network_is_left(
     mesh, there, _ = console
     busy = Busy(mesh, monkeypatch, "ping")
 
-    async def left() -> Any:
+    async def left() -> None:
         calls = [asyncio.create_task(there.call_async("arm-1", "ping", {}, 60.0)) for _ in range(IN_FLIGHT + 1)]
         await asyncio.to_thread(eventually, lambda: busy.waiting >= IN_FLIGHT, 30.0, what="every thread of calls waits")
         there.close()
-        last = await calls[-1]
+        with pytest.raises(NoAnswerError, match=CLOSED):
+            await calls[-1]
         busy.released.set()
-        await asyncio.gather(*calls)
-        return last
+        await asyncio.gather(*calls, return_exceptions=True)
 
-    assert asyncio.run(left())["reason"] == CLOSED
+    asyncio.run(left())

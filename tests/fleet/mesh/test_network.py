@@ -175,8 +175,8 @@ def test_no_argument_refuses_a_stop(arguments: dict[str, Any]) -> None:
 def test_call_from_an_event_loop_is_refused_for_such_an_argument_and_a_stop_is_not(arguments: dict[str, Any]) -> None:
     mesh = FakeMesh([row("arm-1")], done)
     there = joined(mesh)
-    refused = asyncio.run(there.call_async("arm-1", "moveTo", arguments, 1.0))
-    assert refused["status"] == "error"
+    with pytest.raises(ArgumentsError):
+        asyncio.run(there.call_async("arm-1", "moveTo", arguments, 1.0))
     assert mesh.sent == []
     asyncio.run(there.call_async("arm-1", "stop", arguments, 1.0))
     assert [command for _, command, _ in mesh.sent] == [{"action": "stop"}]

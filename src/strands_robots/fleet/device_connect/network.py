@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
-from typing import TYPE_CHECKING, Any, Self, TypeVar
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Self
 
 from strands_robots.envelope import Envelope, error
 from strands_robots.errors import (
@@ -17,7 +18,7 @@ from strands_robots.errors import (
     UnknownVerbError,
     UnreachableError,
 )
-from strands_robots.fleet.adapter import CLOSED, DEVICE_CONNECT, FIND_S, STOP_S, FoundRobot, OnEvent
+from strands_robots.fleet.adapter import CLOSED, DEVICE_CONNECT, FIND_S, STOP_S, FoundRobot, OnEvent, ReceivedCall
 from strands_robots.fleet.link_flags import described
 from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope
 from strands_robots.utils import ValidationError, device_id, plain_text
@@ -34,11 +35,13 @@ if TYPE_CHECKING:
     from strands_robots.safety.stop_roster import StopOutcome
     from strands_robots.serving.advertised import AdvertisedVerb
 
-T = TypeVar("T")
 logger = logging.getLogger(__name__)
 
 UNKNOWN_METHOD, BAD_PARAMS = -32601, -32602
 """JSON-RPC's codes of an unknown function and of arguments that do not fit."""
+
+DESCRIBE = "requestRegistration"
+"""Function by which a device describes itself."""
 
 DESCRIBE_S = 2.0
 """Seconds in which a device has to describe itself."""
@@ -72,7 +75,7 @@ class DeviceConnectNetwork:
 
     @classmethod
     def joined(cls, client: FleetClient) -> Self:
-        """Return the network of a connected client, which stays with whoever connected it."""
+        """Return the network of a connected client, which is closed by its owner."""
         network = cls(client.link, client.source)
         network._client, network._given = client, True
         return network
@@ -156,7 +159,7 @@ class DeviceConnectNetwork:
             try:
                 self._peers[robot] = self._connected.describe(robot, DESCRIBE_S)
             except Exception as exc:
-                refusal = _refusal(exc, robot, "requestRegistration")
+                refusal = _refusal(exc, robot, DESCRIBE)
                 if refusal is None:
                     raise
                 if robot not in self._peers:
@@ -170,11 +173,13 @@ class DeviceConnectNetwork:
 
     def verb(self, robot: str, name: str) -> AdvertisedVerb | None:
         """Return a function as the device itself describes it."""
-        return _answered(robot, name, lambda: self._connected.verb(robot, name))
+        with self._asked(robot, name):
+            return self._connected.verb(robot, name)
 
     def call(self, robot: str, verb: str, arguments: Mapping[str, Any], timeout: float) -> Envelope:
         """Call a function of the device."""
-        return _answered(robot, verb, lambda: self._connected.call(robot, verb, arguments, timeout))
+        with self._asked(robot, verb):
+            return self._connected.call(robot, verb, arguments, timeout)
 
     def stop(
         self, robot: str, timeout: float = STOP_S, robot_name: str = "", *, insist: bool = False
@@ -185,14 +190,22 @@ class DeviceConnectNetwork:
         unknown = answer.get("status") == "error" and answer.get("stopped") is None
         return None if unknown and not insist and not self.bears(robot) else answer
 
+    def received(self, robot: str, verb: str, arguments: Mapping[str, Any]) -> ReceivedCall:
+        """Return the call as it is: a device receives what was sent."""
+        del robot
+        return ReceivedCall(self._source, verb, arguments)
+
     async def call_async(self, robot: str, verb: str, arguments: Mapping[str, Any], within: float) -> Envelope:
         """Call a function of the device."""
-        try:
+        with self._asked(robot, verb):
             return await self._connected.call_async(robot, verb, arguments, within)
-        except Exception as exc:
-            if _refusal(exc, robot, verb) is None and not isinstance(exc, RefusalError):
-                raise
-            return error(_why(exc))
+
+    async def describe_async(self, robot: str, within: float) -> FoundRobot:
+        """Return the device as it describes itself."""
+        described = await self.call_async(robot, DESCRIBE, {}, within)
+        from strands_robots.device_connect.discovery import Peer  # noqa: PLC0415 - loaded when it is used
+
+        return _found(replace(Peer.of(described), id=robot))
 
     async def stop_async(self, robot: str, within: float = STOP_S, robot_name: str = "") -> Envelope:
         """Stop the device by ``stop``, else by ``stopMotion``."""
@@ -350,7 +363,7 @@ class DeviceConnectNetwork:
 
     @contextmanager
     def _lent(self) -> Iterator[FleetClient]:
-        """Lend the joined client, or one of its own where there is none: an emergency stop waits for no joining."""
+        """Lend the joined client, or one for the length of the block."""
         client = self._client
         if client is not None:
             yield client
@@ -359,6 +372,21 @@ class DeviceConnectNetwork:
 
         with FleetClient(self._link, self._source) as own:
             yield own
+
+    @contextmanager
+    def _asked(self, robot: str, verb: str) -> Iterator[None]:
+        """Raise what a call raises as a :class:`RefusalError`; forget a device that is gone."""
+        try:
+            yield
+        except RefusalError:
+            raise
+        except Exception as exc:
+            refusal = _refusal(exc, robot, verb)
+            if refusal is None:
+                raise
+            if isinstance(refusal, NoSuchRobotError):
+                self._peers.pop(robot, None)
+            raise refusal from exc
 
     @property
     def _connected(self) -> FleetClient:
@@ -395,20 +423,8 @@ def _found(peer: Peer) -> FoundRobot:
             **{"functions": peer.functions, "events": peer.events, "tags": list(peer.tags)},
             "age_s": None if age is None else round(age, 3),
         },
+        functions=peer.functions,
     )
-
-
-def _answered(robot: str, verb: str, call: Callable[[], T]) -> T:
-    """Return what ``call`` returns; raise its exception as a :class:`RefusalError`."""
-    try:
-        return call()
-    except RefusalError:
-        raise
-    except Exception as exc:
-        refusal = _refusal(exc, robot, verb)
-        if refusal is None:
-            raise
-        raise refusal from exc
 
 
 def _why(exc: Exception) -> str:

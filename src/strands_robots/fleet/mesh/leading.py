@@ -1,4 +1,4 @@
-"""Teleoperation over the mesh: a leader here leads a peer, or one there a robot here.
+"""Teleoperation over the mesh, where a leader leads the robot of another peer.
 
 Authorization and lockout are the follower's, wherever its leader is.
 """
@@ -205,10 +205,10 @@ def publisher(mesh: Mesh, leader: Any, method: str, hz: float) -> InputPublisher
 
 @contextmanager
 def followed(robot: Any, peer: str, max_speed: float) -> Iterator[FollowedPeer]:
-    """Let a leader that another peer publishes drive a robot of this process, for the length of a block.
+    """Let the leader of another peer drive a robot for the length of a block.
 
     Args:
-        robot: joined to the mesh.
+        robot: of this process, joined to the mesh.
         peer: the publisher; its device is called ``leader``.
         max_speed: whole joint ranges a second.
 

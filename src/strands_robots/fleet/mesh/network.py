@@ -15,8 +15,14 @@ from itertools import count
 from typing import TYPE_CHECKING, Any, Self
 
 from strands_robots.envelope import Envelope, error
-from strands_robots.errors import ArgumentsError, NoAnswerError, NoSuchRobotError, RefusalError, UnreachableError
-from strands_robots.fleet.adapter import CLOSED, FIND_S, MESH, STOP_S, FoundRobot, OnEvent
+from strands_robots.errors import (
+    ArgumentsError,
+    NoAnswerError,
+    NoSuchRobotError,
+    UnknownVerbError,
+    UnreachableError,
+)
+from strands_robots.fleet.adapter import CLOSED, FIND_S, MESH, STOP_S, FoundRobot, OnEvent, ReceivedCall
 from strands_robots.fleet.lockout_report import LockoutReport, Resumed
 from strands_robots.fleet.mesh.controller import MeshController
 from strands_robots.fleet.mesh.descriptions import functions_of, functions_of_each, functions_of_kind
@@ -242,15 +248,32 @@ class MeshNetwork:
         reply = self._joined_mesh.send(robot, {"action": "stop", **one}, timeout)
         return stop_answer(robot, reply, enrolled_peers())
 
+    def received(self, robot: str, verb: str, arguments: Mapping[str, Any]) -> ReceivedCall:
+        """Return the call with the action's defaults; of a verb of the robot's own as it is."""
+        from strands_robots.mesh.security import validate_command  # noqa: PLC0415 - loaded when it is used
+        from strands_robots.serving.verbs import LEASE_NAMES  # noqa: PLC0415 - as above
+
+        mesh, action = self._joined_mesh, self._action(robot, verb)
+        given = self._given_to(robot, action, arguments)
+        sent = given if self._owns(robot, action) else validate_command({**given, "action": action})
+        left_out = LEASE_NAMES | {"action"}
+        return ReceivedCall(mesh.peer_id, action, {name: value for name, value in sent.items() if name not in left_out})
+
     async def call_async(self, robot: str, verb: str, arguments: Mapping[str, Any], within: float) -> Envelope:
-        """Send the peer an action, without the arguments that are empty."""
-        given = {name: value for name, value in arguments.items() if value not in ("", None)}
+        """Send the peer an action, without the arguments that are empty.
+
+        A verb of the robot's own gets them all.
+        """
+        return await self._requests.call(lambda: self.call(robot, verb, self._given_to(robot, verb, arguments), within))
+
+    async def describe_async(self, robot: str, within: float) -> FoundRobot:
+        """Return the peer with the functions that it describes, of an older one those of its kind."""
         try:
-            carried = _carried(robot, verb, given)
-            mesh = self._joined_mesh
-            return await self._requests.call(mesh, robot, {**carried, "action": self._action(robot, verb)}, within)
-        except RefusalError as exc:
-            return error(exc.why)
+            functions = (await self.call_async(robot, "describe", {}, within)).get("functions")
+        except UnknownVerbError:
+            functions = None
+        told = functions if isinstance(functions, list) else self.announced_functions(robot)
+        return replace(self.known(robot), functions=told)
 
     async def stop_async(self, robot: str, within: float = STOP_S, robot_name: str = "") -> Envelope:
         """Stop the peer on a thread that no call takes."""
@@ -399,9 +422,16 @@ class MeshNetwork:
         return [row for row in self._joined_mesh.peers if row["reachable"]]
 
     def _action(self, robot: str, verb: str) -> str:
-        row = self._joined_mesh.get_peer(robot) or {}
-        own = row.get("own_verbs")
-        return verb if isinstance(own, list) and verb in own else _ALIASES.get(verb, verb)
+        return verb if self._owns(robot, verb) else _ALIASES.get(verb, verb)
+
+    def _owns(self, robot: str, verb: str) -> bool:
+        own = (self._joined_mesh.get_peer(robot) or {}).get("own_verbs")
+        return isinstance(own, list) and verb in own
+
+    def _given_to(self, robot: str, verb: str, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+        if self._mesh is None or self._owns(robot, verb):
+            return arguments
+        return {name: value for name, value in arguments.items() if value not in ("", None)}
 
     def _waited_for(self, robot: str, longest: float = math.inf) -> bool:
         """Return whether the peer is in reach, once that can be known."""

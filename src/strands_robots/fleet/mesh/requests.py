@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from strands_robots.envelope import Envelope, error
+from strands_robots.errors import NoAnswerError, RefusalError
 from strands_robots.fleet.adapter import CLOSED
 from strands_robots.fleet.cached_keys import CachedKeys
 from strands_robots.fleet.lockout_report import LockoutReport
@@ -37,17 +38,23 @@ class PeerRequests:
         self._questions = ThreadPoolExecutor(IN_FLIGHT, "mesh question")
         self._keys = CachedKeys(enrolled_peers)
 
-    async def call(self, mesh: Mesh, robot: str, command: dict[str, Any], seconds: float) -> Envelope:
-        """Send an action; every failure is an answer of status error."""
-        reply = await _done(self._calls, lambda: mesh.send(robot, command, seconds), lambda why: {"failed": why})
-        if "failed" in reply:
-            return error(reply["failed"])
-        if reply.get("status") == "timeout":
-            return error(f"{robot} did not answer.")
-        if reply.get("type") != "response":
-            return error(f"{robot}: {plain_text(reply.get('error')) or 'refused'}")
-        result = reply.get("result")
-        return dict(result) if isinstance(result, Mapping) else error(f"{robot} answered with an unknown result shape.")
+    async def call(self, work: Callable[[], Envelope]) -> Envelope:
+        """Return what ``work`` answers.
+
+        Raises:
+            RefusalError: as ``work``; no answer for whatever else it raises.
+        """
+
+        def refused() -> Envelope | RefusalError:
+            try:
+                return work()
+            except RefusalError as refusal:
+                return refusal
+
+        answer = await _done(self._calls, refused, NoAnswerError)
+        if isinstance(answer, RefusalError):
+            raise answer
+        return answer
 
     async def stop(self, mesh: Mesh, robot: str, seconds: float, robot_name: str = "") -> Envelope:
         """Stop a peer; *stopped* counts only where an enrolled robot has signed it."""
