@@ -460,7 +460,7 @@ class TestDefaultProfile:
 
     @pytest.fixture
     def joined(self, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-        """The networks that were joined, none of which answers."""
+        """The networks that were joined or stopped, none of which answers."""
         found: list[str] = []
 
         def device_connect(self: DeviceConnectNetwork, *_: object, **__: object) -> None:
@@ -475,7 +475,6 @@ class TestDefaultProfile:
         monkeypatch.setenv("STRANDS_MESH", "true")
         monkeypatch.setenv("STRANDS_MESH_PORT", "7001")
         monkeypatch.setenv("STRANDS_DC_PORT", "7002")
-        # An emergency stop leaves on a connection of its own.
         for way in ("open", "emergency_stop"):
             monkeypatch.setattr(DeviceConnectNetwork, way, device_connect)
         monkeypatch.setattr(MeshNetwork, "_dialled", mesh)

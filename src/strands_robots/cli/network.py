@@ -212,7 +212,7 @@ class Network:
 
     @property
     def _usable_mesh(self) -> bool | None:
-        """False where the profile's mesh cannot be used: then it is left out, for a stop needs the rest."""
+        """False where the profile's mesh cannot be used, and is left out."""
         profile = self._profile
         try:
             _ = None if profile is None else profile.mesh

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, wait
 from contextlib import closing, contextmanager, nullcontext, suppress
 from functools import partial
@@ -161,7 +161,7 @@ def estop(
 
 @contextmanager
 def _stopping(screen: Screen, network: Network, *, on_mesh: bool, source: str | None = None) -> Iterator[Networks]:
-    """Make the networks of a stop, which joins them itself; without any it ends with code 3."""
+    """Make the networks of a stop, which joins them itself."""
     try:
         networks = network.networks(on_mesh=on_mesh, source=TOOL if on_mesh else source)
     except CliError as failure:
@@ -174,7 +174,7 @@ def _stopping(screen: Screen, network: Network, *, on_mesh: bool, source: str | 
 
 
 def _say_ignored(screen: Screen, *notes: str) -> None:
-    """Say what of a stop's arguments is left out, once it has left; none of them refuses it."""
+    """Say what of a stop's arguments is left out, once the stop has left."""
     for note in filter(None, notes):
         screen.say(f"Ignored: {plain(note, 300)}.", "yellow")
 
@@ -211,7 +211,7 @@ def show_resume(screen: Screen, key: Path | None, flags: str) -> None:
 def _watched(
     screen: Screen, networks: Networks, pressed: Callable[[], FleetVerdict], latest: Mapping[str, Progress]
 ) -> FleetVerdict:
-    """Press on a thread of its own, which never waits for drawing, and draw the answers as they come."""
+    """Press on a thread that never waits for drawing; draw the answers."""
     verdict: Future[FleetVerdict] = Future()
 
     def press() -> None:
@@ -228,7 +228,7 @@ def _watched(
             so_far = dict(latest)
             rows = {name: progress_rows(each) for name, each in so_far.items()}
             live.update(stop_table(rows, _title(so_far, len(networks.stated))), refresh=True)
-        shown = _concerned(verdict.result())
+        shown = _shown(verdict.result())
         live.update(stop_table(_rows(shown), "EMERGENCY STOP"), refresh=True)
     return verdict.result()
 
@@ -240,12 +240,12 @@ def _title(progress: Mapping[str, Progress], networks: int) -> str:
     return f"EMERGENCY STOP{age}{': THE LINK IS DOWN' if down else ''}"
 
 
-def _concerned(verdict: FleetVerdict) -> list[NetworkVerdict]:
-    """Return the networks that a stop is shown for: beside one with robots, one without any is none."""
-    return [each for each in verdict.networks if each.concerned] or list(verdict.networks[:1])
+def _shown(verdict: FleetVerdict) -> Sequence[NetworkVerdict]:
+    """Return the networks to show: one without robots only where it is alone."""
+    return verdict.reporting or verdict.networks[:1]
 
 
-def _rows(shown: list[NetworkVerdict]) -> dict[str, list[tuple[Any, ...]]]:
+def _rows(shown: Sequence[NetworkVerdict]) -> dict[str, list[tuple[Any, ...]]]:
     return {each.network: outcome_rows(each.outcome) for each in shown if each.outcome is not None}
 
 
@@ -269,7 +269,7 @@ def _report(
     Returns:
         The names of the networks that have robots.
     """
-    shown = _concerned(verdict)
+    shown = _shown(verdict)
     rows = _rows(shown)
     estop = bool(verdict.estop_id)
     if not drawn and any(rows.values()):
@@ -290,8 +290,8 @@ def _report(
     everywhere = (*verdict.networks, *verdict.unreached)
     first = next((each for each in everywhere if each.network == networks.stated[0].name), everywhere[0])
     known = {**facts(networks, first)}
-    for each in verdict.networks:
-        if each is not first and each.concerned:
+    for each in verdict.reporting:
+        if each is not first:
             known[each.network] = {name: every.stopped for name, every in each.verdicts().items()}
     stated = {each.name for each in networks.stated}
     known |= _say_absent(screen, {each.network: each.absent for each in verdict.unreached if each.network in stated})
@@ -336,7 +336,7 @@ def _warn(screen: Screen, outcome: StopOutcome) -> None:
 
 
 def _report_one(screen: Screen, networks: Networks, device: str, robot: str, answers: Mapping[str, Envelope]) -> None:
-    """Print the stop of one robot on each network that has it; raise unless all of them stand still.
+    """Print the stop of one robot on each network; raise unless all stand still.
 
     Args:
         screen: where.

@@ -98,7 +98,7 @@ def progress_rows(progress: Progress) -> list[tuple[Any, ...]]:
 
 
 def stop_table(rows: Mapping[str, Sequence[tuple[Any, ...]]], title: str = "", *, timed: bool = True) -> Table:
-    """Return the table of a stop, with a column for the network where several have rows.
+    """Return the table of a stop; the network is named where several have rows.
 
     Args:
         rows: by network.

@@ -249,7 +249,7 @@ class NetworkAdapter(Protocol):
 
     @property
     def meeting_port(self) -> int | None:
-        """The loopback port where robots of this machine meet; None where that is not known."""
+        """The loopback port where robots meet; None where it is not known."""
 
     @property
     def stale(self) -> str:

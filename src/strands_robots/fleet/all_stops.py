@@ -170,17 +170,17 @@ def _on_each(networks: Networks, stop: Callable[[NetworkAdapter], NetworkVerdict
 
     stated = networks.stated
     stops = side_by_side(stopped, stated)
-    # One of them may have come since the stop left.
     stops += [
         (not_left(name, key, networks.absent.get(name, "it is not joined")), False)
         for name, key in networks.keys.items()
+        # One of them may have come since the stop left.
         if all(name != each.name for each in stated)
     ]
     return stops
 
 
 def _told_once(verdicts: Sequence[Stopped], named: Collection[str]) -> list[Stopped]:
-    """Return the verdicts with each named robot silent where it is known, else on one network."""
+    """Return the verdicts; a named robot is silent where it is known, else once."""
     dropped = [set[str]() for _ in verdicts]
     for name in named:
         silent = [at for at, (each, _) in enumerate(verdicts) if name in each.silent]
@@ -191,7 +191,7 @@ def _told_once(verdicts: Sequence[Stopped], named: Collection[str]) -> list[Stop
 
 
 def _parted(verdicts: Sequence[Stopped]) -> tuple[list[NetworkVerdict], list[NetworkVerdict]]:
-    """Return the verdicts that count, and those of networks that are gone and have no robot."""
+    """Return the verdicts that count, and those of gone networks without robots."""
     reached = any(left for _, left in verdicts)
     counted, gone = list[NetworkVerdict](), list[NetworkVerdict]()
     for each, left in verdicts:
@@ -201,10 +201,6 @@ def _parted(verdicts: Sequence[Stopped]) -> tuple[list[NetworkVerdict], list[Net
     return counted, gone
 
 
-def _said(verdict: StopVerdict) -> str:
-    return "; ".join([*verdict.not_stopped.values(), *verdict.unknown.values()]) or "stopped"
-
-
 def _remembered(network: NetworkAdapter, meant: Scope) -> bool:
     """Return whether this machine remembers a robot that a scope means on a network."""
     try:
@@ -212,3 +208,7 @@ def _remembered(network: NetworkAdapter, meant: Scope) -> bool:
     except UnreachableError:
         # The mesh of a profile that could not be joined has no name.
         return False
+
+
+def _said(verdict: StopVerdict) -> str:
+    return "; ".join([*verdict.not_stopped.values(), *verdict.unknown.values()]) or "stopped"

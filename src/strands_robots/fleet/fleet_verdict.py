@@ -49,11 +49,6 @@ class NetworkVerdict:
         return frozenset({*report.answered, *report.silent, *report.alarms})
 
     @property
-    def concerned(self) -> bool:
-        """True where a robot is known, or may be."""
-        return bool(self.verdicts() or self.problems)
-
-    @property
     def silent(self) -> Sequence[str]:
         """Robots that had to answer, and did not."""
         return self.outcome.report.silent if self.outcome is not None else ()
@@ -64,7 +59,7 @@ class NetworkVerdict:
         return outcome is not None and any(row.name == robot and not row.named for row in outcome.roster.rows)
 
     def without(self, robots: Collection[str]) -> NetworkVerdict:
-        """Return the verdict without robots that are silent here, because they are of another network."""
+        """Return the verdict without silent robots, which are of another network."""
         if self.outcome is None or not robots:
             return self
         outcome = self.outcome

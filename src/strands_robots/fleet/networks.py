@@ -151,7 +151,8 @@ class Networks:
         self.stated = tuple(stated)
         self.absent: dict[str, str] = dict(absent or {})
         self.keys = dict(keys or {})
-        self._stays, self._later, self._closed = stays, later, False
+        self._stays, self._later = stays, later
+        self._closed = self._waiting = False
         self._left: threading.Event | None = None
         self._joinings: tuple[_Joining, ...] = ()
         self._change = threading.Condition()
@@ -189,12 +190,16 @@ class Networks:
         self._closed = False
         for each in self._attempts():
             each.begin(here=here)
+        with self._change:
+            later, self._waiting, left = self._later if not self._waiting else (), True, self._left
+        for came in later:
+            threading.Thread(target=self._await, args=(came, left), name="await a network", daemon=True).start()
 
     def close(self) -> None:
         """Leave the networks."""
         with self._change:
             self._closed, joinings, self._joinings = True, self._joinings, ()
-            left, self._left = self._left, None
+            left, self._left, self._waiting = self._left, None, False
             self._told.clear()
         if left is not None:
             left.set()
@@ -510,6 +515,14 @@ class Networks:
 
         return end_all
 
+    def _attempts(self) -> tuple[_Joining, ...]:
+        """Return the attempts to join each network; none once they were left."""
+        with self._change:
+            if self._left is None and not self._closed:
+                self._left = threading.Event()
+                self._joinings = tuple(_Joining(each, again=self._stays, changed=self._changed) for each in self.stated)
+            return self._joinings
+
     def _await(self, came: Callable[[], NetworkAdapter | None], left: threading.Event) -> None:
         """Join a network once it is there."""
         while (network := came()) is None:
@@ -521,16 +534,6 @@ class Networks:
                 return
             self.stated, self._joinings = (*self.stated, network), (*self._joinings, joining)
         joining.begin(here=True)
-
-    def _attempts(self) -> tuple[_Joining, ...]:
-        """Return the attempts to join each network, made but not begun; none once the networks were left."""
-        with self._change:
-            if self._left is None and not self._closed:
-                self._left = left = threading.Event()
-                self._joinings = tuple(_Joining(each, again=self._stays, changed=self._changed) for each in self.stated)
-                for came in self._later:
-                    threading.Thread(target=self._await, args=(came, left), name="await a network", daemon=True).start()
-            return self._joinings
 
     def _changed(self, joining: _Joining) -> None:
         if joining.up:
@@ -546,16 +549,16 @@ class Networks:
 
     def _stopped(self, robot: str, timeout: float, robot_name: str, *, insist: bool) -> dict[str, Envelope]:
         def stopped(network: NetworkAdapter) -> Envelope | None:
-            answer, why = None, ""
+            answer: Envelope | None = None
             try:
                 # Each stop leaves as soon as its network is up.
                 why = self.awaited(network)
                 if not why:
                     answer = network.stop(robot, timeout, robot_name, insist=insist)
-            except NoSuchRobotError:
-                pass
             except Exception as exc:  # noqa: BLE001 - a stop that fails is a verdict, whatever it raised
-                return error(f"{type(exc).__name__}: {exc}", stopped=None)
+                if not isinstance(exc, NoSuchRobotError):
+                    return error(f"{type(exc).__name__}: {exc}", stopped=None)
+                why = ""
             if insist:
                 return error(why, stopped=None) if why and not self.joined else answer
             return answer or _silent(network, robot, why)
@@ -600,7 +603,7 @@ def _bears(network: NetworkAdapter, robot: str) -> bool:
 
 
 def _silent(network: NetworkAdapter, robot: str, why: str) -> Envelope | None:
-    """Return the answer of a robot that a network remembers, and that is silent there; None for another one.
+    """Return the answer of a silent robot that a network remembers, else None.
 
     Args:
         network: where it is remembered.

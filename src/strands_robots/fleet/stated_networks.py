@@ -130,11 +130,11 @@ def _no_hub() -> str:
     return ""
 
 
+def _mesh_here() -> NetworkKey:
+    """Return the name of this machine's mesh, as ``mesh.session`` has it."""
+    return NetworkKey.of(network_key.MESH, [f"tcp/127.0.0.1:{settings.integer('STRANDS_MESH_PORT')}"])
+
+
 def _unusable(unfit: Exception) -> NoReturn:
     """Raise what keeps a network from being used, so that its robots are not known."""
     raise unfit
-
-
-def _mesh_here() -> NetworkKey:
-    """Return the name of this machine's mesh, as :func:`strands_robots.mesh.session.network` has it."""
-    return NetworkKey.of(network_key.MESH, [f"tcp/127.0.0.1:{settings.integer('STRANDS_MESH_PORT')}"])

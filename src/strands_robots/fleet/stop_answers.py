@@ -77,7 +77,7 @@ def measured(
 
 
 def not_reached(network: NetworkKey, *, left: bool = False) -> StopOutcome:
-    """Return the outcome of a stop that no robot answered: the roster's robots, each with its reason.
+    """Return the outcome of a stop that no robot answered, with reasons.
 
     Args:
         network: whose roster it is. A disk that hangs is waited for within a bound.

@@ -75,7 +75,7 @@ class DeviceConnectNetwork:
 
     @classmethod
     def joined(cls, client: FleetClient) -> Self:
-        """Return the network of a connected client, which stays with whoever connected it."""
+        """Return the network of a connected client, which is closed by its owner."""
         network = cls(client.link, client.source)
         network._client, network._given = client, True
         return network
@@ -363,7 +363,7 @@ class DeviceConnectNetwork:
 
     @contextmanager
     def _lent(self) -> Iterator[FleetClient]:
-        """Lend the joined client, or one of its own where there is none: an emergency stop waits for no joining."""
+        """Lend the joined client, or one for the length of the block."""
         client = self._client
         if client is not None:
             yield client
