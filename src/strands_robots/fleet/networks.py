@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING, Any, Self
 from strands_robots.envelope import Envelope, error
 from strands_robots.errors import NoSuchRobotError, RefusalError, UnreachableError
 from strands_robots.fleet.adapter import FIND_S, STOP_S, FoundRobot, NetworkAdapter, OnEvent
-from strands_robots.fleet.fleet_verdict import combined, verdict_of_answer
-from strands_robots.fleet.shared_id import SharedId, decided
 from strands_robots.fleet.side_by_side import side_by_side
-from strands_robots.safety.stopping import StopVerdict
+from strands_robots.serving.known_verbs import READS, RESUMES, STOPS
 from strands_robots.utils import near, plain_text
 
 if TYPE_CHECKING:
+    from strands_robots.fleet.shared_id import SharedId
     from strands_robots.safety.network_key import NetworkKey
+    from strands_robots.safety.stopping import StopVerdict
     from strands_robots.serving.advertised import AdvertisedVerb
 
 logger = logging.getLogger(__name__)
@@ -30,6 +30,9 @@ AGAIN_S, AGAIN_MAX_S = 1.0, 5.0
 
 SHARED_IDS_MAX = 1024
 """Ids on several networks of which the decided network is remembered."""
+
+STILL = READS | STOPS | RESUMES | {"wait"}
+"""Verbs of our robots that move nothing."""
 
 CLOSED = "the networks were left"
 
@@ -118,6 +121,7 @@ class Networks:
         absent: networks that are not joined, with the reason.
         keys: names of absent networks under which their robots are remembered, so that a stop names these.
         stays: go on trying to join those that are not there yet.
+        unasked: networks that no one asked for, so that their absence is not told.
 
     Attributes:
         stated: as given.
@@ -132,12 +136,15 @@ class Networks:
         keys: Mapping[str, Callable[[], NetworkKey]] | None = None,
         *,
         stays: bool = False,
+        unasked: Collection[str] = (),
     ) -> None:
         self.stated = tuple(stated)
+        self._unasked = frozenset(unasked)
         self.absent: dict[str, str] = dict(absent or {})
         self.keys = dict(keys or {})
         self._stays = stays
         self._joinings: tuple[_Joining, ...] = ()
+        self._unbegun: tuple[_Joining, ...] = ()
         self._change = threading.Condition()
         self._listeners: list[Callable[[NetworkAdapter], None]] = []
         self._told: list[NetworkAdapter] = []
@@ -150,15 +157,21 @@ class Networks:
     def __exit__(self, *_exception: object) -> None:
         self.close()
 
-    def open(self) -> None:
+    def open(self, *, in_turn: bool = False) -> None:
         """Begin to join all networks; return once one of them is joined.
+
+        Args:
+            in_turn: join the others only once the first one cannot be joined, or lacks what is asked for.
 
         Raises:
             UnreachableError: none of them can be reached, and they do not stay.
         """
         self._joinings = tuple(_Joining(each, again=self._stays, changed=self._changed) for each in self.stated)
-        if len(self._joinings) == 1 and not self._stays:
+        if self._joinings and not self._stays and (in_turn or len(self._joinings) == 1):
+            self._unbegun = self._joinings[1:]
             self._joinings[0].run()
+            if not self.joined:
+                self._begin_others()
         else:
             for each in self._joinings:
                 each.start()
@@ -172,7 +185,7 @@ class Networks:
     def close(self) -> None:
         """Leave the networks."""
         with self._change:
-            joinings, self._joinings = self._joinings, ()
+            joinings, self._joinings, self._unbegun = self._joinings, (), ()
             self._told.clear()
         for each in joinings:
             each.close()
@@ -206,6 +219,7 @@ class Networks:
             UnreachableError: there is none.
         """
         self.check_opened()
+        self._begin_others()
         for each in self._joinings:
             each.attempted.wait()
         joined = self.joined
@@ -218,13 +232,22 @@ class Networks:
         joining = next((each for each in self._joinings if each.network is network), None)
         if joining is None:
             return CLOSED
+        self._begin_others()
         joining.attempted.wait()
         return "" if joining.up else joining.why or CLOSED
 
     @property
+    def missing(self) -> dict[str, str]:
+        """The absent networks that someone asked for, with their reasons."""
+        return {name: why for name, why in self.absent.copy().items() if name not in self._unasked}
+
+    @property
     def absences(self) -> str:
-        """The absent networks with their reasons, as one text."""
-        return "; ".join(f"{name}: {why.rstrip('.')}" for name, why in self.absent.items())
+        """The reasons why networks are absent, those that someone asked for where there are any."""
+        stated = self.missing or self.absent
+        if len(stated) == 1:
+            return next(iter(stated.values()))
+        return "; ".join(f"{name}: {why.rstrip('.')}" for name, why in stated.items())
 
     @property
     def reach(self) -> str:
@@ -318,6 +341,8 @@ class Networks:
             raise NoSuchRobotError(f"No robot {robot[:100]!r} is in reach", robot=robot, verb=verb, remedy=remedy)
         if len(bearers) == 1 or not moves:
             return self._decided(robot, bearers) or bearers[0]
+        from strands_robots.fleet.shared_id import decided  # noqa: PLC0415 - few ids are on two networks
+
         return decided(self._shared_id(robot), robot, verb, bearers)
 
     def session(self, robot: str) -> object:
@@ -341,6 +366,21 @@ class Networks:
         """Return a verb as its robot describes it; raises as :meth:`of`."""
         return self.of(robot, name).verb(robot, name)
 
+    def described(self, robot: str, verb: str) -> tuple[NetworkAdapter, AdvertisedVerb | None]:
+        """Return the network that a call goes to, and the verb as its robot describes it.
+
+        Whether it moves the robot is known by its name, or else by that description.
+
+        Raises:
+            RefusalError: as :meth:`of`.
+        """
+        network = self.of(robot, verb)
+        described = network.verb(robot, verb)
+        if verb in STILL or (described is not None and described.kind != "motion"):
+            return network, described
+        decided = self.of(robot, verb, moves=True)
+        return decided, described if decided is network else decided.verb(robot, verb)
+
     def call(
         self, robot: str, verb: str, arguments: Mapping[str, Any], timeout: float, *, moves: bool = True
     ) -> Envelope:
@@ -349,6 +389,12 @@ class Networks:
         Raises:
             RefusalError: as :meth:`NetworkAdapter.call`, or as :meth:`of`.
         """
+        if self._unbegun and not moves:
+            try:
+                return self._joinings[0].network.call(robot, verb, arguments, timeout)
+            except NoSuchRobotError:
+                if len(self.settled()) == 1:
+                    raise
         return self.of(robot, verb, moves=moves).call(robot, verb, arguments, timeout)
 
     async def call_async(
@@ -386,6 +432,8 @@ class Networks:
 
     def halt(self, robot: str, robot_name: str = "") -> StopVerdict:
         """Stop every bearer of an id; return the verdict."""
+        from strands_robots.fleet.fleet_verdict import combined, verdict_of_answer  # noqa: PLC0415 - a call need not load it
+
         began, answers = time.monotonic(), self.stop(robot, robot_name=robot_name)
         name = f"{robot}/{robot_name}" if robot_name else robot
         verdicts = [
@@ -442,6 +490,12 @@ class Networks:
 
         return end_all
 
+    def _begin_others(self) -> None:
+        with self._change:
+            others, self._unbegun = self._unbegun, ()
+        for each in others:
+            each.start()
+
     def _changed(self, joining: _Joining) -> None:
         if joining.up:
             self.absent.pop(joining.network.name, None)
@@ -470,6 +524,8 @@ class Networks:
         return {each.name: said for each, said in zip(self.stated, answers, strict=True) if said is not None}
 
     def _shared_id(self, robot: str) -> SharedId:
+        from strands_robots.fleet.shared_id import SharedId  # noqa: PLC0415 - as above
+
         with self._change:
             if len(self._shared_ids) >= SHARED_IDS_MAX and robot not in self._shared_ids:
                 del self._shared_ids[next(iter(self._shared_ids))]
