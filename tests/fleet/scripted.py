@@ -10,7 +10,7 @@ from typing import Any
 
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.errors import NoSuchRobotError, RefusalError, UnknownVerbError, UnreachableError
-from strands_robots.fleet.adapter import DEVICE_CONNECT, FIND_S, STOP_S, FoundRobot, OnEvent, RobotEvent
+from strands_robots.fleet.adapter import DEVICE_CONNECT, FIND_S, STOP_S, Detail, FoundRobot, OnEvent, RobotEvent
 from strands_robots.fleet.lockout_report import LockoutReport, Resumed
 from strands_robots.fleet.stop_answers import measured, roster_verdict, unanswered
 from strands_robots.safety import network_key
@@ -267,7 +267,10 @@ class ScriptedNetwork:
             self.locked.pop(each.name, None)
         return {each.name: (True, "free") for each in reports}
 
-    def subscribe(self, robot: str, on_event: OnEvent) -> Callable[[], None]:
+    def beats_every(self, robot: str) -> float:
+        return 5.0
+
+    def subscribe(self, robot: str, on_event: OnEvent, detail: Detail = Detail.EVENTS) -> Callable[[], None]:
         self.subscribers.append(on_event)
         return lambda: self.subscribers.remove(on_event)
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from strands_robots.envelope import Envelope, error
 from strands_robots.errors import NoSuchRobotError, RefusalError, UnreachableError
-from strands_robots.fleet.adapter import FIND_S, STOP_S, FoundRobot, NetworkAdapter, OnEvent
+from strands_robots.fleet.adapter import FIND_S, STOP_S, Detail, FoundRobot, NetworkAdapter, OnEvent
 from strands_robots.fleet.side_by_side import side_by_side
 from strands_robots.serving.known_verbs import READS, RESUMES, STOPS
 from strands_robots.utils import near, plain_text
@@ -458,7 +458,7 @@ class Networks:
         of_bearers = {each.name: said for each, said in answers.items() if each in graded or _bears(each, robot)}
         return of_bearers or {each.name: said for each, said in answers.items()}
 
-    def subscribe(self, robot: str, on_event: OnEvent) -> Callable[[], None]:
+    def subscribe(self, robot: str, on_event: OnEvent, detail: Detail = Detail.EVENTS) -> Callable[[], None]:
         """Receive a robot's events on every network, also on those that are joined later.
 
         Returns:
@@ -468,7 +468,7 @@ class Networks:
 
         def follow(network: NetworkAdapter) -> None:
             try:
-                end = network.subscribe(robot, on_event)
+                end = network.subscribe(robot, on_event, detail)
             except RefusalError as exc:
                 logger.warning("Events on %s cannot be received: %s", network.name, exc)
                 return

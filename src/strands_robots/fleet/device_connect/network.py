@@ -17,7 +17,7 @@ from strands_robots.errors import (
     UnknownVerbError,
     UnreachableError,
 )
-from strands_robots.fleet.adapter import CLOSED, DEVICE_CONNECT, FIND_S, STOP_S, FoundRobot, OnEvent
+from strands_robots.fleet.adapter import CLOSED, DEVICE_CONNECT, FIND_S, STOP_S, Detail, FoundRobot, OnEvent
 from strands_robots.fleet.link_flags import described
 from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope
 from strands_robots.utils import ValidationError, plain_text
@@ -59,6 +59,7 @@ class DeviceConnectNetwork:
     announces_verbs = True
     reads: Mapping[str, str] = {"status": "getStatus", "state": "getState", "features": "getFeatures"}
     starts = "execute"
+    _aliases: Mapping[str, str] = {**reads, "start": starts}
 
     def __init__(self, link: LinkConfig, source: str, *, preload: bool = False) -> None:
         from strands_robots.device_connect.client import FleetClient  # noqa: PLC0415 - loaded when it is used
@@ -90,6 +91,8 @@ class DeviceConnectNetwork:
         try:
             self._client.__enter__()
         except (MessagingError, TimeoutError, OSError) as exc:
+            # A client connects once; the next attempt has one of its own.
+            self._client = type(self._client)(self._client.link, self._client.source)
             raise UnreachableError(plain_text(str(exc))) from exc
         self._open = True
 
@@ -165,10 +168,17 @@ class DeviceConnectNetwork:
 
     def verb(self, robot: str, name: str) -> AdvertisedVerb | None:
         """Return a function as the device itself describes it."""
-        return _answered(robot, name, lambda: self._connected.verb(robot, name))
+        described = _answered(robot, name, lambda: self._connected.verb(robot, name))
+        if described is None and (alias := self._aliases.get(name)):
+            return _answered(robot, alias, lambda: self._connected.verb(robot, alias))
+        return described
 
     def call(self, robot: str, verb: str, arguments: Mapping[str, Any], timeout: float) -> Envelope:
-        """Call a function of the device."""
+        """Call a function of the device, also by its name on the mesh."""
+        if verb in self._aliases:
+            # A device may have a function of that name.
+            described = self.verb(robot, verb)
+            verb = self._aliases[verb] if described is None else described.name
         return _answered(robot, verb, lambda: self._connected.call(robot, verb, arguments, timeout))
 
     def stop(
@@ -307,8 +317,13 @@ class DeviceConnectNetwork:
         with _carried():
             return resume_robots(self._connected, reports, signer, timeout)
 
-    def subscribe(self, robot: str, on_event: OnEvent) -> Callable[[], None]:
-        """Receive the device's events."""
+    def beats_every(self, robot: str) -> float:
+        """Return the seconds between two heartbeats of the device, or of its process."""
+        return self._connected.beats_every(robot)
+
+    def subscribe(self, robot: str, on_event: OnEvent, detail: Detail = Detail.EVENTS) -> Callable[[], None]:
+        """Receive the device's events, which are all that it sends."""
+        del detail
         from strands_robots.fleet.device_connect.events import robot_event  # noqa: PLC0415 - a call need not load it
 
         with _carried():

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from strands_robots.envelope import Envelope, error
 from strands_robots.errors import ArgumentsError, NoAnswerError, NoSuchRobotError, RefusalError, UnreachableError
-from strands_robots.fleet.adapter import CLOSED, FIND_S, MESH, STOP_S, FoundRobot, OnEvent
+from strands_robots.fleet.adapter import CLOSED, FIND_S, MESH, STOP_S, Detail, FoundRobot, OnEvent
 from strands_robots.fleet.lockout_report import LockoutReport, Resumed
 from strands_robots.fleet.mesh.controller import MeshController
 from strands_robots.fleet.mesh.descriptions import functions_of, functions_of_each, functions_of_kind
@@ -118,7 +118,7 @@ class MeshNetwork:
         """Return the robots in reach, once they had the time to announce themselves."""
         discover(self._joined_mesh, since=self._joined, within=timeout)
         self._discoveries += 1
-        lockable, rows = {*lockable_peers(self._joined_mesh)}, {str(row["peer_id"]): row for row in self._rows()}
+        lockable, rows = {*lockable_peers(self._joined_mesh)}, {str(row["peer_id"]): row for row in self._judged()}
         return [
             replace(
                 _found(row),
@@ -135,12 +135,7 @@ class MeshNetwork:
             discover(self._joined_mesh, since=self._fresh)
         else:
             time.sleep(max(0.0, self._joined + timeout - time.monotonic()))
-        rows, keys = self._rows(), enrolled_peers()
-        for row in rows:
-            row["tags"] = list(read_tags(row.get("tags")))
-            if "locked" in row and (why := lockout_distrust(row["peer_id"], row, row.get("epochs") or [], keys)):
-                row["distrusted"] = why
-        return [_found(row) for row in rows]
+        return [_found(row) for row in self._judged()]
 
     def known(self, robot: str) -> FoundRobot:
         """Return what the peer announced last."""
@@ -345,9 +340,16 @@ class MeshNetwork:
         """Send the resumes of these peers, which relay them."""
         return resume_peers(self._joined_mesh, reports, signer, timeout)
 
-    def subscribe(self, robot: str, on_event: OnEvent) -> Callable[[], None]:
+    def beats_every(self, robot: str) -> float:
+        """Return twice the time between two heartbeats: on a busy machine one may come late."""
+        from strands_robots.mesh import topics  # noqa: PLC0415 - loaded when it is used
+
+        del robot
+        return 2 / topics.BY_NAME["presence"].rate_hz
+
+    def subscribe(self, robot: str, on_event: OnEvent, detail: Detail = Detail.EVENTS) -> Callable[[], None]:
         """Receive a robot's policy steps and safety events, or what all say."""
-        return follow(self._joined_mesh, robot, on_event, next(self._subscriptions))
+        return follow(self._joined_mesh, robot, on_event, next(self._subscriptions), detail)
 
     def close(self) -> None:
         """Leave the mesh."""
@@ -381,6 +383,15 @@ class MeshNetwork:
     def _rows(self) -> list[dict[str, Any]]:
         """Return the peers in reach, with a robot or without one."""
         return [row for row in self._joined_mesh.peers if row["reachable"]]
+
+    def _judged(self) -> list[dict[str, Any]]:
+        """Return the peers in reach, with the reason why the lockout of one is not believed."""
+        rows, keys = self._rows(), enrolled_peers()
+        for row in rows:
+            row["tags"] = list(read_tags(row.get("tags")))
+            if "locked" in row and (why := lockout_distrust(row["peer_id"], row, row.get("epochs") or [], keys)):
+                row["distrusted"] = why
+        return rows
 
     def _action(self, robot: str, verb: str) -> str:
         row = self._joined_mesh.get_peer(robot) or {}
