@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 from click.testing import Result
+from fixtures.waiting import free_port
 from typer.testing import CliRunner
 
 from strands_robots.cli.app import build
@@ -15,9 +16,17 @@ from strands_robots.cli.network import Network
 from strands_robots.device_connect.backends import loopback_config
 from strands_robots.device_connect.discovery import Peer
 from strands_robots.envelope import Envelope, success
+from strands_robots.fleet.device_connect.network import DeviceConnectNetwork
+from strands_robots.fleet.networks import Networks
 from strands_robots.serving.advertised import AdvertisedVerb, find_verb
 
 Run = Callable[..., Result]
+
+
+@pytest.fixture(autouse=True)
+def no_mesh_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No command meets the mesh of the user."""
+    monkeypatch.setenv("STRANDS_MESH_PORT", str(free_port()))
 
 
 @pytest.fixture
@@ -41,6 +50,9 @@ class FakeFleet:
         self.called: list[tuple[Any, ...]] = []
         self.stale = ""
 
+    def known(self) -> tuple[str, ...]:
+        return tuple(peer.id for peer in self.found)
+
     def peers(self, timeout: float = 2.0) -> list[Peer]:
         return self.found
 
@@ -63,6 +75,13 @@ class FakeFleet:
         return self.stops
 
 
+class Given(DeviceConnectNetwork):
+    """Device Connect by a client that is connected already."""
+
+    def open(self) -> None:
+        """Do nothing."""
+
+
 def connect(monkeypatch: pytest.MonkeyPatch, fleet: Any) -> None:
     """Put ``fleet`` in the place of the robots on every network."""
 
@@ -71,6 +90,7 @@ def connect(monkeypatch: pytest.MonkeyPatch, fleet: Any) -> None:
         yield fleet
 
     monkeypatch.setattr(Network, "fleet", connected)
+    monkeypatch.setattr(Network, "networks", lambda *_, **__: Networks([Given.joined(fleet)]))
 
 
 @pytest.fixture

@@ -246,7 +246,7 @@ class ScriptedNetwork:
 
     def lockouts(self, robots: Iterable[str], timeout: float, *, signed: bool = False) -> list[LockoutReport]:
         def report(name: str) -> LockoutReport:
-            lockouts = (Lockout(self.locked[name], "desk", 1.0, ""),) if name in self.locked else ()
+            lockouts = (Lockout(self.locked[name], "desk", "", 1.0),) if name in self.locked else ()
             key = self.keys.get(name)
             facts = {} if key is None else {"statement": signed_by(key, Purpose.LOCKOUT_STATE, name, {"nonce": "n"})}
             return LockoutReport(name, lockouts, facts=facts)

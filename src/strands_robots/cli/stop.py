@@ -221,7 +221,7 @@ def _stopping(screen: Screen, network: Network, *, on_mesh: bool) -> Iterator[Ne
     # The table of a stop on the mesh names what the log would report.
     with captured_log() if on_mesh and screen.live else nullcontext():
         try:
-            with network.joined(on_mesh=on_mesh, peer=TOOL) as there:
+            with network.adapter(on_mesh=on_mesh, peer=TOOL) as there:
                 yield there
         except CliError as failure:
             if on_mesh and failure.code is Exit.REFUSED:
