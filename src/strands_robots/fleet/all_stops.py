@@ -119,7 +119,7 @@ def not_left(network: str, key: Callable[[], NetworkKey], why: object) -> Networ
 
 
 def answer_of(verdict: FleetVerdict, networks: Networks) -> Envelope:
-    """Return the verdict as one answer; that of one network alone as this network words it.
+    """Return the verdict as one answer, of a single network in its words.
 
     With several, ``stopped`` is True, False, or None where it is not known, ``not_stopped`` and ``silent`` list robots,
     ``robots`` has the answers by id and ``networks`` the facts of each network.
@@ -168,13 +168,10 @@ def _on_each(networks: Networks, stop: Callable[[NetworkAdapter], NetworkVerdict
             return not_left(network.name, lambda: network.key, exc), True
         return verdict, verdict.outcome is None or verdict.outcome.report.link
 
-    stated = networks.stated
-    stops = side_by_side(stopped, stated)
+    stops = side_by_side(stopped, networks.stated)
     stops += [
         (not_left(name, key, networks.absent.get(name, "it is not joined")), False)
         for name, key in networks.keys.items()
-        # One of them may have come since the stop left.
-        if all(name != each.name for each in stated)
     ]
     return stops
 

@@ -22,7 +22,7 @@ from strands_robots.errors import (
     UnknownVerbError,
     UnreachableError,
 )
-from strands_robots.fleet.adapter import CLOSED, FIND_S, MESH, STOP_S, FoundRobot, OnEvent, ReceivedCall
+from strands_robots.fleet.adapter import CLOSED, FIND_S, MESH, STOP_S, Detail, FoundRobot, OnEvent, ReceivedCall
 from strands_robots.fleet.lockout_report import LockoutReport, Resumed
 from strands_robots.fleet.mesh.controller import MeshController
 from strands_robots.fleet.mesh.descriptions import functions_of, functions_of_each, functions_of_kind
@@ -126,7 +126,7 @@ class MeshNetwork:
         """Return the robots in reach, once they had the time to announce themselves."""
         discover(self._joined_mesh, since=self._joined, within=timeout)
         self._discoveries += 1
-        lockable, rows = {*lockable_peers(self._joined_mesh)}, {str(row["peer_id"]): row for row in self._rows()}
+        lockable, rows = {*lockable_peers(self._joined_mesh)}, {str(row["peer_id"]): row for row in self._judged()}
         return [
             replace(
                 _found(row),
@@ -143,12 +143,7 @@ class MeshNetwork:
             discover(self._joined_mesh, since=self._fresh)
         else:
             time.sleep(max(0.0, self._joined + timeout - time.monotonic()))
-        rows, keys = self._rows(), enrolled_peers()
-        for row in rows:
-            row["tags"] = list(read_tags(row.get("tags")))
-            if "locked" in row and (why := lockout_distrust(row["peer_id"], row, row.get("epochs") or [], keys)):
-                row["distrusted"] = why
-        return [_found(row) for row in rows]
+        return [_found(row) for row in self._judged()]
 
     def known(self, robot: str) -> FoundRobot:
         """Return what the peer announced last."""
@@ -249,7 +244,7 @@ class MeshNetwork:
         return stop_answer(robot, reply, enrolled_peers())
 
     def received(self, robot: str, verb: str, arguments: Mapping[str, Any]) -> ReceivedCall:
-        """Return the call with the action's defaults; of a verb of the robot's own as it is."""
+        """Return the call with the action's defaults, of an own verb as it is."""
         from strands_robots.mesh.security import validate_command  # noqa: PLC0415 - loaded when it is used
         from strands_robots.serving.verbs import LEASE_NAMES  # noqa: PLC0415 - as above
 
@@ -267,7 +262,7 @@ class MeshNetwork:
         return await self._requests.call(lambda: self.call(robot, verb, self._given_to(robot, verb, arguments), within))
 
     async def describe_async(self, robot: str, within: float) -> FoundRobot:
-        """Return the peer with the functions that it describes, of an older one those of its kind."""
+        """Return the peer with its functions, of an older one those of its kind."""
         try:
             functions = (await self.call_async(robot, "describe", {}, within)).get("functions")
         except UnknownVerbError:
@@ -384,9 +379,16 @@ class MeshNetwork:
         """Send the resumes of these peers, which relay them."""
         return resume_peers(self._joined_mesh, reports, signer, timeout)
 
-    def subscribe(self, robot: str, on_event: OnEvent) -> Callable[[], None]:
+    def beats_every(self, robot: str) -> float:
+        """Return twice the time between two heartbeats, as one may come late."""
+        from strands_robots.mesh import topics  # noqa: PLC0415 - loaded when it is used
+
+        del robot
+        return 2 / topics.BY_NAME["presence"].rate_hz
+
+    def subscribe(self, robot: str, on_event: OnEvent, detail: Detail = Detail.EVENTS) -> Callable[[], None]:
         """Receive a robot's policy steps and safety events, or what all say."""
-        return follow(self._joined_mesh, robot, on_event, next(self._subscriptions))
+        return follow(self._joined_mesh, robot, on_event, next(self._subscriptions), detail)
 
     def close(self) -> None:
         """Leave the mesh."""
@@ -420,6 +422,15 @@ class MeshNetwork:
     def _rows(self) -> list[dict[str, Any]]:
         """Return the peers in reach, with a robot or without one."""
         return [row for row in self._joined_mesh.peers if row["reachable"]]
+
+    def _judged(self) -> list[dict[str, Any]]:
+        """Return the peers in reach, each with why its lockout is not believed."""
+        rows, keys = self._rows(), enrolled_peers()
+        for row in rows:
+            row["tags"] = list(read_tags(row.get("tags")))
+            if "locked" in row and (why := lockout_distrust(row["peer_id"], row, row.get("epochs") or [], keys)):
+                row["distrusted"] = why
+        return rows
 
     def _action(self, robot: str, verb: str) -> str:
         return verb if self._owns(robot, verb) else _ALIASES.get(verb, verb)
