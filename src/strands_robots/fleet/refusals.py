@@ -73,7 +73,9 @@ def said(refusal: RefusalError) -> str:
     The ids near an absent one stay.
     """
     if refusal.envelope:
-        return text_of(refusal.envelope)
+        text = text_of(refusal.envelope)
+        # The mesh refuses with a word, of which an agent knows no meaning.
+        return f"{text}: {refusal.why}." if text.endswith(tuple(EXACT)) else text
     if isinstance(refusal, UnreachableError):
         return f"The network does not carry this: {refusal.why}"
     if isinstance(refusal, ValueError):
