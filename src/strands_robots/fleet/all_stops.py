@@ -5,17 +5,22 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Collection, Sequence
+from functools import partial
 from typing import Any
 
+from strands_robots.envelope import Envelope, error, success
 from strands_robots.fleet.adapter import STOP_S, NetworkAdapter
 from strands_robots.fleet.fleet_verdict import FleetVerdict, NetworkVerdict
 from strands_robots.fleet.network_stop import not_left
-from strands_robots.fleet.networks import Networks
+from strands_robots.fleet.networks import CLOSED, Networks
 from strands_robots.fleet.side_by_side import side_by_side
+from strands_robots.fleet.stop_answers import roster_verdict
+from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.orders import new_epoch
 from strands_robots.safety.roster import Roster
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.safety.stop_roster import READ_WITHIN_S, StopOutcome, robots_known_at
+from strands_robots.safety.stopping import StopVerdict
 
 logger = logging.getLogger(__name__)
 
@@ -83,6 +88,43 @@ def measured_verdicts(networks: Networks, stop: Callable[[NetworkAdapter], StopO
     return _on_each(networks, lambda network: NetworkVerdict(network.name, stop(network)))
 
 
+def unreached(networks: Networks) -> FleetVerdict:
+    """Return the verdict of a stop where no network could be joined.
+
+    It names the robots that this machine remembers there.
+    """
+    keys = {each.name: partial(_key, each) for each in networks.stated} | networks.keys
+    return FleetVerdict([not_left(name, key, networks.absent.get(name, CLOSED)) for name, key in keys.items()])
+
+
+def answer_of(verdict: FleetVerdict, networks: Networks) -> Envelope:
+    """Return the verdict as one answer; that of one network alone as this network words it.
+
+    With several, ``stopped`` is True, False, or None where it is not known, ``not_stopped`` and ``silent`` list robots,
+    ``robots`` has the answers by id and ``networks`` the facts of each network.
+    """
+    if not verdict.networks:
+        return error(f"{networks.absences or CLOSED}.", stopped=None)
+    first, *others = verdict.reporting or verdict.networks[:1]
+    if not others and first.outcome is not None and not first.absent:
+        (adapter,) = (each for each in networks.stated if each.name == first.network)
+        return adapter.verdict(first.outcome) if verdict.estop_id else roster_verdict(first.outcome)
+    outcomes = [each.outcome for each in verdict.networks if each.outcome is not None]
+    moving = [name for name, each in verdict.items() if each.stopped is False]
+    still = [name for name, each in verdict.items() if each.stopped]
+    scopes = [each.report.scope.field() for each in outcomes]
+    fields: dict[str, Any] = {
+        "stopped": False if moving else True if verdict.ok else None,
+        "not_stopped": moving,
+        "silent": [name for name in verdict.missing if name not in moving],
+        "robots": {name: _said(each) for name, each in verdict.items()},
+        "networks": {each.network: each.facts() for each in verdict.networks},
+        **({"estop_id": verdict.estop_id, **scopes[0]} if verdict.estop_id and scopes else {}),
+    }
+    said = " ".join([*([f"Stopped: {', '.join(still)}."] if still else []), str(verdict)])
+    return (success if verdict.ok else error)(said, **fields)
+
+
 def _on_each(networks: Networks, stop: Callable[[NetworkAdapter], NetworkVerdict]) -> list[NetworkVerdict]:
     """Stop the robots of each network, side by side, each as soon as it is joined."""
 
@@ -127,3 +169,11 @@ def _not_remembered(network: NetworkAdapter, robots: Collection[str]) -> frozens
         reading.start()
         reading.join(READ_WITHIN_S)
     return frozenset(robots) - rows[0] if rows else frozenset()
+
+
+def _key(network: NetworkAdapter) -> NetworkKey:
+    return network.key
+
+
+def _said(verdict: StopVerdict) -> str:
+    return "; ".join([*verdict.not_stopped.values(), *verdict.unknown.values()]) or "stopped"

@@ -56,7 +56,13 @@ class NetworkVerdict:
         left = f"It did not leave on {self.network}: {self.absent.rstrip('.')}." if self.absent else ""
         if self.outcome is None:
             return left
-        return " ".join(filter(None, [left, self.outcome.sentence, *stop_notes(self.outcome)]))
+        free = f"Not locked: {', '.join(self.outcome.not_locked)}." if self.outcome.not_locked else ""
+        return " ".join(filter(None, [left, self.outcome.sentence, free, *stop_notes(self.outcome)]))
+
+    def facts(self) -> dict[str, Any]:
+        """Return what a script reads of it besides the verdicts."""
+        facts = {} if self.outcome is None else self.outcome.facts()
+        return {"absent": self.absent, **facts} if self.absent else facts
 
     def verdicts(self) -> dict[str, StopVerdict]:
         """Return the verdict of each robot that answered or had to.
@@ -115,6 +121,13 @@ class FleetVerdict(Mapping[str, StopVerdict]):
         self._counted = frozenset(known).union(*(each.counted for each in self.networks))
 
     @property
+    def reporting(self) -> tuple[NetworkVerdict, ...]:
+        """Networks that have robots, or that the stop did not reach in full."""
+        return tuple(
+            each for each in self.networks if each.absent or each.problems or (each.outcome and each.outcome.size)
+        )
+
+    @property
     def ok(self) -> bool:
         """True when every robot that had to answer is known to stand still, and one did."""
         stopped = any(each.stopped for each in self._verdicts.values())
@@ -138,8 +151,8 @@ class FleetVerdict(Mapping[str, StopVerdict]):
         said = [f"Ignored: {note}." for note in self.ignored]
         said += [f"{name} did not stop." for name, each in self._verdicts.items() if each.stopped is False]
         said += [f"{name}: {why}." for name, each in self._verdicts.items() for why in each.unknown.values()]
-        told = [each for each in self.networks if each.absent or each.problems or (each.outcome and each.outcome.size)]
-        said += [f"{each.network}: {each.sentence}" if len(told) > 1 else each.sentence for each in told]
+        several = len(self.reporting) > 1
+        said += [f"{each.network}: {each.sentence}" if several else each.sentence for each in self.reporting]
         return " ".join(filter(None, said)) or "No robot is known."
 
     def __repr__(self) -> str:
