@@ -10,6 +10,7 @@ from collections import defaultdict
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -72,9 +73,9 @@ LONG_SUMMARIES_MAX = 35
 
 
 @cache
-def tree_of(path: Path) -> ast.Module:
-    """Parse a file once for all tests."""
-    return ast.parse(path.read_text(encoding="utf-8"))
+def nodes_of(path: Path) -> tuple[Any, ...]:
+    """Return every node of a file; it is parsed and walked once for all tests."""
+    return tuple(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
 
 
 def module_of(path: Path) -> str:
@@ -103,7 +104,7 @@ def floor_of(module: str) -> int:
 def imports(module: str) -> frozenset[str]:
     """Return the modules of the package that a module imports: at its top, in functions, or for types alone."""
     found = set()
-    for node in ast.walk(tree_of(MODULES[module])):
+    for node in nodes_of(MODULES[module]):
         names: list[str] = []
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
@@ -145,7 +146,7 @@ def circle_through(start: str) -> list[str] | None:
 def classes() -> Iterator[tuple[str, ast.ClassDef]]:
     """Every class of the package with the module that defines it."""
     for module, path in MODULES.items():
-        for node in ast.walk(tree_of(path)):
+        for node in nodes_of(path):
             if isinstance(node, ast.ClassDef):
                 yield module, node
 
@@ -193,7 +194,7 @@ def test_no_two_files_or_folders_beside_each_other_import_each_other() -> None:
 def test_only_the_contract_asks_of_which_kind_a_robot_is() -> None:
     asking = set()
     for module, path in MODULES.items():
-        for node in ast.walk(tree_of(path)):
+        for node in nodes_of(path):
             if isinstance(node, ast.Call) and ast.unparse(node.func) in ("isinstance", "issubclass"):
                 kinds = {each.id for each in ast.walk(node.args[1]) if isinstance(each, ast.Name)}
                 asking |= {module} if kinds & {"TaskRobot", "WorldRobot", "AdaptedRobot"} else set()
@@ -231,7 +232,7 @@ def test_every_public_exception_derives_from_the_one_root() -> None:
 def docstrings() -> Iterator[tuple[str, str]]:
     """Every docstring of the package with its place."""
     for path in SOURCES:
-        for node in ast.walk(tree_of(path)):
+        for node in nodes_of(path):
             if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
                 text = ast.get_docstring(node)
                 if text:
@@ -253,7 +254,7 @@ def test_no_name_needs_a_word_that_readers_have_to_learn_first() -> None:
     found = []
     for path in SOURCES:
         names = {path.stem}
-        for node in ast.walk(tree_of(path)):
+        for node in nodes_of(path):
             named = getattr(node, "name", None) or getattr(node, "arg", None) or getattr(node, "id", None)
             names.add(named or getattr(node, "attr", None) or "")
         for name in sorted(filter(None, names)):
@@ -272,7 +273,7 @@ def test_every_file_is_short_enough_to_hold_in_the_head() -> None:
 
 @pytest.mark.parametrize("path", SOURCES, ids=relative)
 def test_no_exception_is_swallowed(path: Path) -> None:
-    for node in ast.walk(tree_of(path)):
+    for node in nodes_of(path):
         if isinstance(node, ast.ExceptHandler):
             assert not (len(node.body) == 1 and isinstance(node.body[0], ast.Pass)), f"{relative(path)}:{node.lineno}"
 
@@ -280,7 +281,7 @@ def test_no_exception_is_swallowed(path: Path) -> None:
 @pytest.mark.parametrize("path", [p for p in SOURCES if p.name != "settings.py"], ids=relative)
 def test_only_settings_reads_the_environment(path: Path) -> None:
     reads = {"environ", "getenv"}
-    for node in ast.walk(tree_of(path)):
+    for node in nodes_of(path):
         name = node.attr if isinstance(node, ast.Attribute) else ""
         assert name not in reads, f"{relative(path)}:{node.lineno} reads the environment; declare it in settings.py"
 
@@ -289,11 +290,9 @@ def test_only_settings_reads_the_environment(path: Path) -> None:
 def test_no_module_reads_an_underscore_name_of_another(path: Path) -> None:
     if path.name == "_compat.py":
         return
-    tree = tree_of(path)
-    modules = {
-        alias.asname or alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names
-    }
-    for node in ast.walk(tree):
+    nodes = nodes_of(path)
+    modules = {alias.asname or alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+    for node in nodes:
         if isinstance(node, ast.ImportFrom):
             private = [a.name for a in node.names if a.name.startswith("_") and not a.name.startswith("__")]
             # The last two are documented for authors of tasks, under "Extending" in asyncio's own pages.

@@ -203,7 +203,7 @@ _declare(
     Setting("STRANDS_MESH_BRIDGE_TOPICS", "list", "", "Topics the bridge carries to MQTT, by name in the table."),
     # Robots.
     Setting("STRANDS_CONTROL_HZ", "number", "50", "Control loop rate of a rollout.", 1, 2000),
-    Setting("STRANDS_ROBOT_MESH_DC", "text", "auto", "Network of the robot_mesh tool: off means the native mesh."),
+    Setting("STRANDS_ROBOT_MESH_DC", "text", "auto", "Device Connect for the robot_mesh tool: off leaves it out."),
     Setting("STRANDS_STATE_DIR", "path", "", "Directory for grants, lockouts and keys. Unset: ~/.strands_robots."),
     Setting("STRANDS_TAGS", "list", "", "Tags of the robots of this process, by which callers choose robots."),
     # The calling side.

@@ -168,7 +168,7 @@ class ScriptedNetwork:
     ) -> Envelope | None:
         if robot not in self.robots:
             return unanswered(robot) if insist else None
-        self.stopped.append(robot)
+        self.stopped.append(f"{robot}/{robot_name}" if robot_name else robot)
         if isinstance(self.stops, Exception):
             raise self.stops
         return self.stops

@@ -4,72 +4,66 @@ import base64
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import nullcontext
+from contextlib import ExitStack
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from fixtures.barista import Barista
 from fixtures.mesh_robots import Arm, World
 from fixtures.waiting import eventually
+from tests.fleet.scripted import ScriptedNetwork, function
 
 from strands_robots import settings
-from strands_robots.device_connect.backends import LinkConfig
-from strands_robots.device_connect.discovery import Peer
-from strands_robots.envelope import Envelope, success
+from strands_robots.envelope import error, success
 from strands_robots.errors import UnreachableError
+from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
 from strands_robots.fleet.device_connect.network import DeviceConnectNetwork
 from strands_robots.fleet.mesh import network
-from strands_robots.fleet.mesh.joining import joined_mesh
+from strands_robots.fleet.mesh.network import MeshNetwork
+from strands_robots.fleet.networks import Networks
 from strands_robots.mesh import Mesh, init_mesh, safety
 from strands_robots.mesh.session import clear_peers
 from strands_robots.mesh.transport import zenoh_config
-from strands_robots.serving.advertised import AdvertisedVerb, find_verb
-from strands_robots.tools import networks, robot_mesh
-from strands_robots.tools.networks import Robots
+from strands_robots.safety.plane import plane
+from strands_robots.safety.scope import EVERY_ROBOT
+from strands_robots.tools import robot_mesh
+
+# The package gives the tool for the module's name.
+MODULE = sys.modules["strands_robots.tools.robot_mesh"]
 
 
-class FakeNetwork:
-    """Records its calls."""
-
-    def __init__(self) -> None:
-        self.calls: list[tuple[Any, ...]] = []
-
-    def __getattr__(self, verb: str) -> Callable[..., Envelope]:
-        def called(*arguments: Any) -> Envelope:
-            self.calls.append((verb, *arguments))
-            return success("done")
-
-        return called
+def use(monkeypatch: pytest.MonkeyPatch, *networks: ScriptedNetwork) -> None:
+    """Have the tool join these networks."""
+    for make in ("networks_of", "networks_for_stop"):
+        monkeypatch.setattr(MODULE, make, lambda *_, **__: Networks(networks))
 
 
 @pytest.fixture
-def fake(monkeypatch: pytest.MonkeyPatch) -> FakeNetwork:
-    network = FakeNetwork()
-    monkeypatch.setattr(networks, "network", lambda: network)
+def fake(monkeypatch: pytest.MonkeyPatch) -> ScriptedNetwork:
+    network = ScriptedNetwork(robots=dict.fromkeys(("arm-1", "base-1", "world-1")))
+    use(monkeypatch, network)
     return network
 
 
-def test_every_action_reaches_the_network(fake: FakeNetwork) -> None:
-    robot_mesh(action="peers")
+def test_every_action_reaches_the_network(fake: ScriptedNetwork) -> None:
+    assert [row["id"] for row in robot_mesh(action="peers")["peers"]] == ["arm-1", "base-1", "world-1"]
     robot_mesh(action="tell", target="arm-1", instruction="wave", duration=2)
     robot_mesh(action="status", target="arm-1")
-    robot_mesh(action="stop", target="arm-1")
-    robot_mesh(action="stop")
-    robot_mesh(action="stop", target="world-1", arguments={"robot_name": "left"})
-    robot_mesh(action="emergency_stop", instruction="smoke")
     robot_mesh(action="release_torque", target="arm-1")
+    task = {"instruction": "wave", "policy_provider": "mock", "duration": 2.0}
     assert fake.calls == [
-        ("peers",),
-        ("tell", "arm-1", "wave", "mock", 2.0),
-        ("status", "arm-1"),
-        ("stop", "arm-1"),
-        ("stop", ""),
-        ("stop", "world-1", "left"),
-        ("emergency_stop", "smoke"),
-        ("release_torque", "arm-1"),
+        ("arm-1", "execute", task, 10.0),
+        ("arm-1", "getStatus", {}, 10.0),
+        ("arm-1", "releaseTorque", {}, 10.0),
     ]
+    robot_mesh(action="stop", target="arm-1")
+    robot_mesh(action="stop", target="world-1", arguments={"robot_name": "left"})
+    robot_mesh(action="stop")
+    assert fake.stopped == ["arm-1", "world-1/left", "arm-1", "base-1", "world-1"]
+    robot_mesh(action="emergency_stop", instruction="smoke")
+    assert [(reason, scope) for reason, scope, _ in fake.estops] == [("smoke", EVERY_ROBOT)]
+    assert not fake.joined
 
 
 @pytest.mark.parametrize(
@@ -92,53 +86,65 @@ def test_every_action_reaches_the_network(fake: FakeNetwork) -> None:
     ],
 )
 def test_argument_out_of_its_domain_is_refused_by_name(
-    fake: FakeNetwork, arguments: dict[str, Any], named: str
+    fake: ScriptedNetwork, arguments: dict[str, Any], named: str
 ) -> None:
     answer = robot_mesh(**arguments)
     assert answer["status"] == "error"
     assert named in answer["reason"]
     assert fake.calls == []
+    assert fake.searches == 0
 
 
 @pytest.mark.parametrize(
-    ("given", "called"),
+    ("given", "reason"),
     [
-        ({"action": "emergency_stop"}, ("emergency_stop", "")),
-        ({"action": "emergency_stop", "instruction": "x" * 100_000}, ("emergency_stop", "x" * 200)),
-        ({"action": "emergency_stop", "instruction": "a\nb", "duration": "?"}, ("emergency_stop", "a b")),
-        ({"action": "emergency_stop", "instruction": 5, "target": "a b"}, ("emergency_stop", "5")),
-        ({"action": "stop", "target": "arm 1"}, ("stop", "")),
-        ({"action": "stop", "target": ["arm-1"], "reason": "x"}, ("stop", "")),
-        ({"action": "stop", "arguments": {"robot_name": "left"}}, ("stop", "")),
-        ({"action": "stop", "target": "world-1", "arguments": {"robot": "left"}}, ("stop", "world-1")),
-        ({"action": "stop", "target": "world-1", "arguments": {"robot_name": ""}}, ("stop", "world-1")),
-        ({"action": "stop", "target": "world-1", "arguments": {"robot_name": [1]}}, ("stop", "world-1")),
-        ({"action": "stop", "target": "world-1", "arguments": "left"}, ("stop", "world-1")),
-        ({"action": "stop", "target": "world-1", "arguments": {"robot_name": "left"}}, ("stop", "world-1", "left")),
+        ({}, ""),
+        ({"instruction": "x" * 100_000}, "x" * 200),
+        ({"instruction": "a\nb", "duration": "?"}, "a b"),
+        ({"instruction": 5, "target": "a b"}, "5"),
     ],
 )
-async def test_no_argument_refuses_a_stop(fake: FakeNetwork, given: dict[str, Any], called: tuple[Any, ...]) -> None:
-    use = {"toolUseId": "1", "name": "robot_mesh", "input": given}
+async def test_no_argument_refuses_an_emergency_stop(fake: ScriptedNetwork, given: dict[str, Any], reason: str) -> None:
+    use = {"toolUseId": "1", "name": "robot_mesh", "input": {"action": "emergency_stop", **given}}
     events = [event async for event in robot_mesh.stream(use, {})]
-    assert fake.calls == [called], events
+    assert [(said, scope) for said, scope, _ in fake.estops] == [(reason, EVERY_ROBOT)], events
 
 
-def test_verbs_are_called_with_their_arguments(fake: FakeNetwork) -> None:
+@pytest.mark.parametrize(
+    ("given", "stopped"),
+    [
+        ({"target": "arm 1"}, ["arm-1", "base-1", "world-1"]),
+        ({"target": ["arm-1"], "reason": "x"}, ["arm-1", "base-1", "world-1"]),
+        ({"arguments": {"robot_name": "left"}}, ["arm-1", "base-1", "world-1"]),
+        ({"target": "world-1", "arguments": {"robot": "left"}}, ["world-1"]),
+        ({"target": "world-1", "arguments": {"robot_name": ""}}, ["world-1"]),
+        ({"target": "world-1", "arguments": {"robot_name": [1]}}, ["world-1"]),
+        ({"target": "world-1", "arguments": "left"}, ["world-1"]),
+        ({"target": "world-1", "arguments": {"robot_name": "left"}}, ["world-1/left"]),
+    ],
+)
+async def test_no_argument_refuses_a_stop(fake: ScriptedNetwork, given: dict[str, Any], stopped: list[str]) -> None:
+    use = {"toolUseId": "1", "name": "robot_mesh", "input": {"action": "stop", **given}}
+    events = [event async for event in robot_mesh.stream(use, {})]
+    assert fake.stopped == stopped, events
+
+
+def test_verbs_are_called_with_their_arguments(fake: ScriptedNetwork) -> None:
     robot_mesh(action="move", target="arm-1", arguments={"x": 0.2, "y": 0.0, "z": 0.1})
     robot_mesh(action="move", target="arm-1", verb="pick", arguments={"object": "cube"})
     robot_mesh(action="call", target="base-1", verb="drive", arguments={"linear": 0.1})
     robot_mesh(action="wait", target="arm-1")
-    assert [call[:4] for call in fake.calls] == [
-        ("call", "arm-1", "moveTo", {"x": 0.2, "y": 0.0, "z": 0.1}),
-        ("call", "arm-1", "pick", {"object": "cube"}),
-        ("call", "base-1", "drive", {"linear": 0.1}),
-        ("call", "arm-1", "wait", {}),
+    assert [call[:3] for call in fake.calls] == [
+        ("arm-1", "moveTo", {"x": 0.2, "y": 0.0, "z": 0.1}),
+        ("arm-1", "pick", {"object": "cube"}),
+        ("base-1", "drive", {"linear": 0.1}),
+        ("arm-1", "wait", {}),
     ]
 
 
-def test_picture_is_an_image_block(fake: FakeNetwork, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_picture_is_an_image_block(fake: ScriptedNetwork) -> None:
     answer = success("front, 2 x 2 pixels.", camera="front") | {"jpeg": base64.b64encode(b"\xff\xd8x").decode()}
-    monkeypatch.setattr(networks, "network", lambda: SimpleNamespace(call=lambda *_: answer))
+    fake.answers["getPicture"] = lambda _: answer
     shown = robot_mesh(action="picture", target="arm-1", arguments={"camera": "front"})
     assert shown["content"][-1] == {"image": {"format": "jpeg", "source": {"bytes": b"\xff\xd8x"}}}
     assert "jpeg" not in shown
@@ -146,20 +152,36 @@ def test_picture_is_an_image_block(fake: FakeNetwork, monkeypatch: pytest.Monkey
     assert "could not be decoded" in robot_mesh(action="picture", target="arm-1")["reason"]
 
 
-def test_picture_of_a_motion_is_an_image_block_of_its_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_picture_of_a_motion_is_an_image_block_of_its_answer(fake: ScriptedNetwork) -> None:
     taken = {"camera": "table", "format": "jpeg", "jpeg": base64.b64encode(b"\xff\xd8x").decode()}
     answer = success("moveTo completed.", error_mm=0.4) | {"picture": taken}
-    monkeypatch.setattr(networks, "network", lambda: SimpleNamespace(call=lambda *_: answer))
+    fake.answers["moveTo"] = lambda _: answer
     shown = robot_mesh(action="move", target="arm-1", arguments={"x": 0.2, "y": 0.0, "z": 0.1, "picture": "table"})
     assert shown["content"][-1] == {"image": {"format": "jpeg", "source": {"bytes": b"\xff\xd8x"}}}
     assert shown["error_mm"] == 0.4
     assert "picture" not in shown
 
 
-@pytest.mark.parametrize("value", ["off", "OFF", "0", "false"])
-def test_native_mesh_is_used_when_device_connect_is_off(monkeypatch: pytest.MonkeyPatch, value: str) -> None:
+@pytest.mark.parametrize(
+    ("value", "devices"),
+    [("off", False), ("OFF", False), ("0", False), ("false", False)]
+    + [(each, True) for each in ("auto", "on", "", "maybe")],
+)
+def test_device_connect_is_left_out_where_the_setting_says_so(
+    monkeypatch: pytest.MonkeyPatch, value: str, devices: bool
+) -> None:
+    made: list[bool] = []
+
+    def networks_of(*_: object, devices: bool) -> Networks:
+        made.append(devices)
+        return Networks([ScriptedNetwork()])
+
+    for make in ("networks_of", "networks_for_stop"):
+        monkeypatch.setattr(MODULE, make, networks_of)
     monkeypatch.setenv("STRANDS_ROBOT_MESH_DC", value)
-    assert networks.network().joined is networks.on_mesh
+    for action in ("peers", "stop", "emergency_stop"):
+        robot_mesh(action=action)
+    assert made == [devices] * 3
 
 
 @pytest.fixture
@@ -167,7 +189,7 @@ def on_the_mesh(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setenv("STRANDS_ROBOT_MESH_DC", "off")
     monkeypatch.setenv("STRANDS_MESH_BACKEND", "memory")
     monkeypatch.setattr(zenoh_config, "DISCOVERY_S", 0.1)
-    monkeypatch.setattr(networks, "STOP_S", 20.0)
+    monkeypatch.setattr(MODULE, "STOP_S", 20.0)
     monkeypatch.setattr(safety, "COLLECT_S", 20.0)
     clear_peers()
     yield
@@ -182,7 +204,7 @@ def test_every_action_on_an_empty_mesh_is_an_error(on_the_mesh: None) -> None:
 def test_disabled_mesh_is_reported_as_off(on_the_mesh: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("STRANDS_MESH", "false")
     answer = robot_mesh(action="stop")
-    assert "native mesh is off" in answer["reason"]
+    assert "mesh: it is switched off" in answer["reason"]
     assert answer["stopped"] is None
 
 
@@ -213,14 +235,21 @@ def test_robots_on_the_mesh_are_listed_commanded_and_stopped(on_the_mesh: None) 
 def barista(on_the_mesh: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Barista]:
     monkeypatch.setenv("BYPASS_TOOL_CONSENT", "true")
     robot = Barista()
-    with joined_mesh(robot, "bar-1", "robot"), joined_mesh(None, "looker", "tool") as looker:
+    with ExitStack() as stack:
+        peers = [init_mesh(body, name) for body, name in ((robot, "bar-1"), (None, "looker"))]
+        for each in peers:
+            assert each is not None
+            stack.callback(each.close)
         # All peers of one process share their list of peers.
-        eventually(lambda: looker.get_peer("bar-1") is not None)
+        eventually(lambda: peers[1] is not None and peers[1].get_peer("bar-1") is not None)
         yield robot
 
 
-def test_own_verb_of_a_mesh_peer_is_waited_for_as_long_as_it_lasts(barista: Barista) -> None:
-    answer = networks.network().call("bar-1", "brewCoffee", {"cups": 2}, seconds=1e-6)
+def test_own_verb_of_a_mesh_peer_is_waited_for_as_long_as_it_lasts(
+    barista: Barista, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(MODULE, "CALL_S", 1e-6)
+    answer = robot_mesh(action="call", target="bar-1", verb="brewCoffee", arguments={"cups": 2})
     assert answer["cups"] == 2
 
 
@@ -251,18 +280,34 @@ def test_unknown_peer_is_answered_at_once_with_the_near_ones(
     assert answer["reason"] == "No peer 'bar-2' is on the mesh. Near it: bar-1."
 
 
-@pytest.mark.parametrize("value", ["auto", "on", "", "maybe"])
-def test_device_connect_is_the_default_network(monkeypatch: pytest.MonkeyPatch, value: str) -> None:
-    monkeypatch.setenv("STRANDS_ROBOT_MESH_DC", value)
-    assert networks.network().joined is networks.on_device_connect
-
-
 def test_remote_network_needs_an_opt_in(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NATS_URL", "nats://192.0.2.1:4222")
-    answer = robot_mesh(action="stop", target="arm-1")
+    answer = robot_mesh(action="status", target="arm-1")
     assert answer["status"] == "error"
-    assert "allow_insecure" in answer["reason"]
-    assert answer["stopped"] is None
+    assert "needs authentication" in answer["reason"]
+    assert "insecure" in answer["reason"]
+
+
+def test_network_that_cannot_be_used_refuses_no_stop_on_the_other(
+    on_the_mesh: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("STRANDS_ROBOT_MESH_DC")
+    monkeypatch.setenv("NATS_URL", "nats://192.0.2.1:4222")
+    robot = World("left")
+    peer = init_mesh(robot, "sim-1", "sim")
+    assert peer is not None
+    try:
+        for action in ("stop", "emergency_stop"):
+            robot.start_policy("left", "wave")
+            answer = robot_mesh(action=action)
+            assert robot.running == {}
+            # What is on the other network is not known.
+            assert (answer["status"], answer["stopped"]) == ("error", None)
+            assert "Stopped: sim-1." in answer["reason"]
+            assert "It did not leave on device_connect: A network beyond this machine" in answer["reason"]
+            plane().clear_local("the test")
+    finally:
+        peer.close()
 
 
 def test_importing_the_tools_loads_no_agent_framework() -> None:
@@ -289,47 +334,125 @@ BREW = {
 }
 
 
-class FakeFleet:
-    """A connection to one robot with a verb of its own, and to a device that is none of ours."""
-
-    stale = ""
-
-    def __init__(self) -> None:
-        self.called: list[tuple[Any, ...]] = []
-
-    def peers(self, timeout: float) -> list[Peer]:
-        resume = {"name": "resume", "parameters": {"properties": {"assertion": {"type": "object"}}}}
-        ours = (resume, *({"name": f"{name}Control"} for name in ("acquire", "renew", "release")), {"name": "stop"})
-        return [Peer("bar-1", functions=(BREW, *ours)), Peer("echo-1", functions=({"name": "echo"},))]
-
-    def verb(self, device: str, name: str) -> AdvertisedVerb | None:
-        return find_verb([BREW], name)
-
-    def call(self, *called: Any) -> Envelope:
-        self.called.append(called)
-        return success("done")
+RESUME = {"name": "resume", "parameters": {"properties": {"assertion": {"type": "object"}}}}
+OURS = (BREW, RESUME, *({"name": f"{name}Control"} for name in ("acquire", "renew", "release")), {"name": "stop"})
 
 
 @pytest.fixture
-def fleet(monkeypatch: pytest.MonkeyPatch) -> FakeFleet:
-    fake = FakeFleet()
-    joined = DeviceConnectNetwork.joined(fake)  # type: ignore[arg-type]
-    monkeypatch.setattr(networks, "network", lambda: Robots(lambda: nullcontext(joined)))
-    return fake
+def bar(monkeypatch: pytest.MonkeyPatch) -> ScriptedNetwork:
+    """A robot with a verb of its own, and a device that is none of ours."""
+    network = ScriptedNetwork(robots={"bar-1": OURS, "echo-1": ({"name": "echo"},)})
+    use(monkeypatch, network)
+    return network
 
 
-def test_own_verb_is_called_with_its_arguments_for_as_long_as_it_lasts(fleet: FakeFleet) -> None:
+def test_own_verb_is_called_with_its_arguments_for_as_long_as_it_lasts(bar: ScriptedNetwork) -> None:
     robot_mesh(action="call", target="bar-1", verb="brewCoffee", arguments={"cups": 2})
     robot_mesh(action="call", target="bar-1", verb="ownUnknown")
-    assert fleet.called == [("bar-1", "brewCoffee", {"cups": 2}, 125.0), ("bar-1", "ownUnknown", {}, 35.0)]
+    assert bar.calls == [("bar-1", "brewCoffee", {"cups": 2}, 125.0), ("bar-1", "ownUnknown", {}, 35.0)]
 
 
-def test_peers_name_own_verbs_with_their_parameters_and_devices_that_cannot_be_stopped(fleet: FakeFleet) -> None:
-    bar, echo = robot_mesh(action="peers")["peers"]
-    assert bar["functions"][:3] == ["brewCoffee", "resume", "acquireControl"]
-    assert bar["own_verbs"] == {"brewCoffee": "(cups: integer, 1 to 8) Brew coffee."}
-    assert "note" not in bar
+def test_peers_name_own_verbs_with_their_parameters_and_devices_that_cannot_be_stopped(bar: ScriptedNetwork) -> None:
+    ours, echo = robot_mesh(action="peers")["peers"]
+    assert ours["functions"][:3] == ["brewCoffee", "resume", "acquireControl"]
+    assert ours["own_verbs"] == {"brewCoffee": "(cups: integer, 1 to 8) Brew coffee."}
+    assert "note" not in ours
     assert echo["note"] == "This device has no lockout, no lease and no stop."
+
+
+class TestOfBothNetworks:
+    """Each action goes to the network that has the robot; a stop goes to all that have it."""
+
+    @pytest.fixture
+    def near(self) -> ScriptedNetwork:
+        return ScriptedNetwork(DEVICE_CONNECT, dict.fromkeys(("arm-1", "both")))
+
+    @pytest.fixture
+    def far(self, near: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch) -> ScriptedNetwork:
+        far = ScriptedNetwork(MESH, dict.fromkeys(("arm-2", "both")))
+        far.starts, far.reads = "start", {"status": "status"}
+        use(monkeypatch, near, far)
+        return far
+
+    def test_robots_are_listed_with_their_network(self, far: ScriptedNetwork) -> None:
+        rows = {row["id"]: row["network"] for row in robot_mesh(action="peers")["peers"]}
+        assert rows == {"arm-1": "device_connect", "arm-2": "mesh", "both": "device_connect"}
+
+    def test_robot_is_asked_and_moved_by_the_words_of_its_network(
+        self, near: ScriptedNetwork, far: ScriptedNetwork
+    ) -> None:
+        for name in ("arm-1", "arm-2"):
+            assert robot_mesh(action="status", target=name)["status"] == "success"
+            assert robot_mesh(action="tell", target=name, instruction="wave")["status"] == "success"
+        assert [verb for _, verb, _, _ in near.calls] == ["getStatus", "execute"]
+        assert [verb for _, verb, _, _ in far.calls] == ["status", "start"]
+
+    @pytest.mark.parametrize(
+        "motion",
+        [
+            {"action": "tell", "instruction": "wave"},
+            {"action": "move", "arguments": {"x": 0.1}},
+            {"action": "release_torque"},
+            {"action": "call", "verb": "brewCoffee"},
+        ],
+    )
+    def test_motion_of_a_shared_id_is_refused_naming_both_networks(
+        self, near: ScriptedNetwork, far: ScriptedNetwork, motion: dict[str, Any]
+    ) -> None:
+        answer = robot_mesh(target="both", **motion)
+        assert "device_connect and mesh both have a robot of this id" in answer["reason"]
+        assert {verb for _, verb, _, _ in (*near.calls, *far.calls)} <= {"getStatus", "status"}
+
+    @pytest.mark.parametrize(
+        "read",
+        [
+            {"action": "status"},
+            {"action": "picture"},
+            {"action": "wait"},
+            {"action": "call", "verb": "renewControl"},
+            {"action": "call", "verb": "beansLeft"},
+        ],
+    )
+    def test_read_of_a_shared_id_goes_to_the_first_network(
+        self, near: ScriptedNetwork, far: ScriptedNetwork, read: dict[str, Any]
+    ) -> None:
+        near.robots["both"] = far.robots["both"] = (function("beansLeft", "read"),)
+        near.answers = dict.fromkeys(("getStatus", "getPicture", "wait", "renewControl"), lambda _: success("done"))
+        assert robot_mesh(target="both", **read)["status"] == "success"
+        assert (len(near.calls), far.calls) == (1, [])
+
+    def test_stop_goes_to_all_bearers_and_each_has_its_answer(
+        self, near: ScriptedNetwork, far: ScriptedNetwork
+    ) -> None:
+        far.stops = error("bus", stopped=False)
+        answer = robot_mesh(action="stop", target="both")
+        assert (answer["stopped"], answer["not_stopped"]) == (False, ["both on mesh"])
+        assert (near.stopped, far.stopped) == (["both"], ["both"])
+
+    def test_stop_of_all_is_one_answer_that_names_robots_of_both(
+        self, near: ScriptedNetwork, far: ScriptedNetwork
+    ) -> None:
+        for action in ("stop", "emergency_stop"):
+            answer = robot_mesh(action=action)
+            assert (answer["status"], answer["stopped"]) == ("success", True)
+            assert set(answer["robots"]) == {"arm-1", "arm-2", "both"}
+            assert {name: facts["roster"]["size"] for name, facts in answer["networks"].items()} == {
+                "device_connect": 2,
+                "mesh": 2,
+            }
+        assert near.estops == far.estops == [("", EVERY_ROBOT, answer["estop_id"])]
+
+    def test_stop_where_no_network_is_there_names_the_robots_of_each(
+        self, near: ScriptedNetwork, far: ScriptedNetwork
+    ) -> None:
+        assert robot_mesh(action="stop")["status"] == "success"
+        near.unreachable, far.unreachable = "the cable is cut", "no hub"
+        for action in ("stop", "emergency_stop"):
+            answer = robot_mesh(action=action)
+            assert (answer["status"], answer["stopped"]) == ("error", None)
+            assert "It did not leave on device_connect: the cable is cut." in answer["reason"]
+            assert "It did not leave on mesh: no hub." in answer["reason"]
+        assert robot_mesh(action="stop", target="both")["stopped"] is None
 
 
 class TestDefaultProfile:
@@ -340,18 +463,20 @@ class TestDefaultProfile:
         """The networks that were joined, none of which answers."""
         found: list[str] = []
 
-        def device_connect(_self: object, link: LinkConfig, _source: str) -> None:
+        def device_connect(self: DeviceConnectNetwork) -> None:
+            link = self._client.link
             found.append(f"device connect {link.meet_port} {link.tenant}")
             raise UnreachableError("no answer")
 
-        def mesh(*_: object) -> None:
+        def mesh(_self: MeshNetwork) -> None:
             found.append(f"mesh {settings.raw('STRANDS_MESH_PORT')} {settings.raw('STRANDS_MESH_NAMESPACE')}")
             raise UnreachableError("no answer")
 
+        monkeypatch.setenv("STRANDS_MESH", "true")
         monkeypatch.setenv("STRANDS_MESH_PORT", "7001")
         monkeypatch.setenv("STRANDS_DC_PORT", "7002")
-        monkeypatch.setattr(DeviceConnectNetwork, "__init__", device_connect)
-        monkeypatch.setattr("strands_robots.fleet.mesh.joining.joined_mesh", mesh)
+        monkeypatch.setattr(DeviceConnectNetwork, "open", device_connect)
+        monkeypatch.setattr(MeshNetwork, "_dialled", mesh)
         return found
 
     @pytest.fixture
@@ -370,18 +495,18 @@ class TestDefaultProfile:
     ) -> None:
         write('port = 7101\ntenant = "lab"\n[mesh]\nport = 7102\nnamespace = "lab"')
         assert robot_mesh(action=action)["status"] == "error"
+        assert sorted(joined) == ["device connect 7101 lab", "mesh 7102 lab"]
+        joined.clear()
         monkeypatch.setenv("STRANDS_ROBOT_MESH_DC", "off")
         assert robot_mesh(action=action)["status"] == "error"
-        assert joined == ["device connect 7101 lab", "mesh 7102 lab"]
+        assert joined == ["mesh 7102 lab"]
         assert settings.raw("STRANDS_MESH_PORT") == "7001"
 
     def test_without_a_profile_they_are_those_of_the_environment(
         self, joined: list[str], monkeypatch: pytest.MonkeyPatch
     ) -> None:
         robot_mesh(action="emergency_stop")
-        monkeypatch.setenv("STRANDS_ROBOT_MESH_DC", "off")
-        robot_mesh(action="emergency_stop")
-        assert joined == ["device connect 7002 default", "mesh 7001 strands"]
+        assert sorted(joined) == ["device connect 7002 default", "mesh 7001 strands"]
 
     def test_fleet_on_the_mesh_alone_is_reached_there(self, joined: list[str], write: Callable[[str], None]) -> None:
         write("[mesh]\nport = 7102")
@@ -392,9 +517,28 @@ class TestDefaultProfile:
         self, joined: list[str], write: Callable[[str], None], monkeypatch: pytest.MonkeyPatch
     ) -> None:
         write("port = 7101")
+        assert robot_mesh(action="emergency_stop")["status"] == "error"
+        assert joined == ["device connect 7101 default"]
         monkeypatch.setenv("STRANDS_ROBOT_MESH_DC", "off")
         answer = robot_mesh(action="emergency_stop")
-        assert (answer["status"], "has no mesh" in answer["reason"], joined) == ("error", True, [])
+        assert (answer["status"], answer["stopped"]) == ("error", None)
+        assert f"mesh: the connection profile {settings.raw('STRANDS_FLEET')} has none" in answer["reason"]
+        assert joined == ["device connect 7101 default"]
+
+    def test_table_that_cannot_be_used_refuses_no_stop_on_the_other_network(
+        self, joined: list[str], write: Callable[[str], None]
+    ) -> None:
+        write('port = 7101\n[mesh]\nport = "?"')
+        answer = robot_mesh(action="emergency_stop")
+        assert (answer["status"], answer["stopped"]) == ("error", None)
+        assert "mesh.port" in answer["reason"]
+        assert joined == ["device connect 7101 default"]
+        assert "mesh.port" in robot_mesh(action="status", target="arm-1")["reason"]
+        joined.clear()
+        write('[mesh]\nport = "?"')
+        # Device Connect of this machine is another fleet's.
+        assert "mesh.port" in robot_mesh(action="emergency_stop")["reason"]
+        assert joined == []
 
     @pytest.mark.parametrize("value", ["auto", "off"])
     def test_profile_that_cannot_be_read_is_an_error_that_stops_no_other_fleet(

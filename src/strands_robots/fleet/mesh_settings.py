@@ -7,8 +7,7 @@ fleet of that profile is joined, and a fleet of another one is refused meanwhile
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from typing import ClassVar
 
 from strands_robots import settings
@@ -24,15 +23,6 @@ class MeshSettings:
 
     def __init__(self, stated: Mapping[str, str]) -> None:
         self._stated = dict(stated)
-
-    @contextmanager
-    def held(self) -> Iterator[None]:
-        """Hold the settings for the length of a block; raises as :meth:`take`."""
-        self.take()
-        try:
-            yield
-        finally:
-            self.give_back()
 
     def take(self) -> None:
         """Put the settings, until as many fleets of them have given them back.

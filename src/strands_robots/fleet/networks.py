@@ -18,6 +18,7 @@ from strands_robots.fleet.refusals import answered
 from strands_robots.fleet.shared_id import SharedId, decided
 from strands_robots.fleet.side_by_side import side_by_side
 from strands_robots.safety.stopping import StopVerdict
+from strands_robots.serving.known_verbs import READS, RESUMES, STOPS
 from strands_robots.utils import near, plain_text
 
 if TYPE_CHECKING:
@@ -31,6 +32,9 @@ AGAIN_S, AGAIN_MAX_S = 1.0, 5.0
 
 SHARED_IDS_MAX = 1024
 """Ids on several networks of which the decided network is remembered."""
+
+STILL = READS | STOPS | RESUMES | {"wait"}
+"""Verbs of our robots that move nothing."""
 
 CLOSED = "the networks were left"
 
@@ -350,6 +354,21 @@ class Networks:
     def verb(self, robot: str, name: str) -> AdvertisedVerb | None:
         """Return a verb as its robot describes it; raises as :meth:`of`."""
         return self.of(robot, name).verb(robot, name)
+
+    def described(self, robot: str, verb: str) -> tuple[NetworkAdapter, AdvertisedVerb | None]:
+        """Return the network that a call goes to, and the verb as its robot describes it.
+
+        Whether it moves the robot is known by its name, or else by that description.
+
+        Raises:
+            RefusalError: as :meth:`of`.
+        """
+        network = self.of(robot, verb)
+        described = network.verb(robot, verb)
+        if verb in STILL or (described is not None and described.kind != "motion"):
+            return network, described
+        decided = self.of(robot, verb, moves=True)
+        return decided, described if decided is network else decided.verb(robot, verb)
 
     def call(
         self, robot: str, verb: str, arguments: Mapping[str, Any], timeout: float, *, moves: bool = True

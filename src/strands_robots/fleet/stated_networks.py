@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from strands_robots import settings
 from strands_robots._mesh_switch import mesh_env_request
@@ -13,6 +15,7 @@ from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH, NetworkAdapter
 from strands_robots.fleet.link_flags import LinkFlags
 from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.profiles import FleetProfile
+from strands_robots.utils import MissingExtraError, ValidationError
 
 if TYPE_CHECKING:
     from strands_robots.safety.network_key import NetworkKey
@@ -86,6 +89,34 @@ def _mesh(source: str, stated: Mapping[str, str] | None) -> NetworkAdapter:
     return MeshNetwork(source, stated)
 
 
+def networks_for_stop(
+    profile: FleetProfile | None, given: Mapping[str, Any], source: str, *, devices: bool = True
+) -> Networks:
+    """Return the networks of a stop, as :func:`networks_of`.
+
+    A stop leaves on one network though the settings of the other cannot be used; its verdict names that one.
+
+    Raises:
+        ValidationError: the settings of neither can be used.
+    """
+    try:
+        return networks_of(profile, given, source, devices=devices)
+    except (ValidationError, MissingExtraError) as exc:
+        unfit = exc
+    parts: list[tuple[str, FleetProfile | None, dict[str, bool]]] = [(DEVICE_CONNECT, profile, {"devices": False})]
+    if devices and profile is not None and profile.network:
+        parts.append((MESH, replace(profile, stated_mesh=None), {}))
+    for left_out, rest, without in parts:
+        try:
+            networks = networks_of(rest, given, source, **without)
+        except (ValidationError, MissingExtraError):
+            continue
+        networks.absent[left_out] = str(unfit)
+        networks.keys[left_out] = partial(_unusable, unfit)
+        return networks
+    raise unfit
+
+
 def _no_hub() -> str:
     """Return why this machine has no mesh, or "" where it may have one."""
     if settings.raw("STRANDS_MESH_BACKEND").lower() != "zenoh" or mesh_env_request():
@@ -98,6 +129,11 @@ def _no_hub() -> str:
     except OSError:
         return f"no mesh answers on 127.0.0.1:{port}"
     return ""
+
+
+def _unusable(unfit: Exception) -> NoReturn:
+    """Raise what keeps a network from being used, so that its robots are not known."""
+    raise unfit
 
 
 def _mesh_key() -> NetworkKey:

@@ -11,15 +11,28 @@
 from __future__ import annotations
 
 import base64
+from collections.abc import Callable, Mapping
+from contextlib import closing, suppress
 from functools import partial
 from typing import Any
 
+from strands_robots import settings
 from strands_robots.agent_tool import fitted, tool
-from strands_robots.envelope import error
+from strands_robots.envelope import Envelope, error, success
+from strands_robots.errors import RefusalError, StrandsRobotsError, UnreachableError
+from strands_robots.fleet.adapter import STOP_S, FoundRobot
+from strands_robots.fleet.all_stops import answer_of, estop_all, stop_all, unreached
+from strands_robots.fleet.callers import TOOL
+from strands_robots.fleet.fleet_verdict import FleetVerdict
+from strands_robots.fleet.networks import Networks
+from strands_robots.fleet.profiles import profile_for
+from strands_robots.fleet.refusals import said
+from strands_robots.fleet.stated_networks import networks_for_stop, networks_of
+from strands_robots.fleet.stop_answers import combined_verdict
+from strands_robots.serving.advertised import RobotDescription, fitting
 from strands_robots.serving.robot_verbs import ARM_VERBS, WORLD_VERBS
 from strands_robots.serving.stop_arguments import noted, stop_reason, stop_robot, stop_scope
 from strands_robots.serving.verbs import unknown_arguments
-from strands_robots.tools import networks
 from strands_robots.utils import WAIT_S, ValidationError, choice, device_id, identifier, mapping, shown
 
 CALLED = {"move": "moveTo", "picture": "getPicture", "wait": "wait"}
@@ -29,8 +42,13 @@ STOPS = ("stop", "emergency_stop")
 ACTIONS = ("peers", "tell", "status", *STOPS, "release_torque", "call", *CALLED)
 NEEDS_TARGET = ("tell", "status", "release_torque", "call", *CALLED)
 
-CALL_S = networks.ANSWER_S + WAIT_S
+ANSWER_S = 10.0
+
+CALL_S = ANSWER_S + WAIT_S
 """Longest wait for the answer to a verb, which may wait for the end of a motion."""
+
+OWN_BYTES = 16_000
+"""Size of what the list of robots says on one robot's own verbs."""
 
 
 def _readable_stop(given: dict[str, Any]) -> dict[str, Any]:
@@ -91,16 +109,51 @@ def robot_mesh(
         if asked in CALLED or asked == "call":
             name = identifier("verb", verb or CALLED.get(asked, ""))
             given = mapping("arguments", {} if arguments is None else arguments)
-            return _with_image(networks.network().call(robot, name, given, CALL_S))
+            return _with_image(_asked(lambda there: _called(there, robot, name, given)))
         if asked == "tell":
             given = {"instruction": instruction, "policy_provider": policy_provider, "duration": duration}
             task = ARM_VERBS["execute"].checked(given)
-            return networks.network().tell(robot, task["instruction"], task["policy_provider"], task["duration"])
+            wanted = {name: task[name] for name in ("instruction", "policy_provider", "duration")}
+            return _asked(lambda there: _started(there, robot, wanted))
     except ValidationError as refused:
         return error(str(refused))
     if asked == "release_torque":
-        return networks.network().release_torque(robot)
-    return networks.network().status(robot) if asked == "status" else networks.network().peers()
+        return _asked(lambda there: there.call(robot, "releaseTorque", {}, ANSWER_S))
+    return _asked((lambda there: _status(there, robot)) if asked == "status" else _peers)
+
+
+def _peers(there: Networks) -> Envelope:
+    """List all that are in reach, with type, state, functions and network.
+
+    Verbs of its own come with their parameters, in the robot's words.
+    """
+    found = there.listed()
+    functions: dict[str, object] = {}
+    for network in there.joined:
+        # A robot of a network that is lost in between is listed without its verbs.
+        with suppress(RefusalError):
+            functions |= network.describe_each([name for name, (_, its) in found.items() if its is network])
+    rows = [_row(each, network.name, functions.get(name)) for name, (each, network) in sorted(found.items())]
+    if not rows:
+        return error(f"No robot answered. {there.stale}".strip(), peers=[])
+    return success(f"{len(rows)} robots: {', '.join(sorted(found))}. {there.stale}".strip(), peers=rows)
+
+
+def _status(there: Networks, robot: str) -> Envelope:
+    network = there.of(robot)
+    return network.call(robot, network.reads["status"], {}, ANSWER_S)
+
+
+def _started(there: Networks, robot: str, task: Mapping[str, Any]) -> Envelope:
+    """Have the robot start a task."""
+    network = there.of(robot, "tell", moves=True)
+    return network.call(robot, network.starts, task, ANSWER_S)
+
+
+def _called(there: Networks, robot: str, verb: str, arguments: Mapping[str, Any]) -> Envelope:
+    """Call any verb of the robot, and wait as long as it lasts by its description."""
+    network, described = there.described(robot, verb)
+    return network.call(robot, verb, arguments, CALL_S + (described.lasts_s if described is not None else 0.0))
 
 
 def _stop(target: object, arguments: object) -> dict[str, Any]:
@@ -110,8 +163,14 @@ def _stop(target: object, arguments: object) -> dict[str, Any]:
     of_world, unread = WORLD_VERBS["stop"].readable(given) if robot else ({}, "")
     if arguments and not given:
         unread = "arguments is no object"
-    one = of_world.get("robot_name", "")
-    return noted(networks.network().stop(robot, *([one] if one else [])), unknown, unread)
+
+    def stopped(there: Networks) -> Envelope:
+        answers = there.stop(robot, STOP_S, of_world.get("robot_name", ""))
+        names = [robot] if len(answers) == 1 else [f"{robot} on {network}" for network in answers]
+        return combined_verdict(dict(zip(names, answers.values(), strict=True)))
+
+    answer = _asked(stopped, stops=True) if robot else _all_stopped(stop_all)
+    return noted(answer, unknown, unread)
 
 
 def _emergency_stop(instruction: object, arguments: object) -> dict[str, Any]:
@@ -122,9 +181,70 @@ def _emergency_stop(instruction: object, arguments: object) -> dict[str, Any]:
     unknown = unknown_arguments(len(given.keys() - {"only", "cell"}))
     if arguments and not given:
         unread = "arguments is no object"
-    network = networks.network()
-    answer = network.emergency_stop(why) if scope.everything else network.emergency_stop(why, scope=scope)
+    answer = _all_stopped(lambda there: estop_all(there, why, scope=scope))
     return noted(answer, cut, unread, unknown)
+
+
+def _all_stopped(stop: Callable[[Networks], FleetVerdict]) -> Envelope:
+    """Return the answer to a stop of all; it names the robots of gone networks."""
+
+    def stopped(there: Networks) -> Envelope:
+        try:
+            there.open()
+        except UnreachableError:
+            return answer_of(unreached(there), there)
+        return answer_of(stop(there), there)
+
+    return _answer(stopped, stops=True)
+
+
+def _asked(work: Callable[[Networks], Envelope], *, stops: bool = False) -> Envelope:
+    """Return what ``work`` answers on networks that are joined; as :func:`_answer`."""
+
+    def joined(there: Networks) -> Envelope:
+        there.open()
+        return work(there)
+
+    return _answer(joined, stops=stops)
+
+
+def _answer(work: Callable[[Networks], Envelope], *, stops: bool) -> Envelope:
+    """Return what ``work`` answers on networks of its own, or an error envelope.
+
+    They are those of the default connection profile, ``STRANDS_FLEET``, if there is one; the mesh alone where
+    ``STRANDS_ROBOT_MESH_DC`` says so. They are left at the end.
+
+    Args:
+        work: asks robots.
+        stops: they are asked to stop.
+    """
+    on_mesh = settings.raw("STRANDS_ROBOT_MESH_DC").lower() in settings.FALSE_SPELLINGS
+    make, fields = (networks_for_stop, {"stopped": None}) if stops else (networks_of, {})
+    try:
+        with closing(make(profile_for(None, {}), {}, TOOL, devices=not on_mesh)) as there:
+            return work(there)
+    except RefusalError as refusal:
+        return error(said(refusal), **fields)
+    except (StrandsRobotsError, LookupError, TimeoutError, RuntimeError, ValueError) as exc:
+        return error(str(exc.args[0]) if exc.args else type(exc).__name__, **fields)
+
+
+def _row(found: FoundRobot, network: str, functions: object) -> dict[str, Any]:
+    """Return what a list of robots says on one."""
+    description = RobotDescription.of(functions)
+    verbs = description.verbs.values()
+    # Of a verb that was only named there is no more to say.
+    described = (each for each in verbs if each.own and (each.stated or each.summary))
+    own = dict(fitting(((each.name, f"({each.takes}) {each.summary}") for each in described), OWN_BYTES))
+    return {
+        "id": found.id,
+        "type": found.type,
+        "status": found.status,
+        "network": network,
+        "functions": [each.name for each in verbs],
+        **({"own_verbs": own} if own else {}),
+        **({"note": description.absent} if description.absent and functions is not None else {}),
+    }
 
 
 def _with_image(answer: dict[str, Any]) -> dict[str, Any]:

@@ -19,7 +19,10 @@ pytestmark = pytest.mark.timeout(600)
 
 @pytest.fixture(scope="module")
 def machine(tmp_path_factory: pytest.TempPathFactory) -> Machine:
-    return Machine(tmp_path_factory.mktemp("state"))
+    made = Machine(tmp_path_factory.mktemp("state"))
+    # Here each command makes its own imports, as it does for a user.
+    made.forked = False
+    return made
 
 
 @pytest.fixture(scope="module")
