@@ -252,13 +252,16 @@ class MeshNetwork:
         return ""
 
     def received(self, robot: str, verb: str, arguments: Mapping[str, Any]) -> ReceivedCall:
-        """Return the call with the action's defaults; of a verb of the robot's own as it is."""
+        """Return the call with the defaults of an action of ours."""
         from strands_robots.mesh.security import validate_command  # noqa: PLC0415 - loaded when it is used
         from strands_robots.serving.verbs import LEASE_NAMES  # noqa: PLC0415 - as above
 
         mesh, action = self._joined_mesh, self._action(robot, verb)
         given = self._given_to(robot, action, arguments)
-        sent = given if self._owns(robot, action) else validate_command({**given, "action": action})
+        try:
+            sent = given if self._owns(robot, action) else validate_command({**given, "action": action})
+        except ValidationError as exc:
+            raise ArgumentsError(str(exc), robot=robot, verb=verb) from exc
         left_out = LEASE_NAMES | {"action"}
         return ReceivedCall(mesh.peer_id, action, {name: value for name, value in sent.items() if name not in left_out})
 
@@ -270,7 +273,7 @@ class MeshNetwork:
         return await self._requests.call(lambda: self.call(robot, verb, self._given_to(robot, verb, arguments), within))
 
     async def describe_async(self, robot: str, within: float) -> FoundRobot:
-        """Return the peer with the functions that it describes, of an older one those of its kind."""
+        """Return the peer as it describes itself, an older one by its kind."""
         try:
             functions = (await self.call_async(robot, "describe", {}, within)).get("functions")
         except UnknownVerbError:
