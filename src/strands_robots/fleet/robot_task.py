@@ -38,11 +38,9 @@ def task_of(facts: Mapping[str, Any]) -> dict[str, Any]:
 
 def runs(facts: Mapping[str, Any], robot_name: str = "") -> bool:
     """Return whether a robot, or one of a world, runs a task by its status."""
-    running, rows = facts.get("running_policies"), facts.get("policies")
+    running = facts.get("running_policies")
     if isinstance(running, Mapping):
         return robot_name in running if robot_name else bool(running)
-    if isinstance(rows, list) and robot_name:
-        return any(isinstance(row, Mapping) and row.get("robot") == robot_name for row in rows)
     return str(facts.get("task_status", "")).lower() in RUNNING
 
 

@@ -86,8 +86,8 @@ class RobotResources:
                 await asyncio.to_thread(end)
 
     async def _list(self, context: Any, params: Any) -> ListResourcesResult:
-        found = sorted(await asyncio.to_thread(self._networks.find))
-        ids = [name for name in found if _robot_of(SCHEME + name)]
+        found = await asyncio.to_thread(self._networks.find)
+        ids = sorted(name for name, (each, _) in found.items() if not each.world and _robot_of(SCHEME + name))
         cursor = str(params.cursor or "") if params is not None else ""
         start = int(cursor) if cursor.isdecimal() and len(cursor) < 8 else 0
         page = [

@@ -69,7 +69,8 @@ def add_reads(server: MCPServer[Any], access: AccessOf, standing: Callable[[], s
     ) -> Result:
         """List the robots on the network, in pages: id, type, model, availability."""
         found = await asyncio.to_thread(access(context).caller.networks.find)
-        rows = [row(found[name][0]) for name in sorted(found)]
+        # A world stands for its robots.
+        rows = [row(each) for _, (each, _) in sorted(found.items()) if not each.world]
         page = list[dict[str, str]]()
         for each in rows[start:]:
             if page and len(json.dumps([*page, each])) > PAGE_BYTES:

@@ -220,7 +220,7 @@ class MeshNetwork:
         reply = mesh.send(robot, {**arguments, "action": action}, timeout if there else min(timeout, STOP_S))
         if reply.get("type") == "response":
             result = reply.get("result")
-            return dict(result) if isinstance(result, Mapping) else {"result": result}
+            return _named_as(verb, result) if isinstance(result, Mapping) else {"result": result}
         if self._mesh is None:
             raise NoAnswerError(CLOSED, robot=robot, verb=verb)
         if reply.get("status") == "timeout":
@@ -416,9 +416,19 @@ class MeshNetwork:
         return isinstance(own, list) and verb in own
 
     def _given_to(self, robot: str, verb: str, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-        if self._mesh is None or self._owns(robot, verb):
+        """Return the arguments that an action of ours is sent with."""
+        from strands_robots.serving.known_verbs import STOPS  # noqa: PLC0415 - loaded when it is used
+        from strands_robots.serving.peer_verbs import PEER_VERBS  # noqa: PLC0415 - as above
+
+        mesh = self._mesh
+        if mesh is None or self._owns(robot, verb):
             return arguments
-        return {name: value for name, value in arguments.items() if value not in ("", None)}
+        given = {name: value for name, value in arguments.items() if value not in ("", None)}
+        known, names = PEER_VERBS.get(verb), (mesh.get_peer(robot) or {}).get("sim_robots")
+        # Where none is named the first robot of a world is meant; a stop then means all of them.
+        if known is not None and "robot_name" in known.by_name and verb not in STOPS and isinstance(names, list):
+            given = {"robot_name": next(iter(names), ""), **given}
+        return given
 
     def _waited_for(self, robot: str, longest: float = math.inf) -> bool:
         """Return whether the peer is in reach, once that can be known."""
@@ -448,6 +458,15 @@ def _carried(robot: str, verb: str, arguments: Mapping[str, Any]) -> Mapping[str
     if problem and verb != "stop":
         raise ArgumentsError(problem, robot=robot, verb=verb)
     return {} if problem else arguments
+
+
+def _named_as(verb: str, result: Mapping[str, Any]) -> Envelope:
+    """Return an answer with the fields that its verb has on Device Connect."""
+    rows = result.get("policies")
+    if verb != "getStatus" or not isinstance(rows, list):
+        return dict(result)
+    running = {str(row.get("robot", "")): row for row in rows if isinstance(row, Mapping)}
+    return {**result, "running_policies": running}
 
 
 def _has_robot(row: Mapping[str, Any]) -> bool:
