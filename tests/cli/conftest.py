@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 from click.testing import Result
+from fixtures.waiting import free_port
 from typer.testing import CliRunner
 
 from strands_robots.cli.app import build
@@ -15,9 +16,17 @@ from strands_robots.cli.network import Network
 from strands_robots.device_connect.backends import loopback_config
 from strands_robots.device_connect.discovery import Peer
 from strands_robots.envelope import Envelope, success
+from strands_robots.fleet.device_connect.network import DeviceConnectNetwork
+from strands_robots.fleet.networks import Networks
 from strands_robots.serving.advertised import AdvertisedVerb, find_verb
 
 Run = Callable[..., Result]
+
+
+@pytest.fixture(autouse=True)
+def own_mesh(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A port of the mesh at which no robot of this machine is."""
+    monkeypatch.setenv("STRANDS_MESH_PORT", str(free_port()))
 
 
 @pytest.fixture
@@ -63,6 +72,9 @@ class FakeFleet:
     def stop_all(self, timeout: float) -> dict[str, Envelope]:
         return self.stops
 
+    def known(self) -> tuple[str, ...]:
+        return tuple(peer.id for peer in self.found)
+
 
 def connect(monkeypatch: pytest.MonkeyPatch, fleet: Any) -> None:
     """Put ``fleet`` in the place of the robots on every network."""
@@ -71,7 +83,11 @@ def connect(monkeypatch: pytest.MonkeyPatch, fleet: Any) -> None:
     def connected(network: Network, source: str = "") -> Iterator[Any]:
         yield fleet
 
+    def networks(network: Network, **_: object) -> Networks:
+        return Networks([DeviceConnectNetwork.joined(fleet)])
+
     monkeypatch.setattr(Network, "fleet", connected)
+    monkeypatch.setattr(Network, "networks", networks)
 
 
 @pytest.fixture

@@ -37,7 +37,7 @@ class SigningFleet:
     """One locked robot whose answers are signed by the key that the test gives it."""
 
     def __init__(self, identity: SigningIdentity | None) -> None:
-        self.link = loopback_config()
+        self.link, self.source = loopback_config(), "cli"
         self.identity = identity
         self.locked = True
         self.stale = ""

@@ -179,7 +179,6 @@ def test_stop_needs_neither_name_nor_mesh_of_the_profile(
     assert result.exit_code == Exit.SILENT, result.output
     assert "The caller is strands-robots." in caplog.text
     assert "The mesh is left out." in caplog.text
-    assert settings.raw("STRANDS_MESH") == "false"
 
 
 def test_caller_is_the_profiles_unless_another_is_given(

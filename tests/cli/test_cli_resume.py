@@ -31,7 +31,7 @@ class FakeFleet:
     """Robots with the lockouts that the test sets; a signed resume clears the one it names."""
 
     def __init__(self) -> None:
-        self.link = loopback_config()
+        self.link, self.source = loopback_config(), "cli"
         self.stale = ""
         self.lockouts: dict[str, list[str]] = {}
         self.silent: set[str] = set()

@@ -24,8 +24,8 @@ from strands_robots.device_connect.backends import loopback_config
 from strands_robots.device_connect.discovery import Peer, RegistryError
 from strands_robots.device_connect.enrollment import network_of
 from strands_robots.envelope import Envelope, error, success
-from strands_robots.fleet.device_connect.stops import devices_on, network_key
-from strands_robots.fleet.emergency_stop import EmergencyStop
+from strands_robots.errors import UnreachableError
+from strands_robots.fleet.device_connect.network import DeviceConnectNetwork
 from strands_robots.fleet.stop_answers import stop_outcome
 from strands_robots.safety.answers import Answer
 from strands_robots.safety.controller import Progress, StopReport
@@ -49,7 +49,7 @@ class FakeController:
 
     def __init__(self, stop_report: StopReport) -> None:
         self.report = stop_report
-        self.calls: list[tuple[Collection[str], str]] = []
+        self.calls: list[tuple[list[str], str]] = []
         self.presses: list[str] = []
         self.sending, self.controller_id = Sending(), "desk"
 
@@ -60,7 +60,7 @@ class FakeController:
         self.presses.append(estop_id)
 
     def stop(self, expected: Collection[str], reason: str, **more: Any) -> StopReport:
-        self.calls.append((expected, reason))
+        self.calls.append((list(expected), reason))
         return self.report
 
     def expect(self, estop_id: str, names: Collection[str], *, more: bool = False) -> bool:
@@ -305,7 +305,7 @@ class Lookup:
         self.tries, self.stale = list(tries), stale
         self.failed, self.left = threading.Event(), threading.Event()
 
-    def __call__(self, link: object) -> Lookup:
+    def __call__(self, link: object, source: str) -> Lookup:
         return self
 
     def __enter__(self) -> Self:
@@ -382,8 +382,17 @@ def test_estop_says_so_when_the_registry_gave_no_list(estop: Callable[..., Resul
     assert stale in json.loads(result.stdout)["reason"]
 
 
-def test_estop_that_ended_before_its_robots_were_found_is_no_success(estop: Callable[..., Result]) -> None:
-    result = estop(Lookup(["a"]), LookingController(report(answer("a")), over=True))
+def test_estop_whose_robots_are_found_after_its_end_asks_them_all_the_same(estop: Callable[..., Result]) -> None:
+    assert estop(Lookup(["a"]), LookingController(report(answer("a")), over=True)).exit_code == 0
+
+
+def test_estop_whose_robots_are_not_found_in_time_is_no_success(
+    estop: Callable[..., Result], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lookup, over = Lookup(), threading.Event()
+    monkeypatch.setattr(lookup, "peers", lambda *_, **__: over.wait(20) and [])
+    result = estop(lookup, LookingController(report(answer("a")), over=True), "--deadline", "0.1")
+    over.set()
     assert result.exit_code == 3
     assert "could not be looked up: no list of them in time." in " ".join(result.stderr.split())
 
@@ -399,8 +408,7 @@ def test_stop_that_raises_at_once_leaves_no_lookup_behind(monkeypatch: pytest.Mo
 
     lookup = Lookup()
     monkeypatch.setattr(device_connect, "FleetClient", lookup)
-    link = loopback_config()
-    running = EmergencyStop(Broken(report()), network_key(link), "", 3.0, devices=devices_on(link, 3.0))  # type: ignore[arg-type]
-    with pytest.raises(OSError, match="Too many open files"):
-        running.report.result(20)
+    monkeypatch.setattr(safety_controller, "safety_controller", lambda *given, **more: Broken(report()))
+    with pytest.raises(UnreachableError, match="Too many open files"):
+        DeviceConnectNetwork(loopback_config(), "desk").emergency_stop("")
     assert lookup.left.wait(20)

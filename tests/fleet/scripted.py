@@ -15,6 +15,7 @@ from strands_robots.fleet.lockout_report import LockoutReport, Resumed
 from strands_robots.fleet.refusals import answered
 from strands_robots.fleet.stop_answers import measured, roster_verdict, unanswered
 from strands_robots.safety import network_key
+from strands_robots.safety.controller import OnProgress
 from strands_robots.safety.identity import SigningIdentity
 from strands_robots.safety.lockout import Lockout
 from strands_robots.safety.network_key import NetworkKey
@@ -62,6 +63,7 @@ def key_of(network: str) -> NetworkKey:
 class ScriptedNetwork:
     """Robots whose verbs, answers and stops a test sets; it notes what they were asked."""
 
+    has_stop_link = False
     announces_verbs = True
     reads: Mapping[str, str] = {"status": "getStatus", "state": "getState", "features": "getFeatures"}
     starts = "execute"
@@ -196,6 +198,14 @@ class ScriptedNetwork:
         return "They were looked for in a script."
 
     @property
+    def on_this_machine(self) -> bool:
+        return False
+
+    @property
+    def meeting_port(self) -> int | None:
+        return None
+
+    @property
     def stale(self) -> str:
         return ""
 
@@ -211,6 +221,9 @@ class ScriptedNetwork:
         signing_key: Any = None,
         estop_id: str = "",
         remembers: Remembers | None = None,
+        named: Collection[str] = (),
+        deadline_s: float | None = None,
+        on_progress: OnProgress = lambda progress: None,
     ) -> StopOutcome:
         self.estops.append((reason, scope, estop_id))
         self.signers.append(signing_key)
@@ -219,16 +232,13 @@ class ScriptedNetwork:
             raise UnreachableError(self.unreachable)
         answers = {name: self.stop(name) or error("none") for name in self.robots if scope.covers(name, frozenset())}
         self.locked |= dict.fromkeys(answers, estop_id)
-        return measured(answers, self._roster(scope), Sending(), estop_id)
-
-    def silence(self, robot: str) -> str:
-        return ""
+        return measured(answers, self._roster(scope, named), Sending(), estop_id)
 
     def verdict(self, outcome: StopOutcome) -> Envelope:
         return roster_verdict(outcome)
 
-    def _roster(self, scope: Scope = EVERY_ROBOT) -> StopRoster:
-        roster = StopRoster(self.key, scope=scope)
+    def _roster(self, scope: Scope = EVERY_ROBOT, named: Collection[str] = ()) -> StopRoster:
+        roster = StopRoster(self.key, named, scope)
         inside = [name for name in (*self.robots, *self.silent) if scope.covers(name, frozenset())]
         roster.find(dict.fromkeys(inside, True))
         roster.read()

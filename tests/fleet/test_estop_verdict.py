@@ -36,7 +36,7 @@ class PlainFleet:
     def __init__(self, plain: dict[str, Envelope]) -> None:
         self.plain, self.asked, self.measured = plain, list[str](), False
 
-    def peers(self, timeout: float) -> list[Any]:
+    def peers(self, timeout: float, *, thorough: bool) -> list[Any]:
         return [SimpleNamespace(id=name, stop_verb="stop", cell="") for name in self.plain]
 
     def stop_each(self, devices: list[str], seconds: float) -> dict[str, Envelope]:
@@ -78,6 +78,7 @@ def press(monkeypatch: pytest.MonkeyPatch) -> Press:
             sending=Sending(),
             close=lambda: None,
             press=lambda _: None,
+            wait_link=lambda _: True,
             stop=sent,
             expect=expect,
             controller_id="tool",

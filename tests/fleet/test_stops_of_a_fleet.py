@@ -212,10 +212,9 @@ def test_named_robot_that_a_network_remembers_must_answer_there(
     fleet: Fleet, near: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     del near.robots["both"]
-    near.silent.append("both")
     assert fleet.estop(only="both").ok
     row = RosterRow("both", Known.ENROLLED)
-    monkeypatch.setattr(Roster, "of", lambda network: Roster(network, (row,) if network == near.key else ()))
+    monkeypatch.setattr(Roster, "of", lambda network, *_: Roster(network, (row,) if network == near.key else ()))
     stop = fleet.estop(only="both")
     assert stop.missing == ("both",)
 

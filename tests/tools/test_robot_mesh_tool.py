@@ -460,11 +460,11 @@ class TestDefaultProfile:
 
     @pytest.fixture
     def joined(self, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-        """The networks that were joined, none of which answers."""
+        """The networks that were joined or stopped, none of which answers."""
         found: list[str] = []
 
-        def device_connect(self: DeviceConnectNetwork) -> None:
-            link = self._client.link
+        def device_connect(self: DeviceConnectNetwork, *_: object, **__: object) -> None:
+            link = self._link
             found.append(f"device connect {link.meet_port} {link.tenant}")
             raise UnreachableError("no answer")
 
@@ -475,7 +475,8 @@ class TestDefaultProfile:
         monkeypatch.setenv("STRANDS_MESH", "true")
         monkeypatch.setenv("STRANDS_MESH_PORT", "7001")
         monkeypatch.setenv("STRANDS_DC_PORT", "7002")
-        monkeypatch.setattr(DeviceConnectNetwork, "open", device_connect)
+        for way in ("open", "emergency_stop"):
+            monkeypatch.setattr(DeviceConnectNetwork, way, device_connect)
         monkeypatch.setattr(MeshNetwork, "_dialled", mesh)
         return found
 

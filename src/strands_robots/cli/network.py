@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from strands_robots import settings
+from strands_robots._mesh_switch import mesh_env_request
 from strands_robots.cli.output import CliError, Exit, plain
 from strands_robots.envelope import Envelope
 from strands_robots.errors import ArgumentsError, NoSuchRobotError, RefusalError, UnknownVerbError, UnreachableError
@@ -146,11 +147,16 @@ class Network:
         name = self.caller() if source is None else source
         if on_mesh:
             self.use_mesh()
+            if mesh_env_request() is False:
+                raise CliError("The native mesh is off: STRANDS_MESH switches it off.", Exit.SILENT)
             return networks_of(None, {}, name, devices=False, mesh=True, stays=stays)
         try:
-            networks = networks_of(self._profile, self._given, name, stays=stays)
+            networks = networks_of(self._profile, self._given, name, mesh=self._usable_mesh, stays=stays)
         except ValidationError as exc:
             raise CliError(str(exc), Exit.USAGE) from exc
+        if not networks.stated and not self.on_mesh_alone:
+            # It names the extra.
+            self._stated.link(as_flag)
         if credentials := self._stated.credentials:
             # For the processes that a command starts, and for what it prints.
             settings.put("MESSAGING_CREDENTIALS_FILE", str(credentials))
@@ -205,6 +211,17 @@ class Network:
             yield DeviceConnectNetwork.joined(fleet)
 
     @property
+    def _usable_mesh(self) -> bool | None:
+        """False where the profile's mesh cannot be used, and is left out."""
+        profile = self._profile
+        try:
+            _ = None if profile is None else profile.mesh
+        except ValidationError as unfit:
+            logger.warning("%s The mesh is left out.", unfit)
+            return False
+        return None
+
+    @property
     def stated_tenant(self) -> str:
         """The tenant of Device Connect, of the flag or the environment."""
         return self._stated.stated_tenant
@@ -226,22 +243,6 @@ class Network:
         """True for a connection profile that has a mesh and no Device Connect."""
         profile = self._profile
         return profile is not None and not profile.reaches_devices(self._given)
-
-    def beside(self) -> list[NetworkAdapter]:
-        """Return the connection profile's networks besides Device Connect.
-
-        A stop of all has to reach them. A mesh that cannot be used is left out, as :meth:`link` says in the log.
-        """
-        profile = self._profile
-        try:
-            mesh = None if profile is None else profile.mesh
-        except ValidationError:
-            mesh = None
-        if mesh is None:
-            return []
-        from strands_robots.fleet.mesh.network import MeshNetwork  # noqa: PLC0415 - loaded when it is used
-
-        return [MeshNetwork(self.caller(), mesh)]
 
     def use_mesh(self) -> None:
         """Apply the flags to the native mesh, which takes ``--fleet`` and ``--port``.

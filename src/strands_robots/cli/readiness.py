@@ -137,9 +137,9 @@ def other_user(link: LinkConfig) -> str:
     return f"Robots at the meeting port {link.meet_port} are served by {holder} (uid {uid}), not by you."
 
 
-def meeting_user(link: LinkConfig) -> str:
-    """Return the name of another user at the meeting port, or empty."""
-    uid = None if link.meet_port is None else port_holder(link.meet_port)[0]
+def meeting_user(port: int | None) -> str:
+    """Return the name of another user at a meeting port, or empty."""
+    uid = None if port is None else port_holder(port)[0]
     return "" if uid is None or uid == os.getuid() else _user(uid)
 
 

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import shlex
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, wait
-from contextlib import contextmanager, nullcontext
+from contextlib import closing, contextmanager, nullcontext, suppress
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from strands_robots.cli.command import OnMesh, Timeout, command
 from strands_robots.cli.keys import PassphraseFile, operator_key, signing_key
-from strands_robots.cli.network import Network, near_robots
+from strands_robots.cli.network import Network
 from strands_robots.cli.output import POLL_S, CliError, Exit, Screen, captured_log, label, plain, table
 from strands_robots.cli.readiness import meeting_user
 from strands_robots.cli.stop_report import (
@@ -25,25 +27,17 @@ from strands_robots.cli.stop_report import (
     say_outcome,
     stop_table,
 )
-from strands_robots.envelope import Envelope, text_of
+from strands_robots.envelope import Envelope
+from strands_robots.errors import RefusalError
+from strands_robots.fleet.all_stops import estop_all, stop_all
 from strands_robots.fleet.callers import SOURCE, TOOL
-from strands_robots.fleet.device_connect.stops import devices_on, network_key
-from strands_robots.fleet.emergency_stop import EmergencyStop
-from strands_robots.fleet.fleet_verdict import NetworkVerdict
-from strands_robots.fleet.link_flags import described
-from strands_robots.fleet.network_stop import stop_beside
-from strands_robots.fleet.stop_answers import combined_verdict, roster_verdict, stop_outcome, unanswered
+from strands_robots.fleet.fleet_verdict import FleetVerdict, NetworkVerdict
+from strands_robots.fleet.networks import Networks
+from strands_robots.fleet.stop_answers import combined_verdict, not_reached, roster_verdict, stop_outcome
 from strands_robots.safety.controller import DEADLINE_S, Progress
-from strands_robots.safety.orders import new_epoch
 from strands_robots.safety.stop_roster import StopOutcome
 from strands_robots.serving.stop_arguments import robot_of_world, stop_reason, stop_robot, stop_scope
-from strands_robots.utils import ValidationError, device_id, number
-
-if TYPE_CHECKING:
-    from strands_robots.fleet.adapter import NetworkAdapter
-
-LINK_WAIT_S = 2.0
-"""Longest wait for the connection, after which the deadline counts."""
+from strands_robots.utils import ValidationError, device_id, near, number
 
 LOCKED = "They are locked until they are resumed:"
 LOCKED_THERE = "They are locked until they are resumed, at the machine of each robot:"
@@ -73,40 +67,25 @@ def stop(
     timeout: Timeout = 5.0,
     on_mesh: OnMesh = False,
 ) -> None:
-    """Stop one robot, or all. Exits with 1 when one did not stop, with 3 when one is silent."""
+    """Stop one robot, or all, on every network.
+
+    Exits with 1 when one did not stop, with 3 when one is silent.
+    """
     device, unread = stop_robot("DEVICE", None if everything else device)
-    everything, device = not device, device or None
     name = robot_of_world({"robot_name": one})[0] if device else ""
     if one and not name:
         unread = unread or "--robot names no robot of a DEVICE's world, so all of it is stopped"
-    _say_ignored(screen, unread)
-    seconds, on_mesh = _seconds(screen, "--timeout", timeout, 60, 5.0), on_mesh or network.on_mesh_alone
-    others = [] if device or on_mesh else _beside(network, lambda each: each.stop_all(seconds)[1])
-    with _stopping(screen, network, on_mesh=on_mesh) as there:
-        if device is None:
-            answers, outcome = there.stop_all(seconds)
-            facts = _facts(roster_verdict(outcome)) if on_mesh else {"devices": _devices(answers, outcome)}
+    seconds, unfit = _seconds("--timeout", timeout, 60, 5.0)
+    with _stopping(screen, network, on_mesh=on_mesh) as networks:
+        if device:
+            answers = networks.stop(device, seconds, name)
+            _say_ignored(screen, unread, unfit)
+            # One robot of a world is named with it: the others may move on.
+            _report_one(screen, networks, device, f"{device}/{name}" if name else device, answers)
         else:
-            answer = there.stop(device, seconds, name, insist=True) or unanswered(device)
-            stopped, said = stop_outcome(answer)
-            alike = ""
-            if stopped is None and not on_mesh:
-                why = there.silence(device)
-                said, alike = (f"{said.rstrip('.')}: {why}", "") if why else (said, near_robots(there, device))
-    if device is None:
-        _report_all(screen, outcome, facts, there.reach, others)
-        return
-    # One robot of a world is named with it: the others may move on.
-    robot = f"{device}/{name}" if name else device
-    _show_answers(screen, {robot: (stopped, said)})
-    verdict = combined_verdict({robot: answer})
-    facts = _facts(verdict) if on_mesh else {"devices": {robot: {"stopped": stopped, "said": said}}}
-    if not stopped:
-        what, code = ("DID NOT STOP", Exit.REFUSED) if stopped is False else ("NO ANSWER", Exit.SILENT)
-        raise CliError(plain(text_of(verdict), 2000) if on_mesh else f"{what}: {robot}.{alike}", code, **facts)
-    screen.data({"status": "success", **facts})
-    if on_mesh:
-        screen.say(text_of(verdict), "green")
+            verdict = stop_all(networks, seconds)
+            _say_ignored(screen, unread, unfit)
+            _report(screen, networks, verdict, _plain_facts)
 
 
 def estop(
@@ -115,7 +94,7 @@ def estop(
     *,
     devices: Annotated[
         list[str] | None,
-        typer.Argument(metavar="DEVICE...", help="Those that must answer. Every robot of the tenant stops."),
+        typer.Argument(metavar="DEVICE...", help="Those that must answer. Every robot stops."),
     ] = None,
     everything: Annotated[
         bool, typer.Option("--all", help="Every robot that can be found must answer; the default.")
@@ -142,105 +121,70 @@ def estop(
     passphrase_file: PassphraseFile = None,
     on_mesh: OnMesh = False,
 ) -> None:
-    """Stop every robot of the tenant and lock it. Exits with 1 when one did not stop, with 3 when one is silent.
+    """Stop every robot and lock it, on every network.
+
+    Exits with 1 when one did not stop, with 3 when one is silent.
 
     With --only or --cell it is for these robots; where none of them is there, every robot is stopped.
 
-    The tenant is the fleet that --tenant names, default without it. The id of the stop is the epoch of the lockout that
-    it leaves; a resume names it.
+    On Device Connect it is for a tenant, the fleet that --tenant names, default without it. The id of the stop is the
+    epoch of the lockout that it leaves; a resume names it.
     """
     reason, cut = stop_reason(reason)
-    _say_ignored(screen, cut)
     scope, unread = stop_scope(only, cell)
-    _say_ignored(screen, unread)
-    if on_mesh or network.on_mesh_alone:
-        if devices:
-            _say_ignored(screen, "estop --mesh stops every robot, and no DEVICE is waited for")
-        on_key = None if key is None else signing_key(key, passphrase_file)
-        with _stopping(screen, network, on_mesh=True) as there:
-            outcome = there.emergency_stop(reason, scope=scope, signing_key=on_key)
-        _report_all(screen, outcome, _facts(there.verdict(outcome)), there.reach)
-        show_resume(screen, key, f" --mesh{network.flags}")
-        return
-    # What is no device's id answers to nothing, so the report has it as silent.
-    expected = [] if everything else list(devices or [])
-    seconds = _seconds(screen, "--deadline", deadline, 600, DEADLINE_S)
+    seconds, unfit = _seconds("--deadline", deadline, 600, DEADLINE_S)
     source = device_id("--as", source)
-    link = network.link()
-    signer = None if key is None else signing_key(key, passphrase_file)
-    from strands_robots.device_connect.safety_controller import (  # noqa: PLC0415 - the network is loaded when it is used
-        outcome_envelope,
-        safety_controller,
-    )
-
-    epoch = new_epoch()
-    others = _beside(network, lambda each: each.emergency_stop(reason, scope=scope, signing_key=signer, estop_id=epoch))
-    controller = safety_controller(source, link, signing_key=signer, require_signed=signer is not None)
-    try:
-        running = EmergencyStop(
-            controller,
-            network_key(link),
+    with _stopping(screen, network, on_mesh=on_mesh, source=source) as networks:
+        latest: dict[str, Progress] = {}
+        pressed = partial(
+            estop_all,
+            networks,
             reason,
-            seconds,
-            named=expected,
-            devices=None if expected else devices_on(link, seconds),
             scope=scope,
-            estop_id=epoch,
-            link_wait_s=LINK_WAIT_S,
+            signing_key=None if key is None else signing_key(key, passphrase_file),
+            # What is no device's id answers to nothing, so the report has it as silent.
+            named=() if everything else tuple(devices or ()),
+            deadline_s=seconds,
+            on_progress=latest.__setitem__,
         )
-        if screen.live:
-            outcome = _watch(screen, running)
+        verdict = _watched(screen, networks, pressed, latest) if screen.live else pressed()
+        _say_ignored(screen, cut, unread, unfit)
+        concerned = _report(screen, networks, verdict, _estop_facts, drawn=screen.live)
+        there = [each for each in networks.stated if each.name in concerned]
+        if there and all(each.on_this_machine for each in there):
+            user = meeting_user(there[0].meeting_port)
+            screen.say(LOCKED)
+            screen.copyable(f"  sudo -u {user} {RESUME_HERE}" if user else f"  {RESUME_HERE}")
         else:
-            outcome = running.outcome()
-            screen.show(stop_table(outcome_rows(outcome)))
-    finally:
-        controller.close()
-    report = outcome.report
-    say_outcome(screen, outcome)
-    for name, why in report.alarms.items():
-        screen.say(
-            f"ALARM: {name}: {why}. Its own answer {'is missing' if name in report.alarmed else 'came, too'}.",
-            "bold red",
-        )
-    if report.claimed:
-        screen.say(CLAIMED, "yellow")
-    if report.link and report.silent and not (report.answered or outcome.others.answered):
-        screen.say(KEPT_BY_NONE, "yellow")
-    _end(screen, outcome, _facts(outcome_envelope(outcome)), "" if report.link else described(link), others)
-    if link.loopback_only:
-        user = meeting_user(link)
-        screen.say(LOCKED)
-        screen.copyable(f"  sudo -u {user} {RESUME_HERE}" if user else f"  {RESUME_HERE}")
-    else:
-        show_resume(screen, key, network.flags)
+            show_resume(screen, key, f"{' --mesh' if on_mesh else ''}{network.flags}")
 
 
 @contextmanager
-def _stopping(screen: Screen, network: Network, *, on_mesh: bool) -> Iterator[NetworkAdapter]:
-    """Join the network of a stop; where the mesh is off it ends with code 3."""
-    # The table of a stop on the mesh names what the log would report.
-    with captured_log() if on_mesh and screen.live else nullcontext():
-        try:
-            with network.joined(on_mesh=on_mesh, peer=TOOL) as there:
-                yield there
-        except CliError as failure:
-            if on_mesh and failure.code is Exit.REFUSED:
-                raise CliError(failure.reason, Exit.SILENT, stopped=None) from failure
-            raise
+def _stopping(screen: Screen, network: Network, *, on_mesh: bool, source: str | None = None) -> Iterator[Networks]:
+    """Make the networks of a stop, which joins them itself."""
+    try:
+        networks = network.networks(on_mesh=on_mesh, source=TOOL if on_mesh else source)
+    except CliError as failure:
+        raise CliError(failure.reason, failure.code, stopped=None) from failure
+    if not networks.stated:
+        raise CliError(f"No network can be joined: {networks.absences}.", Exit.SILENT, stopped=None)
+    # The table of a stop names what the log would report.
+    with closing(networks), captured_log() if screen.live else nullcontext():
+        yield networks
 
 
-def _say_ignored(screen: Screen, note: str) -> None:
-    """Say what of a stop's arguments is left out; none of them refuses it."""
-    if note:
+def _say_ignored(screen: Screen, *notes: str) -> None:
+    """Say what of a stop's arguments is left out, once the stop has left."""
+    for note in filter(None, notes):
         screen.say(f"Ignored: {plain(note, 300)}.", "yellow")
 
 
-def _seconds(screen: Screen, name: str, value: float, most: float, usual: float) -> float:
+def _seconds(name: str, value: float, most: float, usual: float) -> tuple[float, str]:
+    """Return a time in its domain, and a note on one that was not."""
     try:
-        return number(name, value, above=0, high=most)
+        return number(name, value, above=0, high=most), ""
     except ValidationError as unfit:
-        _say_ignored(screen, f"{str(unfit).rstrip('.')}; it is {usual:g}")
-        return usual
+        return usual, f"{str(unfit).rstrip('.')}; it is {usual:g}"
 
 
 def show_resume(screen: Screen, key: Path | None, flags: str) -> None:
@@ -264,77 +208,197 @@ def show_resume(screen: Screen, key: Path | None, flags: str) -> None:
     screen.copyable(f"  strands-robots keys resume {shlex.quote(str(operator_key()))}")
 
 
-def _watch(screen: Screen, running: EmergencyStop) -> StopOutcome:
-    """Draw the answers as they come, and return the outcome."""
+def _watched(
+    screen: Screen, networks: Networks, pressed: Callable[[], FleetVerdict], latest: Mapping[str, Progress]
+) -> FleetVerdict:
+    """Press on a thread that never waits for drawing; draw the answers."""
+    verdict: Future[FleetVerdict] = Future()
+
+    def press() -> None:
+        try:
+            verdict.set_result(pressed())
+        except BaseException as exc:  # noqa: BLE001 - raised again by the future
+            verdict.set_exception(exc)
+
+    threading.Thread(target=press, name="estop", daemon=True).start()
     from rich.live import Live  # noqa: PLC0415 - loaded when a screen is redrawn
 
-    # The table already names what the log would report.
-    with captured_log(), Live(stop_table([], "EMERGENCY STOP"), console=screen.out, auto_refresh=False) as live:
-        while not wait([running.report], POLL_S).done:
-            if running.latest is not None:
-                live.update(stop_table(progress_rows(running.latest), _title(running.latest)), refresh=True)
-        outcome = running.outcome()
-        live.update(stop_table(outcome_rows(outcome), "EMERGENCY STOP"), refresh=True)
-    return outcome
+    with Live(stop_table({}, "EMERGENCY STOP"), console=screen.out, auto_refresh=False) as live:
+        while not wait([verdict], POLL_S).done:
+            so_far = dict(latest)
+            rows = {name: progress_rows(each) for name, each in so_far.items()}
+            live.update(stop_table(rows, _title(so_far, len(networks.stated))), refresh=True)
+        shown = _shown(verdict.result())
+        live.update(stop_table(_rows(shown), "EMERGENCY STOP"), refresh=True)
+    return verdict.result()
 
 
-def _title(progress: Progress) -> str:
-    age = f", pressed {progress.elapsed_ms / 1000:.1f} s ago" if progress.elapsed_ms > LATE_MS else ""
-    return f"EMERGENCY STOP{age}" + ("" if progress.link_up else ": THE LINK IS DOWN")
+def _title(progress: Mapping[str, Progress], networks: int) -> str:
+    elapsed_ms = max((each.elapsed_ms for each in progress.values()), default=0.0)
+    age = f", pressed {elapsed_ms / 1000:.1f} s ago" if elapsed_ms > LATE_MS else ""
+    down = len(progress) == networks and not any(each.link_up for each in progress.values())
+    return f"EMERGENCY STOP{age}{': THE LINK IS DOWN' if down else ''}"
 
 
-def _beside(network: Network, stop_robots: Callable[[NetworkAdapter], StopOutcome]) -> list[Future[NetworkVerdict]]:
-    """Stop the robots of a connection profile's other networks at the same time."""
-    return [stop_beside(each, stop_robots) for each in network.beside()]
+def _shown(verdict: FleetVerdict) -> Sequence[NetworkVerdict]:
+    """Return the networks to show: one without robots only where it is alone."""
+    return verdict.reporting or verdict.networks[:1]
 
 
-def _report_all(
+def _rows(shown: Sequence[NetworkVerdict]) -> dict[str, list[tuple[Any, ...]]]:
+    return {each.network: outcome_rows(each.outcome) for each in shown if each.outcome is not None}
+
+
+def _report(
     screen: Screen,
-    outcome: StopOutcome,
-    facts: Mapping[str, Any],
-    absent: str = "",
-    others: Sequence[Future[NetworkVerdict]] = (),
-) -> None:
-    """Print a stop of all without times; raise unless the roster stands still."""
-    rows = outcome_rows(outcome)
-    if rows:
-        screen.show(stop_table(rows, timed=False))
-        say_outcome(screen, outcome)
-    _end(screen, outcome, {**facts, **outcome.facts()}, "" if rows else absent, others)
+    networks: Networks,
+    verdict: FleetVerdict,
+    facts: Callable[[Networks, NetworkVerdict], Mapping[str, Any]],
+    *,
+    drawn: bool = False,
+) -> frozenset[str]:
+    """Print a stop of all; raise unless every robot that must answer stands still.
 
+    Args:
+        screen: where.
+        networks: of the stop.
+        verdict: of the stop.
+        facts: returns what programs read of the first network; robots of others stand under the network's name.
+        drawn: the table is on the screen already.
 
-def _end(
-    screen: Screen,
-    outcome: StopOutcome,
-    facts: Mapping[str, Any],
-    where: str,
-    others: Sequence[Future[NetworkVerdict]] = (),
-) -> None:
-    """Print facts for programs; raise unless the rosters of all networks stand still."""
-    beside = [each for each in (other.result() for other in others) if each.verdicts() or each.problems]
-    known, parts = {**facts}, list[tuple[Exit, str]]()
-    if not beside or outcome.size or outcome.problems:
-        # Beside a network with robots, one without any is no failure.
-        parts.append((exit_code(outcome), f"{failure(outcome)} {where}".rstrip()))
-    for each in beside:
-        screen.say(f"On {each.network}:")
-        if each.outcome is not None:
-            screen.show(stop_table(outcome_rows(each.outcome), timed=False))
+    Returns:
+        The names of the networks that have robots.
+    """
+    shown = _shown(verdict)
+    rows = _rows(shown)
+    estop = bool(verdict.estop_id)
+    if not drawn and any(rows.values()):
+        screen.show(stop_table(rows, timed=estop))
+    failed: list[tuple[Exit, str]] = []
+    for each in shown:
+        if len(shown) > 1:
+            screen.say(f"On {each.network}:")
+        if each.outcome is None:
+            failed.append((Exit.SILENT, each.sentence))
+            continue
+        if estop or rows[each.network]:
             say_outcome(screen, each.outcome)
-        code = Exit.SILENT if each.outcome is None else exit_code(each.outcome)
-        parts.append((code, f"On {each.network}: {each.sentence}"))
-        known[each.network] = {name: verdict.stopped for name, verdict in each.verdicts().items()}
-    failed = [(code, said) for code, said in parts if code is not Exit.OK]
+        if estop:
+            _warn(screen, each.outcome)
+        if (code := exit_code(each.outcome)) is not Exit.OK:
+            failed.append((code, _why(networks, each, each.outcome)))
+    everywhere = (*verdict.networks, *verdict.unreached)
+    first = next((each for each in everywhere if each.network == networks.stated[0].name), everywhere[0])
+    known = {**facts(networks, first)}
+    for each in verdict.reporting:
+        if each is not first:
+            known[each.network] = {name: every.stopped for name, every in each.verdicts().items()}
+    stated = {each.name for each in networks.stated}
+    known |= _say_absent(screen, {each.network: each.absent for each in verdict.unreached if each.network in stated})
     if failed:
         worst = Exit.REFUSED if any(code is Exit.REFUSED for code, _ in failed) else Exit.SILENT
         raise CliError(plain(" ".join(said for _, said in failed), 2000), worst, **known)
     screen.data({"status": "success", **known})
+    return frozenset(each.network for each in shown)
 
 
-def _devices(answers: Mapping[str, Envelope], outcome: StopOutcome) -> dict[str, Any]:
-    graded = {name: stop_outcome(answer) for name, answer in answers.items()}
-    missing = {name: (None, outcome.reasons.get(name, "no answer")) for name in outcome.report.silent}
-    return {name: {"stopped": stopped, "said": said} for name, (stopped, said) in {**graded, **missing}.items()}
+def _why(networks: Networks, each: NetworkVerdict, outcome: StopOutcome) -> str:
+    """Return one line on a network whose robots are not all known to stand still."""
+    said = failure(outcome)
+    if each.absent and not outcome.problems:
+        said = f"The network does not carry this: {each.absent.rstrip('.')}. {said}"
+    there = next((network for network in networks.stated if network.name == each.network), None)
+    if there is not None and not (outcome.size and outcome.report.link):
+        said = f"{said} {there.reach}"
+    return said if there is networks.stated[0] else f"On {each.network}: {said}"
+
+
+def _say_absent(screen: Screen, absent: Mapping[str, str]) -> dict[str, Any]:
+    """Say which stated networks were not reached; return that for programs."""
+    reasons = {name: why for name, why in absent.items() if why}
+    for name, why in reasons.items():
+        screen.say(f"{name} was not reached: {plain(why, 300).rstrip('.')}.", "yellow")
+    return {"absent": reasons} if reasons else {}
+
+
+def _warn(screen: Screen, outcome: StopOutcome) -> None:
+    """Print alarms, claims, and that no robot keeps an emergency stop."""
+    report = outcome.report
+    for name, why in report.alarms.items():
+        screen.say(
+            f"ALARM: {name}: {why}. Its own answer {'is missing' if name in report.alarmed else 'came, too'}.",
+            "bold red",
+        )
+    if report.claimed:
+        screen.say(CLAIMED, "yellow")
+    if report.link and report.silent and not (report.answered or outcome.others.answered):
+        screen.say(KEPT_BY_NONE, "yellow")
+
+
+def _report_one(screen: Screen, networks: Networks, device: str, robot: str, answers: Mapping[str, Envelope]) -> None:
+    """Print the stop of one robot on each network; raise unless all stand still.
+
+    Args:
+        screen: where.
+        networks: of the stop.
+        device: the robot's id.
+        robot: its name in the report.
+        answers: by network.
+    """
+    absent = {each.name: networks.absent.get(each.name, "") for each in networks.stated}
+    if not networks.joined:
+        why = next(iter(absent.values())) if len(absent) == 1 else networks.absences
+        raise CliError(plain(f"The network does not carry this: {why.rstrip('.')}.", 2000), Exit.SILENT, stopped=None)
+    graded, remembered = dict[str, tuple[bool | None, str]](), False
+    for each in networks.stated:
+        if each.name in answers:
+            stopped, said = stop_outcome(answers[each.name])
+            why = not_reached(each.key, left=True).reasons.get(device, "") if stopped is None else ""
+            remembered = remembered or bool(why)
+            graded[each.name] = stopped, f"{said.rstrip('.')}: {why}" if why and why not in said else said
+    several = len(graded) > 1
+    bearers = {f"{robot} on {name}" if several else robot: each for name, each in graded.items()}
+    _show_answers(screen, bearers)
+    outcomes = [stopped for stopped, _ in graded.values()]
+    stopped = False if False in outcomes else None if None in outcomes else True
+    each_said = (
+        {"on": {name: {"stopped": now, "said": said} for name, (now, said) in graded.items()}} if several else {}
+    )
+    said = "; ".join(f"{name}: {text}" if several else text for name, (_, text) in graded.items())
+    verdict = combined_verdict(dict(zip(bearers, (answers[name] for name in graded), strict=True)))
+    known = {"devices": {robot: {"stopped": stopped, "said": said, **each_said}}, **_facts(verdict)}
+    known |= _say_absent(screen, {name: why for name, why in absent.items() if name not in answers})
+    if stopped:
+        screen.data({"status": "success", **known})
+        return
+    moving = ", ".join(name for name, (now, _) in bearers.items() if now is False)
+    silent = ", ".join(name for name, (now, _) in bearers.items() if now is None)
+    failed = [f"{what}: {names}." for what, names in (("DID NOT STOP", moving), ("NO ANSWER", silent)) if names]
+    alike = "" if moving or remembered else _alike(networks, device)
+    raise CliError(f"{' '.join(failed)}{alike}", Exit.REFUSED if moving else Exit.SILENT, **known)
+
+
+def _alike(networks: Networks, device: str) -> str:
+    """Return a sentence with the ids in reach that resemble an absent one."""
+    with suppress(RefusalError):
+        names = networks.find(1.0)
+        return "" if device in names else near(device, names)
+    return ""
+
+
+def _estop_facts(networks: Networks, each: NetworkVerdict) -> Mapping[str, Any]:
+    there = next((network for network in networks.stated if network.name == each.network), networks.stated[0])
+    return {} if each.outcome is None else _facts(there.verdict(each.outcome))
+
+
+def _plain_facts(networks: Networks, each: NetworkVerdict) -> Mapping[str, Any]:
+    del networks
+    if each.outcome is None:
+        return {}
+    graded = {name: stop_outcome(answer) for name, answer in (each.answers or {}).items()}
+    missing = {name: (None, each.outcome.reasons.get(name, "no answer")) for name in each.outcome.report.silent}
+    devices = {name: {"stopped": stopped, "said": said} for name, (stopped, said) in {**graded, **missing}.items()}
+    return {"devices": devices, **_facts(roster_verdict(each.outcome)), **each.outcome.facts()}
 
 
 def _show_answers(screen: Screen, answers: Mapping[str, tuple[bool | None, str]]) -> None:

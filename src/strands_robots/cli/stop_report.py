@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rich.table import Table
@@ -97,11 +97,19 @@ def progress_rows(progress: Progress) -> list[tuple[Any, ...]]:
     return [*(_silent_row(name, mark) for name, mark in marks.items() if name not in progress.answered), *answered]
 
 
-def stop_table(rows: list[tuple[Any, ...]], title: str = "", *, timed: bool = True) -> Table:
-    """Return the table of a stop, with the times of answers where ``timed``."""
-    columns = ("robot", "answer", "ms", "what it said")
-    kept = [at for at, column in enumerate(columns) if timed or column != "ms"]
-    return table(title, [columns[at] for at in kept], [[row[at] for at in kept] for row in rows])
+def stop_table(rows: Mapping[str, Sequence[tuple[Any, ...]]], title: str = "", *, timed: bool = True) -> Table:
+    """Return the table of a stop; the network is named where several have rows.
+
+    Args:
+        rows: by network.
+        title: of the table.
+        timed: with the times of answers.
+    """
+    several = sum(map(bool, rows.values())) > 1
+    columns = ("robot", "network", "answer", "ms", "what it said")
+    kept = [at for at, column in enumerate(columns) if (timed or column != "ms") and (several or column != "network")]
+    every = [(row[0], network, *row[1:]) for network, each in rows.items() for row in each]
+    return table(title, [columns[at] for at in kept], [[row[at] for at in kept] for row in every])
 
 
 def say_outcome(screen: Screen, outcome: StopOutcome) -> None:
@@ -144,7 +152,8 @@ def _row(name: str, answer: Answer, left_ms: float) -> tuple[Any, ...]:
         mark, said = label("claimed", "yellow"), f"not signed by {name}; {said}"
     if answer.delay_s is not None and answer.delay_s * 1000 > LATE_MS:
         said = f"{said}; it arrived {answer.delay_s:.1f} s after the press"
-    return name, mark, label(f"{took_ms:.1f}", slow), said
+    # The mesh times no answer.
+    return name, mark, label(f"{took_ms:.1f}" if answer.latency_ms else "", slow), said
 
 
 def _silent_row(name: str, mark: str, why: str = "") -> tuple[Any, ...]:

@@ -13,6 +13,7 @@ from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope
 if TYPE_CHECKING:
     from strands_robots.fleet.lockout_report import LockoutReport, Resumed
     from strands_robots.fleet.stop_button import StopSender
+    from strands_robots.safety.controller import OnProgress
     from strands_robots.safety.network_key import NetworkKey
     from strands_robots.safety.stop_roster import StopOutcome
     from strands_robots.serving.advertised import AdvertisedVerb
@@ -107,12 +108,14 @@ class NetworkAdapter(Protocol):
 
     Attributes:
         name: :data:`DEVICE_CONNECT` or :data:`MESH`.
+        has_stop_link: emergency stops leave on a connection of their own, so that they need no :meth:`open`.
         announces_verbs: robots announce their verbs, so that :meth:`describe` asks no one.
         reads: the names on this network of the reads ``status``, ``state`` and ``features``.
         starts: the name on this network of the verb that starts a task.
     """
 
     name: str
+    has_stop_link: bool
     announces_verbs: bool
     reads: Mapping[str, str]
     starts: str
@@ -207,9 +210,6 @@ class NetworkAdapter(Protocol):
                 all the time, and None is never returned.
         """
 
-    def silence(self, robot: str) -> str:
-        """Return why a robot that did not answer a stop may be silent, or ""."""
-
     def received(self, robot: str, verb: str, arguments: Mapping[str, Any]) -> ReceivedCall:
         """Return a call as the robot receives it; asks no one.
 
@@ -244,6 +244,14 @@ class NetworkAdapter(Protocol):
         """One sentence on the place where robots are looked for."""
 
     @property
+    def on_this_machine(self) -> bool:
+        """True where all robots are known to be on this machine."""
+
+    @property
+    def meeting_port(self) -> int | None:
+        """The loopback port where robots meet; None where it is not known."""
+
+    @property
     def stale(self) -> str:
         """Reason why the last search may have missed robots, or ""."""
 
@@ -262,10 +270,13 @@ class NetworkAdapter(Protocol):
         signing_key: Any = None,
         estop_id: str = "",
         remembers: Remembers | None = None,
+        named: Collection[str] = (),
+        deadline_s: float | None = None,
+        on_progress: OnProgress = lambda progress: None,
     ) -> StopOutcome:
         """Stop and lock every robot, or those of ``scope``; return the outcome.
 
-        The outcome is recorded. It leaves on a connection of its own where the network has one.
+        The outcome is recorded. A stop that did not leave is an outcome, too.
 
         Args:
             reason: sent to the robots.
@@ -273,6 +284,9 @@ class NetworkAdapter(Protocol):
             signing_key: an Ed25519 key that signs it.
             estop_id: 32 hex digits, the epoch of the lockout; a fresh one by default.
             remembers: says whether a robot of ``scope`` is known; by default by this network's roster.
+            named: robots that must answer; a network that looks for robots then looks for no further ones.
+            deadline_s: seconds until silence is silence; by default, and where it has its own, the network's.
+            on_progress: called with the answers so far, where the network tells them; it returns at once.
         """
 
     def verdict(self, outcome: StopOutcome) -> Envelope:

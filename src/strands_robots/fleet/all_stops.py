@@ -3,33 +3,35 @@
 from __future__ import annotations
 
 import logging
-import threading
 from collections.abc import Callable, Collection, Sequence
-from functools import partial
 from typing import Any
 
 from strands_robots.envelope import Envelope, error, success
+from strands_robots.errors import UnreachableError
 from strands_robots.fleet.adapter import STOP_S, NetworkAdapter
 from strands_robots.fleet.fleet_verdict import FleetVerdict, NetworkVerdict
-from strands_robots.fleet.network_stop import not_left
 from strands_robots.fleet.networks import CLOSED, Networks
 from strands_robots.fleet.side_by_side import side_by_side
-from strands_robots.fleet.stop_answers import roster_verdict
+from strands_robots.fleet.stop_answers import not_reached, roster_verdict
+from strands_robots.safety.controller import Progress
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.orders import new_epoch
-from strands_robots.safety.roster import Roster
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
-from strands_robots.safety.stop_roster import READ_WITHIN_S, StopOutcome, robots_known_at
+from strands_robots.safety.stop_roster import robots_known_at
 from strands_robots.safety.stopping import StopVerdict
+from strands_robots.utils import plain_text
 
 logger = logging.getLogger(__name__)
+
+OnNetworkProgress = Callable[[str, Progress], None]
+"""Takes the name of a network and the answers on it so far."""
 
 
 def stop_all(networks: Networks, timeout: float = STOP_S, *, known: Sequence[str] = ()) -> FleetVerdict:
     """Stop every robot in reach, without a lockout; never raises for a verdict.
 
     Args:
-        networks: which need not be joined yet.
+        networks: which need not be opened: what is not joined yet is joined for it.
         timeout: seconds in which a robot has to answer.
         known: further robots that must answer.
     """
@@ -38,7 +40,8 @@ def stop_all(networks: Networks, timeout: float = STOP_S, *, known: Sequence[str
         answers, outcome = network.stop_all(timeout)
         return NetworkVerdict(network.name, outcome, answers)
 
-    return FleetVerdict(_on_each(networks, stopped), known=known)
+    reached, unreached = _parted(_on_each(networks, stopped, apart=False))
+    return FleetVerdict(reached, known=known, unreached=unreached)
 
 
 def estop_all(
@@ -50,19 +53,26 @@ def estop_all(
     estop_id: str = "",
     known: Sequence[str] = (),
     ignored: Sequence[str] = (),
+    named: Collection[str] = (),
+    deadline_s: float | None = None,
+    on_progress: OnNetworkProgress = lambda network, progress: None,
 ) -> FleetVerdict:
     """Stop and lock every robot of every network under one id.
 
-    It never raises for a verdict.
+    It never raises for a verdict. Where emergency stops have a connection of their own it leaves at once, whether or
+    not the network is joined.
 
     Args:
-        networks: which need not be joined yet.
+        networks: which need not be opened: what it needs of them is joined for it.
         reason: sent to the robots.
         scope: the robots that it is for. Where none of them is on any network, every robot is stopped.
         signing_key: an Ed25519 private key that signs it.
         estop_id: 32 hex digits, the epoch of the lockout; a fresh one by default.
         known: further robots that must answer.
         ignored: notes on arguments that could not be read, for the verdict.
+        named: robots that must answer, on whichever network; each waits for them, and looks for no further ones.
+        deadline_s: seconds until silence is silence, as :meth:`NetworkAdapter.emergency_stop` has it.
+        on_progress: called on a thread of the stop; it returns at once.
     """
     epoch = estop_id or new_epoch()
 
@@ -70,31 +80,42 @@ def estop_all(
         # Of the robots that a stop means none need be on each network; only where none is on any all are stopped.
         if any(networks.bearers(name) for name in meant.only):
             return True
-        return any(robots_known_at(lambda each=each: each.key)(meant) for each in networks.joined)  # type: ignore[misc]
+        return any(_remembered(each, meant) for each in networks.stated)
 
     def stopped(network: NetworkAdapter) -> NetworkVerdict:
         outcome = network.emergency_stop(
-            reason, scope=scope, signing_key=signing_key, estop_id=epoch, remembers=remembers
+            reason,
+            scope=scope,
+            signing_key=signing_key,
+            estop_id=epoch,
+            remembers=remembers,
+            named=named,
+            deadline_s=deadline_s,
+            on_progress=lambda progress: on_progress(network.name, progress),
         )
-        strange = {name for name in scope.only if network not in networks.bearers(name)}
-        return NetworkVerdict(network.name, outcome, not_here=_not_remembered(network, strange))
+        # A link that is down where devices could be looked for is one to which no robot is connected.
+        return NetworkVerdict(network.name, outcome, absent="" if outcome.report.link else "; ".join(outcome.problems))
 
-    meant = tuple(known) if scope.everything else tuple(scope.only)
-    return FleetVerdict(_on_each(networks, stopped), epoch, meant, ignored)
-
-
-def measured_verdicts(networks: Networks, stop: Callable[[NetworkAdapter], StopOutcome]) -> list[NetworkVerdict]:
-    """Return what ``stop`` measures on each network, as verdicts."""
-    return _on_each(networks, lambda network: NetworkVerdict(network.name, stop(network)))
+    verdicts = _told_once(_on_each(networks, stopped, apart=True), {*scope.only, *named})
+    reached, unreached = _parted(verdicts)
+    meant = {**dict.fromkeys(known if scope.everything else scope.only), **dict.fromkeys(named)}
+    return FleetVerdict(reached, epoch, tuple(meant), ignored, unreached)
 
 
-def unreached(networks: Networks) -> FleetVerdict:
-    """Return the verdict of a stop where no network could be joined.
+def not_left(network: str, key: Callable[[], NetworkKey], why: object) -> NetworkVerdict:
+    """Return the verdict of a network that a stop did not reach.
 
-    It names the robots that this machine remembers there.
+    Args:
+        network: its name.
+        key: returns the name under which its robots are remembered.
+        why: the reason.
     """
-    keys = {each.name: partial(_key, each) for each in networks.stated} | networks.keys
-    return FleetVerdict([not_left(name, key, networks.absent.get(name, CLOSED)) for name, key in keys.items()])
+    said = plain_text(str(why)) or type(why).__name__
+    try:
+        return NetworkVerdict(network, not_reached(key()), absent=said)
+    except Exception as exc:  # noqa: BLE001 - the roster's disk must not hide the verdicts of other networks
+        logger.warning("The roster of %s cannot be read: %s", network, exc)
+        return NetworkVerdict(network, absent=said)
 
 
 def answer_of(verdict: FleetVerdict, networks: Networks) -> Envelope:
@@ -125,54 +146,68 @@ def answer_of(verdict: FleetVerdict, networks: Networks) -> Envelope:
     return (success if verdict.ok else error)(said, **fields)
 
 
-def _on_each(networks: Networks, stop: Callable[[NetworkAdapter], NetworkVerdict]) -> list[NetworkVerdict]:
-    """Stop the robots of each network, side by side, each as soon as it is joined."""
+Stopped = tuple[NetworkVerdict, bool]
+"""Verdict of a network, and whether the stop left on it, or failed there."""
 
-    def stopped(network: NetworkAdapter) -> tuple[NetworkVerdict, bool]:
-        if why := networks.awaited(network):
+
+def _on_each(networks: Networks, stop: Callable[[NetworkAdapter], NetworkVerdict], *, apart: bool) -> list[Stopped]:
+    """Stop the robots of each network, side by side, each as soon as it is joined.
+
+    Args:
+        networks: all of them.
+        stop: stops those of one network.
+        apart: one that has a connection of its own for it is not joined.
+    """
+
+    def stopped(network: NetworkAdapter) -> Stopped:
+        if not (apart and network.has_stop_link) and (why := networks.awaited(network)):
             return not_left(network.name, lambda: network.key, why), False
         try:
-            return stop(network), True
+            verdict = stop(network)
         except Exception as exc:  # noqa: BLE001 - a network that fails must not hide the verdicts of the others
             return not_left(network.name, lambda: network.key, exc), True
+        return verdict, verdict.outcome is None or verdict.outcome.report.link
 
-    networks.check_opened()
     stated = networks.stated
     stops = side_by_side(stopped, stated)
-    # One of them may have come since the stop left.
-    absent = [
-        not_left(name, key, networks.absent.get(name, "it is not joined"))
+    stops += [
+        (not_left(name, key, networks.absent.get(name, "it is not joined")), False)
         for name, key in networks.keys.items()
+        # One of them may have come since the stop left.
         if all(name != each.name for each in stated)
     ]
-    # Of a network whose roster cannot be read it is not known whether a robot is there.
-    not_reached = [*(each for each, left in stops if not left), *absent]
-    reached = [each for each, left in stops if left]
-    return [*reached, *(each for each in not_reached if each.outcome is None or each.outcome.size or not reached)]
+    return stops
 
 
-def _not_remembered(network: NetworkAdapter, robots: Collection[str]) -> frozenset[str]:
-    """Return those robots that this machine does not remember on a network.
-
-    A roster that is not read in time, or cannot be, may have all of them.
-    """
-    rows: list[frozenset[str]] = []
-
-    def read() -> None:
-        try:
-            rows.append(frozenset(row.name for row in Roster.of(network.key).rows))
-        except Exception as exc:  # noqa: BLE001 - then each of them counts
-            logger.warning("The roster of %s cannot be read: %s", network.name, exc)
-
-    if robots:
-        reading = threading.Thread(target=read, name="stop roster", daemon=True)
-        reading.start()
-        reading.join(READ_WITHIN_S)
-    return frozenset(robots) - rows[0] if rows else frozenset()
+def _told_once(verdicts: Sequence[Stopped], named: Collection[str]) -> list[Stopped]:
+    """Return the verdicts; a named robot is silent where it is known, else once."""
+    dropped = [set[str]() for _ in verdicts]
+    for name in named:
+        silent = [at for at, (each, _) in enumerate(verdicts) if name in each.silent]
+        known = [at for at, (each, _) in enumerate(verdicts) if each.has(name)] or silent[:1]
+        for at in {*silent} - {*known}:
+            dropped[at].add(name)
+    return [(each.without(names), left) for (each, left), names in zip(verdicts, dropped, strict=True)]
 
 
-def _key(network: NetworkAdapter) -> NetworkKey:
-    return network.key
+def _parted(verdicts: Sequence[Stopped]) -> tuple[list[NetworkVerdict], list[NetworkVerdict]]:
+    """Return the verdicts that count, and those of gone networks without robots."""
+    reached = any(left for _, left in verdicts)
+    counted, gone = list[NetworkVerdict](), list[NetworkVerdict]()
+    for each, left in verdicts:
+        # Of a network whose roster cannot be read it is not known whether a robot is there.
+        counts = left or not reached or each.outcome is None or each.outcome.size
+        (counted if counts else gone).append(each)
+    return counted, gone
+
+
+def _remembered(network: NetworkAdapter, meant: Scope) -> bool:
+    """Return whether this machine remembers a robot that a scope means on a network."""
+    try:
+        return robots_known_at(lambda: network.key)(meant)
+    except UnreachableError:
+        # The mesh of a profile that could not be joined has no name.
+        return False
 
 
 def _said(verdict: StopVerdict) -> str:

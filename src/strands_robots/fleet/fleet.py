@@ -192,6 +192,7 @@ class Fleet:
         Raises:
             UnreachableError: the fleet is not joined.
         """
+        self._networks.check_opened()
         return stop_all(self._networks, known=tuple(self._robots))
 
     def estop(
@@ -213,6 +214,7 @@ class Fleet:
         Raises:
             UnreachableError: the fleet is not joined.
         """
+        self._networks.check_opened()
         why, cut = stop_reason(reason)
         named = [only] if isinstance(only, str) else only
         scope, unread = stop_scope(named or None, cell)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 from strands_robots.envelope import Envelope
@@ -25,14 +25,12 @@ class NetworkVerdict:
         outcome: measured by the network's roster; None where nothing is known of the network.
         answers: of the robots to a plain stop, by id.
         absent: why it did not leave on this network; empty where it did.
-        not_here: robots that the stop named and this network does not have, whose silence says nothing.
     """
 
     network: str
     outcome: StopOutcome | None = None
     answers: Mapping[str, Envelope] | None = None
     absent: str = ""
-    not_here: frozenset[str] = frozenset()
 
     @property
     def problems(self) -> Sequence[str]:
@@ -48,7 +46,28 @@ class NetworkVerdict:
         if self.outcome is None or not self.outcome.size:
             return frozenset(self.verdicts())
         report = self.outcome.report
-        return frozenset({*report.answered, *report.silent, *report.alarms} - self.not_here | {*report.answered})
+        return frozenset({*report.answered, *report.silent, *report.alarms})
+
+    @property
+    def silent(self) -> Sequence[str]:
+        """Robots that had to answer, and did not."""
+        return self.outcome.report.silent if self.outcome is not None else ()
+
+    def has(self, robot: str) -> bool:
+        """Return whether a robot answered, or is known as one of this network."""
+        outcome = self.outcome
+        return outcome is not None and any(row.name == robot and not row.named for row in outcome.roster.rows)
+
+    def without(self, robots: Collection[str]) -> NetworkVerdict:
+        """Return the verdict without silent robots, which are of another network."""
+        if self.outcome is None or not robots:
+            return self
+        outcome = self.outcome
+        report = replace(outcome.report, silent=tuple(name for name in outcome.report.silent if name not in robots))
+        rows = tuple(row for row in outcome.roster.rows if row.name not in robots)
+        reasons = {name: why for name, why in outcome.reasons.items() if name not in robots}
+        roster = replace(outcome.roster, rows=rows)
+        return replace(self, outcome=replace(outcome, report=report, roster=roster, reasons=reasons))
 
     @property
     def sentence(self) -> str:
@@ -79,7 +98,7 @@ class NetworkVerdict:
         for part in (outcome.others, outcome.report):
             verdicts |= {name: _verdict(name, each) for name, each in part.answered.items()}
             verdicts |= {name: StopVerdict(unknown={name: f"ALARM: {why}"}) for name, why in part.alarms.items()}
-        for name in {*outcome.report.silent} - self.not_here:
+        for name in outcome.report.silent:
             verdicts[name] = StopVerdict(unknown={name: outcome.reasons.get(name, "no answer")})
         for name in outcome.no_stop:
             verdicts.setdefault(name, StopVerdict(unknown={name: "it has no stop"}))
@@ -101,6 +120,7 @@ class FleetVerdict(Mapping[str, StopVerdict]):
 
     Attributes:
         networks: the stop on each network.
+        unreached: networks on which it did not leave, and of which no robot is known.
         estop_id: the epoch of the lockout; empty for a stop without one.
         ignored: notes on arguments that could not be read.
     """
@@ -111,8 +131,10 @@ class FleetVerdict(Mapping[str, StopVerdict]):
         estop_id: str = "",
         known: Sequence[str] = (),
         ignored: Sequence[str] = (),
+        unreached: Sequence[NetworkVerdict] = (),
     ) -> None:
-        self.networks, self.estop_id, self.ignored = tuple(networks), estop_id, tuple(ignored)
+        self.networks, self.unreached = tuple(networks), tuple(unreached)
+        self.estop_id, self.ignored = estop_id, tuple(ignored)
         by_robot: dict[str, list[StopVerdict]] = {name: [] for name in known}
         for each in self.networks:
             for name, verdict in each.verdicts().items():

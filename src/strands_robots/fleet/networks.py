@@ -56,21 +56,29 @@ class _Joining:
         self._again, self._changed = again, changed
         self._lock = threading.Lock()
         self._closing = threading.Event()
-        self._up = False
+        self._begun = self._up = False
 
     @property
     def up(self) -> bool:
         """True while the network is joined."""
         return self._up
 
-    def start(self) -> None:
-        """Join on a thread of its own, or here where the interpreter ends."""
+    def begin(self, *, here: bool = False) -> None:
+        """Join on a thread of its own, or on this one; a second call does nothing."""
+        with self._lock:
+            begun, self._begun = self._begun, True
+        if begun:
+            return
         try:
-            threading.Thread(target=self.run, name=f"join {self.network.name}", daemon=True).start()
+            if not here:
+                threading.Thread(target=self._run, name=f"join {self.network.name}", daemon=True).start()
+                return
         except RuntimeError:
-            self.run()
+            # The interpreter ends and starts no thread.
+            logger.debug("%s is joined on the thread of its caller.", self.network.name)
+        self._run()
 
-    def run(self) -> None:
+    def _run(self) -> None:
         """Join; go on trying where that is wanted."""
         pause = AGAIN_S
         while not self._attempt() and self._again and not self._closing.wait(pause):
@@ -144,6 +152,7 @@ class Networks:
         self.absent: dict[str, str] = dict(absent or {})
         self.keys = dict(keys or {})
         self._stays, self._later = stays, later
+        self._closed = self._waiting = False
         self._left: threading.Event | None = None
         self._joinings: tuple[_Joining, ...] = ()
         self._change = threading.Condition()
@@ -164,15 +173,7 @@ class Networks:
         Raises:
             UnreachableError: none of them can be reached, and they do not stay.
         """
-        self._left = left = threading.Event()
-        self._joinings = tuple(_Joining(each, again=self._stays, changed=self._changed) for each in self.stated)
-        for came in self._later:
-            threading.Thread(target=self._await, args=(came, left), name="await a network", daemon=True).start()
-        if len(self._joinings) == 1 and not self._stays:
-            self._joinings[0].run()
-        else:
-            for each in self._joinings:
-                each.start()
+        self.begin(here=len(self.stated) == 1 and not self._stays)
         with self._change:
             self._change.wait_for(lambda: self.joined or all(each.attempted.is_set() for each in self._joinings))
         unexpected = next((each.unexpected for each in self._joinings if each.unexpected), None)
@@ -180,11 +181,25 @@ class Networks:
             self.close()
             raise unexpected or UnreachableError(self.absences)
 
+    def begin(self, *, here: bool = False) -> None:
+        """Begin to join all networks, and return at once.
+
+        Args:
+            here: join them on this thread, and return once that is over.
+        """
+        self._closed = False
+        for each in self._attempts():
+            each.begin(here=here)
+        with self._change:
+            later, self._waiting, left = self._later if not self._waiting else (), True, self._left
+        for came in later:
+            threading.Thread(target=self._await, args=(came, left), name="await a network", daemon=True).start()
+
     def close(self) -> None:
         """Leave the networks."""
         with self._change:
-            joinings, self._joinings = self._joinings, ()
-            left, self._left = self._left, None
+            self._closed, joinings, self._joinings = True, self._joinings, ()
+            left, self._left, self._waiting = self._left, None, False
             self._told.clear()
         if left is not None:
             left.set()
@@ -221,6 +236,8 @@ class Networks:
         """
         self.check_opened()
         for each in self._joinings:
+            each.begin()
+        for each in self._joinings:
             each.attempted.wait()
         joined = self.joined
         if not joined:
@@ -228,10 +245,14 @@ class Networks:
         return joined
 
     def awaited(self, network: NetworkAdapter) -> str:
-        """Wait for the first attempt to join; return why it is not joined, or ""."""
-        joining = next((each for each in self._joinings if each.network is network), None)
+        """Wait for the first attempt to join; return why it is not joined, or "".
+
+        The attempt is made here where none was begun.
+        """
+        joining = next((each for each in self._attempts() if each.network is network), None)
         if joining is None:
             return CLOSED
+        joining.begin(here=not self._stays)
         joining.attempted.wait()
         return "" if joining.up else joining.why or CLOSED
 
@@ -408,8 +429,9 @@ class Networks:
     def stop(self, robot: str, timeout: float = STOP_S, robot_name: str = "") -> dict[str, Envelope]:
         """Stop every bearer of an id; return the answers by network.
 
-        A network that does not know the robot has no answer; without any the robot is on none of them. It never
-        raises for a network that fails.
+        A network that does not know the robot has no answer; one that remembers it, and where it is silent, has one of
+        unknown outcome. Of a robot that none knows the first network's answer is returned. The networks need not be
+        opened. It never raises for one that fails.
 
         Args:
             robot: its id.
@@ -417,9 +439,13 @@ class Networks:
             robot_name: stops one robot of a world alone.
         """
         alone = len(self.stated) == 1
-        stopped = self._stopped(robot, timeout, robot_name, insist=alone)
+        answers = self._stopped(robot, timeout, robot_name, insist=alone)
+        if alone or any(each.get("stopped") is not None for each in answers.values()):
+            return answers
         # A robot that no network knows may be slow to answer: it is stopped again, and waited for.
-        return stopped or ({} if alone else self._stopped(robot, timeout, robot_name, insist=True))
+        again = self._stopped(robot, timeout, robot_name, insist=True)
+        known = {name: each for name, each in again.items() if name in answers or each.get("stopped") is not None}
+        return {**answers, **known} or dict(list(again.items())[:1])
 
     def halt(self, robot: str, robot_name: str = "") -> StopVerdict:
         """Stop every bearer of an id; return the verdict."""
@@ -489,6 +515,14 @@ class Networks:
 
         return end_all
 
+    def _attempts(self) -> tuple[_Joining, ...]:
+        """Return the attempts to join each network; none once they were left."""
+        with self._change:
+            if self._left is None and not self._closed:
+                self._left = threading.Event()
+                self._joinings = tuple(_Joining(each, again=self._stays, changed=self._changed) for each in self.stated)
+            return self._joinings
+
     def _await(self, came: Callable[[], NetworkAdapter | None], left: threading.Event) -> None:
         """Join a network once it is there."""
         while (network := came()) is None:
@@ -499,7 +533,7 @@ class Networks:
             if left.is_set():
                 return
             self.stated, self._joinings = (*self.stated, network), (*self._joinings, joining)
-        joining.run()
+        joining.begin(here=True)
 
     def _changed(self, joining: _Joining) -> None:
         if joining.up:
@@ -515,15 +549,19 @@ class Networks:
 
     def _stopped(self, robot: str, timeout: float, robot_name: str, *, insist: bool) -> dict[str, Envelope]:
         def stopped(network: NetworkAdapter) -> Envelope | None:
+            answer: Envelope | None = None
             try:
                 # Each stop leaves as soon as its network is up.
-                if why := self.awaited(network):
-                    return error(why, stopped=None) if insist and not self.joined else None
-                return network.stop(robot, timeout, robot_name, insist=insist)
-            except NoSuchRobotError:
-                return None
+                why = self.awaited(network)
+                if not why:
+                    answer = network.stop(robot, timeout, robot_name, insist=insist)
             except Exception as exc:  # noqa: BLE001 - a stop that fails is a verdict, whatever it raised
-                return error(f"{type(exc).__name__}: {exc}", stopped=None)
+                if not isinstance(exc, NoSuchRobotError):
+                    return error(f"{type(exc).__name__}: {exc}", stopped=None)
+                why = ""
+            if insist:
+                return error(why, stopped=None) if why and not self.joined else answer
+            return answer or _silent(network, robot, why)
 
         answers = side_by_side(stopped, self.stated)
         return {each.name: said for each, said in zip(self.stated, answers, strict=True) if said is not None}
@@ -562,6 +600,29 @@ def _bears(network: NetworkAdapter, robot: str) -> bool:
         return network.bears(robot)
     except RefusalError:
         return False
+
+
+def _silent(network: NetworkAdapter, robot: str, why: str) -> Envelope | None:
+    """Return the answer of a silent robot that a network remembers, else None.
+
+    Args:
+        network: where it is remembered.
+        robot: its id.
+        why: the reason why the network is not joined; empty for one that is.
+    """
+    from strands_robots.fleet.stop_answers import not_reached  # noqa: PLC0415 - few stops need it
+
+    try:
+        outcome = not_reached(network.key, left=not why)
+    except Exception as exc:  # noqa: BLE001 - a memory that cannot be read hides no answer of another network
+        logger.warning("The roster of %s cannot be read: %s", network.name, exc)
+        return None
+    # One that said that it left may be on another network now.
+    left = any(row.name == robot and row.departed for row in outcome.roster.rows)
+    if left or robot not in outcome.report.silent:
+        return None
+    reason = "; ".join(filter(None, (why.rstrip("."), outcome.reasons.get(robot, ""))))
+    return error(f"{robot} did not answer: {reason or 'it is remembered there'}.", stopped=None)
 
 
 def _waited_for(robot: str, networks: Sequence[NetworkAdapter], *, every: bool) -> list[NetworkAdapter]:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import Any, NoReturn
 
 from strands_robots import settings
 from strands_robots._mesh_switch import mesh_env_request
@@ -15,10 +15,9 @@ from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH, NetworkAdapter
 from strands_robots.fleet.link_flags import LinkFlags
 from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.profiles import FleetProfile
+from strands_robots.safety import network_key
+from strands_robots.safety.network_key import NetworkKey
 from strands_robots.utils import MissingExtraError, ValidationError
-
-if TYPE_CHECKING:
-    from strands_robots.safety.network_key import NetworkKey
 
 HUB_S = 0.2
 """Seconds in which the mesh's hub on this machine takes a connection."""
@@ -66,7 +65,7 @@ def networks_of(
         networks.append(DeviceConnectNetwork(flags.link(), source, preload=preload or stays))
     else:
         absent[DEVICE_CONNECT] = "the extra device-connect is not installed"
-    stated = None if profile is None else profile.mesh
+    stated = None if profile is None or mesh is False else profile.mesh
     if mesh is False or mesh_env_request() is False:
         absent[MESH] = "it is switched off"
     elif profile is not None and stated is None and mesh is None:
@@ -76,7 +75,7 @@ def networks_of(
         absent[MESH] = "the extra mesh is not installed"
     elif mesh is None and stated is None and (why := _no_hub()):
         # Its code is not loaded: most machines have no mesh.
-        absent[MESH], keys[MESH] = why, _mesh_key
+        absent[MESH], keys[MESH] = why, _mesh_here
         later += [lambda: None if _no_hub() else _mesh(source, None)] if stays else []
     else:
         networks.append(_mesh(source, stated))
@@ -131,12 +130,11 @@ def _no_hub() -> str:
     return ""
 
 
+def _mesh_here() -> NetworkKey:
+    """Return the name of this machine's mesh, as ``mesh.session`` has it."""
+    return NetworkKey.of(network_key.MESH, [f"tcp/127.0.0.1:{settings.integer('STRANDS_MESH_PORT')}"])
+
+
 def _unusable(unfit: Exception) -> NoReturn:
     """Raise what keeps a network from being used, so that its robots are not known."""
     raise unfit
-
-
-def _mesh_key() -> NetworkKey:
-    from strands_robots.mesh.session import network  # noqa: PLC0415 - loaded when it is used
-
-    return network()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 from strands_robots.envelope import Envelope, error, is_error, success, text_of
 from strands_robots.safety.answers import Answer
 from strands_robots.safety.controller import StopReport
+from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.sightings import Known
 from strands_robots.safety.silence import Sending
 from strands_robots.safety.stop_notes import stop_notes
@@ -72,6 +74,18 @@ def measured(
         0.0,
     )
     return with_reasons(roster.outcome(report, sending, problem), answers)
+
+
+def not_reached(network: NetworkKey, *, left: bool = False) -> StopOutcome:
+    """Return the outcome of a stop that no robot answered, with reasons.
+
+    Args:
+        network: whose roster it is. A disk that hangs is waited for within a bound.
+        left: the stop left this machine.
+    """
+    roster = StopRoster(network)
+    threading.Thread(target=roster.read, name="stop roster", daemon=True).start()
+    return measured({}, roster, Sending(left=left))
 
 
 def with_reasons(outcome: StopOutcome, answers: Mapping[str, Envelope], *, plain: bool = False) -> StopOutcome:

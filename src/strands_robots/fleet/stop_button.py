@@ -8,9 +8,10 @@ from collections.abc import Callable, Collection
 from dataclasses import replace
 from typing import Any, Protocol
 
-from strands_robots.safety.controller import OnProgress, Press, Progress, StopReport
+from strands_robots.safety.controller import OnProgress, Progress, StopReport
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.orders import new_epoch
+from strands_robots.safety.presses import Press
 from strands_robots.safety.roster_inbox import OnReport
 from strands_robots.safety.roster_search import RosterSearch
 from strands_robots.safety.scope import EVERY_ROBOT, Scope

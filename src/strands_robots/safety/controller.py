@@ -33,6 +33,7 @@ from strands_robots.safety.identity import KeyFileError
 from strands_robots.safety.missed_stops import ANSWER, QUESTION, MissedStops
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.orders import REASON_MAX, answered_field, new_epoch, params_of, signed_stop
+from strands_robots.safety.presses import Press, Presses
 from strands_robots.safety.question_ports import ControllerPort
 from strands_robots.safety.roster_inbox import OnReport, RosterInbox
 from strands_robots.safety.roster_report import STOP_ROSTER
@@ -77,17 +78,6 @@ SETTLE_S = 1.0
 DEADLINE_S = 3.0
 INBOX_PER_ROBOT = 16
 """Answers of one robot that wait to be graded; a robot answers again at each repetition."""
-
-PRESSES_MAX = 64
-"""Presses remembered, so that a stop that goes on under its id keeps the time of its press."""
-
-
-@dataclass(frozen=True, slots=True)
-class Press:
-    """The moment of a press, in monotonic and in wall-clock seconds."""
-
-    at: float
-    wall: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,7 +191,7 @@ class SafetyController:
         self._changed = threading.Condition()
         self._stops: dict[str, _Running] = {}
         self._ended: _Running | None = None
-        self._presses: dict[str, Press] = {}
+        self._presses = Presses()
         self._closing = threading.Event()
         self._check_in: threading.Thread | None = None
         self._unanswered_s = 0.0
@@ -326,11 +316,7 @@ class SafetyController:
 
         ``stop`` does so by itself. A caller that waits between the press and ``stop`` calls this first.
         """
-        with self._changed:
-            press = self._presses.setdefault(estop_id, Press(time.monotonic(), time.time()))
-            while len(self._presses) > PRESSES_MAX:
-                del self._presses[next(iter(self._presses))]
-        return press
+        return self._presses.note(estop_id)
 
     def expect(self, estop_id: str, names: Collection[str], *, more: bool = False) -> bool:
         """Name further robots that must answer ``estop_id``; False when it is over.

@@ -40,6 +40,7 @@ class RosterRow:
         exemption: of rows of :attr:`Roster.exempt`.
         reported_by: the controller that reported it, "" where this machine heard it.
         enrolled_cell: of its enrolment, "" for none; None where that is unknown.
+        named: nothing is known of it but that the caller of a stop named it.
     """
 
     name: str
@@ -56,6 +57,7 @@ class RosterRow:
     exemption: Exemption | None = None
     reported_by: str = ""
     enrolled_cell: str | None = None
+    named: bool = False
 
     @property
     def last_cell(self) -> str:

@@ -351,7 +351,8 @@ class StopRoster:
                 rows[name] = replace(rows[name], stoppable=True)
         for name in self._named:
             # As surely as if it were enrolled: the caller says so.
-            rows[name] = replace(rows.get(name, RosterRow(name, Known.ENROLLED)), known=Known.ENROLLED, stoppable=True)
+            row = rows.get(name, RosterRow(name, Known.ENROLLED, named=True))
+            rows[name] = replace(row, known=Known.ENROLLED, stoppable=True)
         kept = tuple(row for name, row in marked.items() if name not in rows)
         inside = self._named | dict(answered).keys()
         return replace(

@@ -19,9 +19,9 @@ from typing import Any
 from strands_robots import settings
 from strands_robots.agent_tool import fitted, tool
 from strands_robots.envelope import Envelope, error, success
-from strands_robots.errors import RefusalError, StrandsRobotsError, UnreachableError
+from strands_robots.errors import RefusalError, StrandsRobotsError
 from strands_robots.fleet.adapter import STOP_S, FoundRobot
-from strands_robots.fleet.all_stops import answer_of, estop_all, stop_all, unreached
+from strands_robots.fleet.all_stops import answer_of, estop_all, stop_all
 from strands_robots.fleet.callers import TOOL
 from strands_robots.fleet.fleet_verdict import FleetVerdict
 from strands_robots.fleet.networks import Networks
@@ -169,7 +169,7 @@ def _stop(target: object, arguments: object) -> dict[str, Any]:
         names = [robot] if len(answers) == 1 else [f"{robot} on {network}" for network in answers]
         return combined_verdict(dict(zip(names, answers.values(), strict=True)))
 
-    answer = _asked(stopped, stops=True) if robot else _all_stopped(stop_all)
+    answer = _answer(stopped, stops=True) if robot else _all_stopped(stop_all)
     return noted(answer, unknown, unread)
 
 
@@ -188,24 +188,17 @@ def _emergency_stop(instruction: object, arguments: object) -> dict[str, Any]:
 def _all_stopped(stop: Callable[[Networks], FleetVerdict]) -> Envelope:
     """Return the answer to a stop of all; it names the robots of gone networks."""
 
-    def stopped(there: Networks) -> Envelope:
-        try:
-            there.open()
-        except UnreachableError:
-            return answer_of(unreached(there), there)
-        return answer_of(stop(there), there)
-
-    return _answer(stopped, stops=True)
+    return _answer(lambda there: answer_of(stop(there), there), stops=True)
 
 
-def _asked(work: Callable[[Networks], Envelope], *, stops: bool = False) -> Envelope:
+def _asked(work: Callable[[Networks], Envelope]) -> Envelope:
     """Return what ``work`` answers on networks that are joined; as :func:`_answer`."""
 
     def joined(there: Networks) -> Envelope:
         there.open()
         return work(there)
 
-    return _answer(joined, stops=stops)
+    return _answer(joined, stops=False)
 
 
 def _answer(work: Callable[[Networks], Envelope], *, stops: bool) -> Envelope:

@@ -21,7 +21,7 @@ from strands_robots.errors import (
 from strands_robots.fleet.adapter import CLOSED, DEVICE_CONNECT, FIND_S, STOP_S, FoundRobot, OnEvent, ReceivedCall
 from strands_robots.fleet.link_flags import described
 from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope
-from strands_robots.utils import ValidationError, plain_text
+from strands_robots.utils import ValidationError, device_id, plain_text
 
 if TYPE_CHECKING:
     from strands_robots.device_connect.backends import LinkConfig
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from strands_robots.fleet.cached_keys import CachedKeys
     from strands_robots.fleet.lockout_report import LockoutReport, Resumed
     from strands_robots.fleet.stop_button import StopSender
+    from strands_robots.safety.controller import OnProgress
     from strands_robots.safety.network_key import NetworkKey
     from strands_robots.safety.stop_roster import StopOutcome
     from strands_robots.serving.advertised import AdvertisedVerb
@@ -59,44 +60,45 @@ class DeviceConnectNetwork:
     """
 
     name = DEVICE_CONNECT
+    has_stop_link = True
     announces_verbs = True
     reads: Mapping[str, str] = {"status": "getStatus", "state": "getState", "features": "getFeatures"}
     starts = "execute"
 
     def __init__(self, link: LinkConfig, source: str, *, preload: bool = False) -> None:
-        from strands_robots.device_connect.client import FleetClient  # noqa: PLC0415 - loaded when it is used
-
-        self._take(FleetClient(link, source), joined=False)
-        self._preload = preload
-
-    @classmethod
-    def joined(cls, client: FleetClient) -> Self:
-        """Return the network of a connected client, which is closed by whoever opened it."""
-        network = cls.__new__(cls)
-        network._take(client, joined=True)
-        return network
-
-    def _take(self, client: FleetClient, *, joined: bool) -> None:
-        self._client, self._open, self._given = client, joined, joined
+        self._link, self._source, self._preload = link, device_id("source", source), preload
+        self._client: FleetClient | None = None
+        self._given = False
         self._peers: dict[str, Peer] = {}
         self._discoveries = 0
         self._keys: CachedKeys | None = None
 
+    @classmethod
+    def joined(cls, client: FleetClient) -> Self:
+        """Return the network of a connected client, which is closed by its owner."""
+        network = cls(client.link, client.source)
+        network._client, network._given = client, True
+        return network
+
     def open(self) -> None:
         """Connect; raise :class:`UnreachableError` where that fails."""
+        if self._given:
+            return
         from device_connect_edge.messaging import MessagingError  # noqa: PLC0415 - loaded when it is used
+
+        from strands_robots.device_connect import FleetClient  # noqa: PLC0415 - as above
 
         if self._preload:
             import strands_robots.device_connect.safety_controller  # noqa: PLC0415
             import strands_robots.fleet.device_connect.stops  # noqa: PLC0415, F401
 
+        # A client connects once: each attempt has its own.
+        client = FleetClient(self._link, self._source)
         try:
-            self._client.__enter__()
+            client.__enter__()
         except (MessagingError, TimeoutError, OSError) as exc:
-            # A client connects once; the next attempt has one of its own.
-            self._client = type(self._client)(self._client.link, self._client.source)
             raise UnreachableError(plain_text(str(exc))) from exc
-        self._open = True
+        self._client = client
 
     def find(self, timeout: float = FIND_S) -> list[FoundRobot]:
         """Return the devices of the tenant."""
@@ -119,7 +121,8 @@ class DeviceConnectNetwork:
 
     def bears(self, robot: str) -> bool:
         """Return whether a device of this id was found or has announced itself."""
-        return robot in self._peers or (self._open and robot in self._client.known())
+        client = self._client
+        return robot in self._peers or (client is not None and robot in client.known())
 
     def reaches(self, robot: str) -> bool:
         """Return whether a device of this id is known, answers, or is slow to answer."""
@@ -140,7 +143,7 @@ class DeviceConnectNetwork:
         from strands_robots.safety.identity import KeyFileError  # noqa: PLC0415 - as above
 
         try:
-            return enrolled_keys(self._client.link).get(robot)
+            return enrolled_keys(self._link).get(robot)
         except KeyFileError as exc:
             logger.warning("%s So none counts.", exc)
             return None
@@ -187,16 +190,10 @@ class DeviceConnectNetwork:
         unknown = answer.get("status") == "error" and answer.get("stopped") is None
         return None if unknown and not insist and not self.bears(robot) else answer
 
-    def silence(self, robot: str) -> str:
-        """Return what this machine remembers of the device's last messages."""
-        from strands_robots.fleet.device_connect.stops import silence_of  # noqa: PLC0415 - a call need not load it
-
-        return silence_of(self._connected, robot)
-
     def received(self, robot: str, verb: str, arguments: Mapping[str, Any]) -> ReceivedCall:
         """Return the call as it is: a device receives what was sent."""
         del robot
-        return ReceivedCall(self._client.source, verb, arguments)
+        return ReceivedCall(self._source, verb, arguments)
 
     async def call_async(self, robot: str, verb: str, arguments: Mapping[str, Any], within: float) -> Envelope:
         """Call a function of the device."""
@@ -222,17 +219,28 @@ class DeviceConnectNetwork:
         """The name of the tenant's network."""
         from strands_robots.fleet.device_connect.stops import network_key  # noqa: PLC0415 - a call need not load it
 
-        return network_key(self._client.link)
+        return network_key(self._link)
 
     @property
     def reach(self) -> str:
         """The link in words."""
-        return described(self._client.link)
+        return described(self._link)
+
+    @property
+    def on_this_machine(self) -> bool:
+        """True for a link that does not leave this machine."""
+        return self._link.loopback_only
+
+    @property
+    def meeting_port(self) -> int | None:
+        """The loopback port where robots meet."""
+        return self._link.meet_port
 
     @property
     def stale(self) -> str:
         """Reason why the registry's list may lack devices, or ""."""
-        return self._client.stale
+        client = self._client
+        return client.stale if client is not None else ""
 
     def stop_all(self, timeout: float = STOP_S) -> tuple[dict[str, Envelope], StopOutcome]:
         """Stop each device when it is found."""
@@ -249,6 +257,9 @@ class DeviceConnectNetwork:
         signing_key: Any = None,
         estop_id: str = "",
         remembers: Remembers | None = None,
+        named: Collection[str] = (),
+        deadline_s: float | None = None,
+        on_progress: OnProgress = lambda progress: None,
     ) -> StopOutcome:
         """Stop and lock the robots of the tenant, on a connection of its own.
 
@@ -258,12 +269,17 @@ class DeviceConnectNetwork:
 
         with _carried():
             return stopped_and_locked(
-                self._connected,
+                self._link,
+                self._source,
+                self._lent,
                 reason,
-                scope=scope,
+                scope,
                 signing_key=signing_key,
                 estop_id=estop_id,
                 remembers=remembers,
+                named=named,
+                deadline_s=deadline_s,
+                on_progress=on_progress,
             )
 
     def verdict(self, outcome: StopOutcome) -> Envelope:
@@ -277,9 +293,9 @@ class DeviceConnectNetwork:
         """Make a controller with a connection of its own; the network need not be joined."""
         from strands_robots.device_connect.safety_controller import safety_controller, stand  # noqa: PLC0415 - as above
 
-        link = self._client.link
+        link = self._link
         controller = safety_controller(
-            self._client.source, link, signing_key=signing_key, require_signed=signing_key is not None, stands=True
+            self._source, link, signing_key=signing_key, require_signed=signing_key is not None, stands=True
         )
         with closing(controller), closing(stand(controller, link, known)):
             yield controller
@@ -309,7 +325,7 @@ class DeviceConnectNetwork:
         from strands_robots.fleet.lockout_report import LockoutReport  # noqa: PLC0415 - as above
 
         if self._keys is None:
-            self._keys = CachedKeys(lambda: usable_keys(self._client.link))
+            self._keys = CachedKeys(lambda: usable_keys(self._link))
         try:
             return await ask_robot(self._connected, robot, within, self._keys.read())
         except UnreachableError as exc:
@@ -341,9 +357,21 @@ class DeviceConnectNetwork:
 
     def close(self) -> None:
         """Disconnect."""
-        if not self._given:
-            self._open = False
-            self._client.close()
+        if self._client is not None and not self._given:
+            client, self._client = self._client, None
+            client.close()
+
+    @contextmanager
+    def _lent(self) -> Iterator[FleetClient]:
+        """Lend the joined client, or one for the length of the block."""
+        client = self._client
+        if client is not None:
+            yield client
+            return
+        from strands_robots.device_connect import FleetClient  # noqa: PLC0415 - loaded when it is used
+
+        with FleetClient(self._link, self._source) as own:
+            yield own
 
     @contextmanager
     def _asked(self, robot: str, verb: str) -> Iterator[None]:
@@ -362,7 +390,7 @@ class DeviceConnectNetwork:
 
     @property
     def _connected(self) -> FleetClient:
-        if not self._open:
+        if self._client is None:
             raise UnreachableError("Device Connect is not joined: use the fleet as a context manager")
         return self._client
 

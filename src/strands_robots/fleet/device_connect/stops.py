@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable, Collection
+from concurrent.futures import Future
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from strands_robots.envelope import Envelope
 from strands_robots.fleet.adapter import FIND_S, STOP_S
-from strands_robots.fleet.emergency_stop import Devices, EmergencyStop
 from strands_robots.fleet.stop_answers import measured, roster_verdict, with_plain_stops, with_reasons
-from strands_robots.safety.roster_search import FoundDevices
+from strands_robots.safety.controller import OnProgress, Progress, StopReport
+from strands_robots.safety.orders import new_epoch
+from strands_robots.safety.roster_search import FoundDevices, RosterSearch
 from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope
 from strands_robots.safety.silence import Sending
 from strands_robots.safety.stop_roster import StopOutcome, StopRoster
@@ -23,8 +27,14 @@ if TYPE_CHECKING:
 ESTOP_S = 1.5
 """Seconds in which robots answer an emergency stop; it is repeated until then."""
 
+LINK_WAIT_S = 2.0
+"""Longest wait for the connection of an emergency stop, after which its deadline counts."""
+
 SEARCH_SHARE = 2 / 3
-"""Part of the deadline in which devices are looked for; the rest is for their answers."""
+"""Part of a deadline in which devices are looked for; the rest is for their answers."""
+
+Connect = Callable[[], AbstractContextManager["FleetClient"]]
+"""Connects a client for the length of a block, or lends one that is connected."""
 
 
 def stop_everything(fleet: FleetClient) -> Envelope:
@@ -45,88 +55,180 @@ def stop_found(fleet: FleetClient, seconds: float) -> tuple[dict[str, Envelope],
     return answers, outcome
 
 
-def silence_of(fleet: FleetClient, device: str) -> str:
-    """Return why a robot of the roster may be silent; "" for another name."""
-    roster = StopRoster(network_key(fleet.link))
-    roster.read()
-    return measured({}, roster, Sending(tells=fleet.link.transport == "nats")).reasons.get(device, "")
-
-
 def stop_and_lock(fleet: FleetClient, reason: str, scope: Scope = EVERY_ROBOT) -> Envelope:
-    """Send an emergency stop under the client's name; answers by name.
-
-    A device of its scope that is in reach and did not answer it gets a plain ``stop`` as well. The roster must answer.
-    """
+    """Send an emergency stop under the name of a connected client; answers by name."""
     from strands_robots.device_connect.safety_controller import outcome_envelope  # noqa: PLC0415 - the network is loaded when it is used
 
-    return outcome_envelope(stopped_and_locked(fleet, reason, scope=scope))
+    return outcome_envelope(stopped_and_locked(fleet.link, fleet.source, lambda: nullcontext(fleet), reason, scope))
 
 
 def stopped_and_locked(
-    fleet: FleetClient,
+    link: LinkConfig,
+    source: str,
+    connect: Connect,
     reason: str,
-    *,
     scope: Scope = EVERY_ROBOT,
+    *,
     signing_key: Any = None,
     estop_id: str = "",
     remembers: Remembers | None = None,
+    named: Collection[str] = (),
+    deadline_s: float | None = None,
+    on_progress: OnProgress = lambda progress: None,
 ) -> StopOutcome:
-    """Do as :func:`stop_and_lock`; return the outcome.
+    """Send an emergency stop at once, on a connection of its own; return the outcome.
+
+    Devices are looked for meanwhile. One of the scope that is in reach and did not act on it gets a plain ``stop`` as
+    well. The roster must answer.
 
     Args:
-        fleet: a connected client.
+        link: the network.
+        source: the name under which it is sent.
+        connect: gives the client that looks for devices, and stops those.
         reason: sent to the robots.
         scope: the robots that it is for.
         signing_key: signs it; then only enrolled robots can confirm it.
         estop_id: 32 hex digits; a fresh one by default.
         remembers: says whether a robot of ``scope`` is known; by default by this machine's roster.
+        named: robots that must answer besides the roster; then no further ones are looked for.
+        deadline_s: seconds from when the link is up in which robots answer; then a plain stop has as many.
+        on_progress: called with the answers so far.
     """
     from strands_robots.device_connect.safety_controller import safety_controller  # noqa: PLC0415 - the network is loaded when it is used
 
     options: dict[str, Any] = {} if signing_key is None else {"signing_key": signing_key, "require_signed": True}
     options |= {} if remembers is None else {"remembers": remembers}
-    controller = safety_controller(fleet.source, fleet.link, **options)
-    devices = lambda begun: _in_reach(fleet)  # noqa: E731 - the client is connected, so it searches at once
+    controller = safety_controller(source, link, **options)
+    seconds = ESTOP_S if deadline_s is None else deadline_s
+    look_s = FIND_S if deadline_s is None else min(FIND_S, deadline_s * SEARCH_SHARE)
+    lookup = None if named else _Lookup(connect, look_s)
     try:
-        stop = EmergencyStop(
-            controller,
-            network_key(fleet.link),
+        estop_id = estop_id or new_epoch()
+        controller.press(estop_id)
+        look_up = None if lookup is None else lookup.found.result
+        search = RosterSearch(controller, estop_id, network_key(link), look_up, scope, named=named)
+        if lookup is not None:
+            lookup.start(search)
+
+        def progressed(progress: Progress) -> None:
+            search.begin(progress)
+            if lookup is not None:
+                lookup.stop_has_left()
+            on_progress(progress)
+
+        # Nothing can leave before the link is up; then the milliseconds are the robots' and not the handshake's.
+        controller.wait_link(LINK_WAIT_S)
+        report = controller.stop(
+            named,
             reason,
-            ESTOP_S,
-            devices=devices,
-            scope=scope,
+            deadline_s=seconds,
             estop_id=estop_id,
+            more=True,
+            on_progress=progressed,
+            on_report=search.take,
+            scope=scope,
         )
-        report = stop.report.result()
     finally:
+        if lookup is not None:
+            lookup.end()
         controller.close()
-    rest = stop.unanswered(report)
-    # What has not stopped yet waits for no disk.
-    answers = fleet.stop_each(rest, STOP_S) if rest else {}
-    outcome = stop.measured(report)
+    search.start()
+    rest = [] if lookup is None else _unanswered(search, lookup, report, deadline_s)
+    answers: dict[str, Envelope] = {}
+    if rest:
+        # What has not stopped yet waits for no disk.
+        with connect() as fleet:
+            answers = fleet.stop_each(rest, STOP_S if deadline_s is None else min(STOP_S, deadline_s))
+    sending = replace(controller.sending, left=report.link)
+    outcome = _measured(search, report, sending)
     if rest:
         report = with_plain_stops(report, outcome, answers)
-        outcome = with_reasons(stop.measured(report), answers, plain=True)
-    stop.record(outcome, report)
+        outcome = with_reasons(_measured(search, report, sending), answers, plain=True)
+    outcome.record(controller.controller_id)
+    search.roster.remember(report)
     return replace(outcome, not_locked=tuple(rest))
 
 
-def devices_on(link: LinkConfig, deadline_s: float) -> Devices:
-    """Return the search for the devices of a network, on a connection of its own.
+class _Lookup:
+    """Search for the devices in reach, which begins once an emergency stop has left.
 
-    Args:
-        link: the network.
-        deadline_s: of the stop that they must answer; most of it is left for their answers.
+    One that fails is tried once more: a network may not be there yet.
     """
 
-    def found(begun: threading.Event) -> FoundDevices:
-        from strands_robots.device_connect import FleetClient  # noqa: PLC0415 - the network is loaded when it is used
+    def __init__(self, connect: Connect, seconds: float) -> None:
+        self.found: Future[FoundDevices] = Future()
+        self._connect, self._seconds = connect, seconds
+        self._begins, self._over = threading.Event(), threading.Event()
+        self._left = False
 
-        with FleetClient(link) as fleet:
-            begun.wait()
-            return _in_reach(fleet, min(FIND_S, deadline_s * SEARCH_SHARE), thorough=True)
+    def start(self, search: RosterSearch) -> None:
+        """Connect now, and search once the stop has left."""
+        self._search = search
+        threading.Thread(target=self._run, name="estop lookup", daemon=True).start()
 
-    return found
+    def stop_has_left(self) -> None:
+        """Begin the search; a second call does nothing."""
+        if not self._left:
+            self._left = True
+            threading.Thread(target=self._begin, name="estop lookup", daemon=True).start()
+
+    def end(self) -> None:
+        """Leave no search waiting, and try none again."""
+        self._over.set()
+        self._begins.set()
+
+    def _begin(self) -> None:
+        # What a search hears is written into the memory that the roster is read from, so that is read before.
+        self._search.roster.wait_until_read()
+        self._begins.set()
+
+    def _run(self) -> None:
+        for last in (False, True):
+            try:
+                self.found.set_result(self._devices())
+            except BaseException as exc:  # noqa: BLE001 - raised again by the future; a binding's panic is no Exception
+                self._search.failed(exc)
+                # A network that is not there yet is asked again once the stop has begun.
+                self._begins.wait()
+                if last or self._over.is_set():
+                    self.found.set_exception(exc)
+                    return
+            else:
+                return
+
+    def _devices(self) -> FoundDevices:
+        with self._connect() as fleet:
+            self._begins.wait()
+            peers = fleet.peers(self._seconds, thorough=True)
+            return FoundDevices({peer.id: (peer.stop_verb is not None, peer.cell) for peer in peers}, fleet.stale)
+
+
+def _unanswered(search: RosterSearch, lookup: _Lookup, report: StopReport, within: float | None) -> list[str]:
+    """Return the devices in reach that can be stopped, and did not act on a stop.
+
+    It waits for the search as long as ``within``, and not where the stop did not leave.
+    """
+    try:
+        found = lookup.found.result(within if report.link else 0)
+    except KeyboardInterrupt:
+        raise
+    except BaseException:  # noqa: BLE001 - logged by the search, and told by the outcome
+        return []
+    search.complete(found)
+    answered = {*report.stopped, *report.not_stopped, *report.refused}
+    scope = EVERY_ROBOT if report.widened else search.scope
+    return [
+        name
+        for name, (stops, cell) in found.devices.items()
+        if stops and name not in answered and scope.covers(name, {cell or ""} - {""})
+    ]
+
+
+def _measured(search: RosterSearch, report: StopReport, sending: Sending) -> StopOutcome:
+    """Return the report of a stop, measured by its roster."""
+    why = search.problem
+    problem = f"The robots that must answer could not be looked up: {why}." if why else ""
+    return search.roster.outcome(report, sending, problem)
 
 
 def network_key(link: LinkConfig) -> NetworkKey:
@@ -134,8 +236,3 @@ def network_key(link: LinkConfig) -> NetworkKey:
     from strands_robots.device_connect.enrollment import network_of  # noqa: PLC0415 - the network is loaded when it is used
 
     return network_of(link)
-
-
-def _in_reach(fleet: FleetClient, timeout: float = FIND_S, **options: bool) -> FoundDevices:
-    peers = fleet.peers(timeout, **options)
-    return FoundDevices({peer.id: (peer.stop_verb is not None, peer.cell) for peer in peers}, fleet.stale)

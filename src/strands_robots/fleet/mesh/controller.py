@@ -11,9 +11,10 @@ from strands_robots.fleet.mesh.lockouts import lockable_peers
 from strands_robots.fleet.mesh.standing import MeshReports, mesh_network
 from strands_robots.fleet.stop_answers import stop_outcome
 from strands_robots.safety.answers import Answer
-from strands_robots.safety.controller import PRESSES_MAX, OnProgress, Press, Progress, StopReport
+from strands_robots.safety.controller import OnProgress, Progress, StopReport
 from strands_robots.safety.orders import new_epoch
 from strands_robots.safety.peer_answers import enrolled_peers, stop_distrust
+from strands_robots.safety.presses import Press, Presses
 from strands_robots.safety.roster_inbox import OnReport
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.safety.silence import Sending
@@ -36,7 +37,7 @@ class MeshController:
     def __init__(self, mesh: Mesh, signing_key: Any = None) -> None:
         self._mesh = mesh
         self._key = signing_key
-        self._presses: dict[str, Press] = {}
+        self._presses = Presses()
         self._keys = enrolled_peers()
         self._named: dict[str, frozenset[str]] = {}
         self.controller_id, self.network = mesh.peer_id, mesh_network()
@@ -51,10 +52,7 @@ class MeshController:
 
     def press(self, estop_id: str) -> Press:
         """Note the moment of a press, from which its answers are counted."""
-        press = self._presses.setdefault(estop_id, Press(time.monotonic(), time.time()))
-        while len(self._presses) > PRESSES_MAX:
-            del self._presses[next(iter(self._presses))]
-        return press
+        return self._presses.note(estop_id)
 
     def check_in_every(self, interval_s: float) -> None:
         """Check in with the robots that need a live controller."""

@@ -36,6 +36,7 @@ from strands_robots.fleet.mesh_settings import MeshSettings
 from strands_robots.fleet.refusals import refusal_of_text
 from strands_robots.fleet.stop_answers import roster_verdict
 from strands_robots.fleet.stop_button import StopSender
+from strands_robots.safety.controller import OnProgress
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.peer_answers import enrolled_peers, lockout_distrust
 from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope
@@ -69,6 +70,7 @@ class MeshNetwork:
     """
 
     name = MESH
+    has_stop_link = False
     announces_verbs = False
     reads: Mapping[str, str] = {"status": "status", "state": "state", "features": "features"}
     starts = "start"
@@ -246,11 +248,6 @@ class MeshNetwork:
         reply = self._joined_mesh.send(robot, {"action": "stop", **one}, timeout)
         return stop_answer(robot, reply, enrolled_peers())
 
-    def silence(self, robot: str) -> str:
-        """Return "": the mesh knows no reason before its roster was asked."""
-        del robot
-        return ""
-
     def received(self, robot: str, verb: str, arguments: Mapping[str, Any]) -> ReceivedCall:
         """Return the call with the defaults of an action of ours."""
         from strands_robots.mesh.security import validate_command  # noqa: PLC0415 - loaded when it is used
@@ -305,6 +302,16 @@ class MeshNetwork:
         return "They were looked for on the native mesh."
 
     @property
+    def on_this_machine(self) -> bool:
+        """False: a hub may relay for other machines."""
+        return False
+
+    @property
+    def meeting_port(self) -> int | None:
+        """None: the hub may be another user's peer."""
+        return None
+
+    @property
     def stale(self) -> str:
         """Nothing: each peer announces itself."""
         return ""
@@ -322,11 +329,20 @@ class MeshNetwork:
         signing_key: Any = None,
         estop_id: str = "",
         remembers: Remembers | None = None,
+        named: Collection[str] = (),
+        deadline_s: float | None = None,
+        on_progress: OnProgress = lambda progress: None,
     ) -> StopOutcome:
-        """Stop and lock the peers; the mesh carries no reason."""
-        del reason
+        """Stop and lock the peers; the mesh carries no reason, and tells no progress."""
+        del reason, deadline_s, on_progress  # the mesh's own deadlines count
         return lock_peers(
-            self._joined_mesh, signing_key, scope, estop_id=estop_id, since=self._fresh, remembers=remembers
+            self._joined_mesh,
+            signing_key,
+            scope,
+            estop_id=estop_id,
+            since=self._fresh,
+            remembers=remembers,
+            named=named,
         )
 
     def verdict(self, outcome: StopOutcome) -> Envelope:

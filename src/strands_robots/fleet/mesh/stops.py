@@ -55,6 +55,7 @@ def lock_peers(
     estop_id: str = "",
     since: float | None = None,
     remembers: Remembers | None = None,
+    named: Collection[str] = (),
 ) -> StopOutcome:
     """Send the mesh's emergency stop, again while a peer has not confirmed it.
 
@@ -67,10 +68,11 @@ def lock_peers(
         estop_id: 32 hex digits; a fresh one by default.
         since: as in :func:`stop_peers`.
         remembers: says whether a robot of ``scope`` is known; by default by this machine's roster.
+        named: robots that must answer besides the roster.
     """
     epoch = estop_id or new_epoch()
     reports = MeshReports(mesh)
-    roster = StopRoster(mesh_network(), scope=scope)
+    roster = StopRoster(mesh_network(), named, scope)
     reports.inbox.open(epoch, roster.take)
     listening: list[threading.Thread] = []
 
