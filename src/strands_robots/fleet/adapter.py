@@ -226,7 +226,7 @@ class NetworkAdapter(Protocol):
         """Return a call as the robot receives it; asks no one.
 
         Raises:
-            ValidationError: it would refuse the arguments.
+            RefusalError: it would refuse the arguments.
         """
 
     async def call_async(self, robot: str, verb: str, arguments: Mapping[str, Any], within: float) -> Envelope:

@@ -573,7 +573,7 @@ class Networks:
         return {each.name: said for each, said in zip(self.stated, answers, strict=True) if said is not None}
 
     def _at_once(self, robot: str, *, moves: bool) -> NetworkAdapter | None:
-        """Return the network that a call goes to, where that is known; asks no one."""
+        """Return the network of a robot where it is known without a question."""
         joined = self.joined
         if len(joined) == 1 and all(each.attempted.is_set() for each in self._joinings):
             return joined[0]

@@ -84,12 +84,17 @@ def said(refusal: RefusalError) -> str:
     return f"{why} {refusal.remedy}" if isinstance(refusal, NoSuchRobotError) and refusal.remedy else why
 
 
+def answer_to(refusal: RefusalError) -> Envelope:
+    """Return a refusal as an answer of status error: the robot's own, or its words."""
+    return refusal.envelope or error(said(refusal))
+
+
 async def answered(call: Awaitable[Envelope]) -> Envelope:
     """Await a call; return a refusal as an answer of status error."""
     try:
         return await call
     except RefusalError as refusal:
-        return refusal.envelope or error(said(refusal))
+        return answer_to(refusal)
 
 
 def refusal_of(robot: str, verb: str, answer: Mapping[str, Any]) -> RefusalError:

@@ -397,7 +397,7 @@ class DeviceConnectNetwork:
 
     @contextmanager
     def _asked(self, robot: str, verb: str) -> Iterator[None]:
-        """Raise a failure as a :class:`RefusalError`; forget a device that is gone."""
+        """Raise refusals for a call's exceptions; forget a device that is gone."""
         try:
             yield
         except RefusalError:

@@ -217,7 +217,7 @@ class MeshNetwork:
         reply = mesh.send(robot, {**arguments, "action": action}, timeout if there else min(timeout, STOP_S))
         if reply.get("type") == "response":
             result = reply.get("result")
-            return dict(result) if isinstance(result, Mapping) else {"result": result}
+            return _named_as(verb, result) if isinstance(result, Mapping) else {"result": result}
         if self._mesh is None:
             raise NoAnswerError(CLOSED, robot=robot, verb=verb)
         if reply.get("status") == "timeout":
@@ -244,13 +244,16 @@ class MeshNetwork:
         return stop_answer(robot, reply, enrolled_peers())
 
     def received(self, robot: str, verb: str, arguments: Mapping[str, Any]) -> ReceivedCall:
-        """Return the call with the action's defaults, of an own verb as it is."""
+        """Return the call with the defaults of an action of ours."""
         from strands_robots.mesh.security import validate_command  # noqa: PLC0415 - loaded when it is used
         from strands_robots.serving.verbs import LEASE_NAMES  # noqa: PLC0415 - as above
 
         mesh, action = self._joined_mesh, self._action(robot, verb)
         given = self._given_to(robot, action, arguments)
-        sent = given if self._owns(robot, action) else validate_command({**given, "action": action})
+        try:
+            sent = given if self._owns(robot, action) else validate_command({**given, "action": action})
+        except ValidationError as exc:
+            raise ArgumentsError(str(exc), robot=robot, verb=verb) from exc
         left_out = LEASE_NAMES | {"action"}
         return ReceivedCall(mesh.peer_id, action, {name: value for name, value in sent.items() if name not in left_out})
 
@@ -262,7 +265,7 @@ class MeshNetwork:
         return await self._requests.call(lambda: self.call(robot, verb, self._given_to(robot, verb, arguments), within))
 
     async def describe_async(self, robot: str, within: float) -> FoundRobot:
-        """Return the peer with its functions, of an older one those of its kind."""
+        """Return the peer as it describes itself, an older one by its kind."""
         try:
             functions = (await self.call_async(robot, "describe", {}, within)).get("functions")
         except UnknownVerbError:
@@ -440,9 +443,19 @@ class MeshNetwork:
         return isinstance(own, list) and verb in own
 
     def _given_to(self, robot: str, verb: str, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-        if self._mesh is None or self._owns(robot, verb):
+        """Return the arguments that an action of ours is sent with."""
+        from strands_robots.serving.known_verbs import STOPS  # noqa: PLC0415 - loaded when it is used
+        from strands_robots.serving.peer_verbs import PEER_VERBS  # noqa: PLC0415 - as above
+
+        mesh = self._mesh
+        if mesh is None or self._owns(robot, verb):
             return arguments
-        return {name: value for name, value in arguments.items() if value not in ("", None)}
+        given = {name: value for name, value in arguments.items() if value not in ("", None)}
+        known, names = PEER_VERBS.get(verb), (mesh.get_peer(robot) or {}).get("sim_robots")
+        # Where none is named the first robot of a world is meant; a stop then means all of them.
+        if known is not None and "robot_name" in known.by_name and verb not in STOPS and isinstance(names, list):
+            given = {"robot_name": next(iter(names), ""), **given}
+        return given
 
     def _waited_for(self, robot: str, longest: float = math.inf) -> bool:
         """Return whether the peer is in reach, once that can be known."""
@@ -472,6 +485,15 @@ def _carried(robot: str, verb: str, arguments: Mapping[str, Any]) -> Mapping[str
     if problem and verb != "stop":
         raise ArgumentsError(problem, robot=robot, verb=verb)
     return {} if problem else arguments
+
+
+def _named_as(verb: str, result: Mapping[str, Any]) -> Envelope:
+    """Return an answer with the fields that its verb has on Device Connect."""
+    rows = result.get("policies")
+    if verb != "getStatus" or not isinstance(rows, list):
+        return dict(result)
+    running = {str(row.get("robot", "")): row for row in rows if isinstance(row, Mapping)}
+    return {**result, "running_policies": running}
 
 
 def _has_robot(row: Mapping[str, Any]) -> bool:
