@@ -26,7 +26,7 @@ from strands_robots.fleet.adapter import CLOSED, FIND_S, MESH, STOP_S, FoundRobo
 from strands_robots.fleet.lockout_report import LockoutReport, Resumed
 from strands_robots.fleet.mesh.controller import MeshController
 from strands_robots.fleet.mesh.descriptions import functions_of, functions_of_each, functions_of_kind
-from strands_robots.fleet.mesh.discovery import awaited, discover, in_reach, is_in_reach
+from strands_robots.fleet.mesh.discovery import CALLER, awaited, discover, has_robot, in_reach, is_in_reach
 from strands_robots.fleet.mesh.events import follow
 from strands_robots.fleet.mesh.lockouts import ask_peers, lockable_peers, resume_peers
 from strands_robots.fleet.mesh.requests import PeerRequests
@@ -110,7 +110,7 @@ class MeshNetwork:
         from strands_robots.mesh.wire_identity import IdentityError, visitor_id  # noqa: PLC0415 - as above
 
         try:
-            mesh = Mesh(None, visitor_id(self._source), "tool", parts=Parts(acquire=session.dial))
+            mesh = Mesh(None, visitor_id(self._source), CALLER, parts=Parts(acquire=session.dial))
             try:
                 mesh.start()
             except BaseException:
@@ -132,7 +132,7 @@ class MeshNetwork:
                 world=world if (world := name.rpartition("__")[0]) in rows else "",
             )
             for name, row in rows.items()
-            if _has_robot(row)
+            if has_robot(row)
         ]
 
     def listed(self, timeout: float | None = None) -> list[FoundRobot]:
@@ -154,12 +154,12 @@ class MeshNetwork:
 
     def announced(self) -> Collection[str]:
         """Return the robots in reach."""
-        return [str(row["peer_id"]) for row in self._rows() if _has_robot(row)]
+        return [str(row["peer_id"]) for row in self._rows() if has_robot(row)]
 
     def bears(self, robot: str) -> bool:
         """Return whether a robot of this id is in reach."""
         mesh = self._joined_mesh
-        return is_in_reach(mesh, robot) and _has_robot(mesh.get_peer(robot) or {})
+        return is_in_reach(mesh, robot) and has_robot(mesh.get_peer(robot) or {})
 
     def reaches(self, robot: str) -> bool:
         """Return whether a robot of this id is in reach, once peers are known."""
@@ -445,10 +445,6 @@ def _carried(robot: str, verb: str, arguments: Mapping[str, Any]) -> Mapping[str
     if problem and verb != "stop":
         raise ArgumentsError(problem, robot=robot, verb=verb)
     return {} if problem else arguments
-
-
-def _has_robot(row: Mapping[str, Any]) -> bool:
-    return "locked" in row or "tool_name" in row or "robot_kind" in row
 
 
 def _found(row: Mapping[str, Any]) -> FoundRobot:
