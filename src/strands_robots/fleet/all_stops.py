@@ -98,7 +98,9 @@ def unreached(networks: Networks) -> FleetVerdict:
 
 
 def answer_of(verdict: FleetVerdict, networks: Networks) -> Envelope:
-    """Return the verdict as one answer; that of one network alone as this network words it.
+    """Return the verdict as one answer.
+
+    That of one network alone is as this network words it.
 
     With several, ``stopped`` is True, False, or None where it is not known, ``not_stopped`` and ``silent`` list robots,
     ``robots`` has the answers by id and ``networks`` the facts of each network.

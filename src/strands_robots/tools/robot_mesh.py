@@ -230,7 +230,7 @@ def _answer(work: Callable[[Networks], Envelope], *, stops: bool) -> Envelope:
 
 
 def _read_by_a_model(answer: Envelope) -> Envelope:
-    """Return an answer whose error has a text; models take one without it as a success."""
+    """Return an answer whose error has a text, as a model reads it."""
     if not is_error(answer) or "content" in answer:
         return answer
     fields = {name: value for name, value in answer.items() if name not in ("status", "reason")}
