@@ -33,7 +33,7 @@ from strands_robots.fleet.mesh.requests import PeerRequests
 from strands_robots.fleet.mesh.standing import mesh_network, stand_on_mesh
 from strands_robots.fleet.mesh.stops import lock_peers, stop_answer, stop_peers
 from strands_robots.fleet.mesh_settings import MeshSettings
-from strands_robots.fleet.refusals import refusal_of_text
+from strands_robots.fleet.refusals import refusal_of_text, with_meaning
 from strands_robots.fleet.stop_answers import roster_verdict
 from strands_robots.fleet.stop_button import StopSender
 from strands_robots.safety.network_key import NetworkKey
@@ -228,7 +228,7 @@ class MeshNetwork:
                 raise self._absent(robot, verb)
             raise NoAnswerError(f"{robot} did not answer", robot=robot, verb=verb)
         why = plain_text(reply.get("error") or reply.get("reason"))
-        said = error(f"{robot}: {why or 'refused'}")
+        said = error(f"{robot}: {with_meaning(why) or 'refused'}")
         if reply.get("type") == "error" or why.startswith("validation: "):
             raise refusal_of_text(robot, verb, why, said)
         raise UnreachableError(why or "the mesh did not carry the call", robot=robot, verb=verb, envelope=said)
