@@ -91,7 +91,7 @@ async def answered(call: Awaitable[Envelope]) -> Envelope:
 
 
 def with_meaning(text: str) -> str:
-    """Return a refusal of the mesh with what it means, where it is one of its fixed words."""
+    """Return a refusal of the mesh, with its meaning where it is a fixed word."""
     known = EXACT.get(text)
     return text if known is None else f"{text}: {known[1]}"
 
