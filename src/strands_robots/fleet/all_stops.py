@@ -119,7 +119,9 @@ def not_left(network: str, key: Callable[[], NetworkKey], why: object) -> Networ
 
 
 def answer_of(verdict: FleetVerdict, networks: Networks) -> Envelope:
-    """Return the verdict as one answer, of a single network in its words.
+    """Return the verdict as one answer.
+
+    That of one network alone is as this network words it.
 
     With several, ``stopped`` is True, False, or None where it is not known, ``not_stopped`` and ``silent`` list robots,
     ``robots`` has the answers by id and ``networks`` the facts of each network.

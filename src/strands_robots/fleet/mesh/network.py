@@ -26,14 +26,14 @@ from strands_robots.fleet.adapter import CLOSED, FIND_S, MESH, STOP_S, Detail, F
 from strands_robots.fleet.lockout_report import LockoutReport, Resumed
 from strands_robots.fleet.mesh.controller import MeshController
 from strands_robots.fleet.mesh.descriptions import functions_of, functions_of_each, functions_of_kind
-from strands_robots.fleet.mesh.discovery import awaited, discover, in_reach, is_in_reach
+from strands_robots.fleet.mesh.discovery import CALLER, awaited, discover, has_robot, in_reach, is_in_reach
 from strands_robots.fleet.mesh.events import follow
 from strands_robots.fleet.mesh.lockouts import ask_peers, lockable_peers, resume_peers
 from strands_robots.fleet.mesh.requests import PeerRequests
 from strands_robots.fleet.mesh.standing import mesh_network, stand_on_mesh
 from strands_robots.fleet.mesh.stops import lock_peers, stop_answer, stop_peers
 from strands_robots.fleet.mesh_settings import MeshSettings
-from strands_robots.fleet.refusals import refusal_of_text
+from strands_robots.fleet.refusals import refusal_of_text, with_meaning
 from strands_robots.fleet.stop_answers import roster_verdict
 from strands_robots.fleet.stop_button import StopSender
 from strands_robots.safety.controller import OnProgress
@@ -112,7 +112,7 @@ class MeshNetwork:
         from strands_robots.mesh.wire_identity import IdentityError, visitor_id  # noqa: PLC0415 - as above
 
         try:
-            mesh = Mesh(None, visitor_id(self._source), "tool", parts=Parts(acquire=session.dial))
+            mesh = Mesh(None, visitor_id(self._source), CALLER, parts=Parts(acquire=session.dial))
             try:
                 mesh.start()
             except BaseException:
@@ -134,7 +134,7 @@ class MeshNetwork:
                 world=world if (world := name.rpartition("__")[0]) in rows else "",
             )
             for name, row in rows.items()
-            if _has_robot(row)
+            if has_robot(row)
         ]
 
     def listed(self, timeout: float | None = None) -> list[FoundRobot]:
@@ -151,12 +151,12 @@ class MeshNetwork:
 
     def announced(self) -> Collection[str]:
         """Return the robots in reach."""
-        return [str(row["peer_id"]) for row in self._rows() if _has_robot(row)]
+        return [str(row["peer_id"]) for row in self._rows() if has_robot(row)]
 
     def bears(self, robot: str) -> bool:
         """Return whether a robot of this id is in reach."""
         mesh = self._joined_mesh
-        return is_in_reach(mesh, robot) and _has_robot(mesh.get_peer(robot) or {})
+        return is_in_reach(mesh, robot) and has_robot(mesh.get_peer(robot) or {})
 
     def reaches(self, robot: str) -> bool:
         """Return whether a robot of this id is in reach, once peers are known."""
@@ -225,7 +225,7 @@ class MeshNetwork:
                 raise self._absent(robot, verb)
             raise NoAnswerError(f"{robot} did not answer", robot=robot, verb=verb)
         why = plain_text(reply.get("error") or reply.get("reason"))
-        said = error(f"{robot}: {why or 'refused'}")
+        said = error(f"{robot}: {with_meaning(why) or 'refused'}")
         if reply.get("type") == "error" or why.startswith("validation: "):
             raise refusal_of_text(robot, verb, why, said)
         raise UnreachableError(why or "the mesh did not carry the call", robot=robot, verb=verb, envelope=said)
@@ -494,10 +494,6 @@ def _named_as(verb: str, result: Mapping[str, Any]) -> Envelope:
         return dict(result)
     running = {str(row.get("robot", "")): row for row in rows if isinstance(row, Mapping)}
     return {**result, "running_policies": running}
-
-
-def _has_robot(row: Mapping[str, Any]) -> bool:
-    return "locked" in row or "tool_name" in row or "robot_kind" in row
 
 
 def _found(row: Mapping[str, Any]) -> FoundRobot:
