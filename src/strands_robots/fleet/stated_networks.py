@@ -32,6 +32,7 @@ def networks_of(
     mesh: bool | None = None,
     stays: bool = False,
     preload: bool = False,
+    console: bool = False,
 ) -> Networks:
     """Return the networks of a caller, not joined yet.
 
@@ -46,6 +47,7 @@ def networks_of(
         mesh: True joins the mesh in any case, False leaves it out.
         stays: go on trying to join what is not there yet, such as the mesh once its hub has come.
         preload: load now what a stop must not wait for, as a program does that lasts longer than a command.
+        console: on the mesh the caller's name is its whole id, by which robots may know a safety controller.
 
     Raises:
         ValidationError: the profile or the flags cannot be used.
@@ -76,16 +78,16 @@ def networks_of(
     elif mesh is None and stated is None and (why := _no_hub()):
         # Its code is not loaded: most machines have no mesh.
         absent[MESH], keys[MESH] = why, _mesh_here
-        later += [lambda: None if _no_hub() else _mesh(source, None)] if stays else []
+        later += [lambda: None if _no_hub() else _mesh(source, None, console)] if stays else []
     else:
-        networks.append(_mesh(source, stated))
+        networks.append(_mesh(source, stated, console))
     return Networks(networks, absent, keys, stays=stays, later=later)
 
 
-def _mesh(source: str, stated: Mapping[str, str] | None) -> NetworkAdapter:
+def _mesh(source: str, stated: Mapping[str, str] | None, console: bool) -> NetworkAdapter:
     from strands_robots.fleet.mesh.network import MeshNetwork  # noqa: PLC0415 - loaded when it is used
 
-    return MeshNetwork(source, stated)
+    return MeshNetwork(source, stated, console=console)
 
 
 def networks_for_stop(
