@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import shlex
 import subprocess
 import sys
 import threading
@@ -235,6 +237,23 @@ def test_description_of_a_hostile_peer_controls_neither_terminal_nor_programs(si
             shown = done.stdout + done.stderr
             assert "Traceback" not in shown
             assert not {"\x1b", "\x07", "\u202e"} & {*shown}, line
+
+
+def test_commands_of_the_page_of_the_mesh_print_what_stands_there(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[3] / "docs" / "mesh.md").read_text("utf-8")
+    served, block = re.findall(r"```console\n(.*?)```", page, re.DOTALL)[:2]
+    ports = dict.fromkeys(("STRANDS_DC_PORT", "STRANDS_MESH_PORT"), str(free_port()))
+    machine = Machine(tmp_path / "state", **ports)
+    assert served.splitlines()[0] == "$ strands-robots serve so100 --mesh --peer-id arm-1"
+    with machine.serving("arm-1", "--mesh"):
+        eventually(lambda: machine.run("peers").returncode == 0, within=60, what="the arm on the mesh")
+        for part in block.split("$ strands-robots ")[1:]:
+            line, _, printed = part.partition("\n")
+            done = machine.run(*shlex.split(line, comments=True))
+            assert done.returncode == 0, (line, done.stderr)
+            # The first line of what stands there: the heads of a table.
+            heads = printed.partition("\n")[0].split()
+            assert heads == [] or heads in [each.split() for each in done.stdout.splitlines()], (line, done.stdout)
 
 
 def test_robots_of_both_networks_are_recorded_in_one_file(site: Site, tmp_path: Path) -> None:
