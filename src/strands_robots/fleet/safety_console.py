@@ -89,7 +89,7 @@ class SafetyConsole:
 
     @property
     def absent(self) -> Mapping[str, str]:
-        """Networks of the console that are not joined, or have no button, with the reason."""
+        """Networks without a button, each with the reason."""
         stated = {each.name for each in self._networks.stated}
         missing = {name: why for name, why in self._networks.absent.copy().items() if name in stated}
         return {**missing, **self.problems}
