@@ -125,14 +125,25 @@ def test_stop_from_a_loop_waits_for_no_joining_once_the_robot_has_stopped(
     assert asyncio.run(stop()) == {DEVICE_CONNECT: near.stops}
 
 
-def test_network_that_is_gone_and_has_no_remembered_robot_fails_no_stop(near: ScriptedNetwork) -> None:
+def test_stated_network_that_is_gone_fails_a_stop_though_no_robot_of_it_is_remembered(near: ScriptedNetwork) -> None:
     far = ScriptedNetwork(MESH, {})
     far.unreachable = "no route"
     with Networks([near, far]) as networks:
-        verdict = stop_all(networks)
-        assert networks.absent == {MESH: "no route"}
-    assert verdict.ok
-    assert near.stopped == ["arm-1", "both"]
+        for verdict in (stop_all(networks), estop_all(networks, "test")):
+            assert not verdict.ok
+            assert verdict.missing == ("the robots on mesh",)
+            assert "It did not leave on mesh: no route." in str(verdict)
+            assert verdict["arm-1"].stopped
+            assert networks.missing == {MESH: "no route"}
+
+
+def test_mesh_that_no_one_asked_for_fails_no_stop(near: ScriptedNetwork) -> None:
+    far = ScriptedNetwork(MESH, {})
+    far.unreachable = "no hub"
+    with Networks([near, far], unasked={MESH}) as networks:
+        assert stop_all(networks).ok
+        assert near.stopped == ["arm-1", "both"]
+        assert (networks.absent, networks.missing) == ({MESH: "no hub"}, {})
 
 
 def test_none_in_reach_is_refused_with_each_reason(near: ScriptedNetwork) -> None:

@@ -40,7 +40,7 @@ def stop_all(networks: Networks, timeout: float = STOP_S, *, known: Sequence[str
         answers, outcome = network.stop_all(timeout)
         return NetworkVerdict(network.name, outcome, answers)
 
-    reached, unreached = _parted(_on_each(networks, stopped, apart=False))
+    reached, unreached = _parted(networks, _on_each(networks, stopped, apart=False))
     return FleetVerdict(reached, known=known, unreached=unreached)
 
 
@@ -97,7 +97,7 @@ def estop_all(
         return NetworkVerdict(network.name, outcome, absent="" if outcome.report.link else "; ".join(outcome.problems))
 
     verdicts = _told_once(_on_each(networks, stopped, apart=True), {*scope.only, *named})
-    reached, unreached = _parted(verdicts)
+    reached, unreached = _parted(networks, verdicts)
     meant = {**dict.fromkeys(known if scope.everything else scope.only), **dict.fromkeys(named)}
     return FleetVerdict(reached, epoch, tuple(meant), ignored, unreached)
 
@@ -189,13 +189,15 @@ def _told_once(verdicts: Sequence[Stopped], named: Collection[str]) -> list[Stop
     return [(each.without(names), left) for (each, left), names in zip(verdicts, dropped, strict=True)]
 
 
-def _parted(verdicts: Sequence[Stopped]) -> tuple[list[NetworkVerdict], list[NetworkVerdict]]:
+def _parted(networks: Networks, verdicts: Sequence[Stopped]) -> tuple[list[NetworkVerdict], list[NetworkVerdict]]:
     """Return the verdicts that count, and those of gone networks without robots."""
+    # A caller that is new here remembers no robot of a broker that is gone.
+    elsewhere = {each.name for each in networks.stated if networks.asks_for(each.name) and not each.on_this_machine}
     reached = any(left for _, left in verdicts)
     counted, gone = list[NetworkVerdict](), list[NetworkVerdict]()
     for each, left in verdicts:
         # Of a network whose roster cannot be read it is not known whether a robot is there.
-        counts = left or not reached or each.outcome is None or each.outcome.size
+        counts = left or not reached or each.network in elsewhere or each.outcome is None or each.outcome.size
         (counted if counts else gone).append(each)
     return counted, gone
 

@@ -183,7 +183,11 @@ class Networks:
     @property
     def missing(self) -> dict[str, str]:
         """The absent networks that someone asked for, with their reasons."""
-        return {name: why for name, why in self.absent.copy().items() if name not in self._unasked}
+        return {name: why for name, why in self.absent.copy().items() if self.asks_for(name)}
+
+    def asks_for(self, network: str) -> bool:
+        """Return whether someone asked for a network, which then has to be there."""
+        return network not in self._unasked
 
     @property
     def absences(self) -> str:
