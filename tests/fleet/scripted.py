@@ -73,6 +73,7 @@ class ScriptedNetwork:
     """Robots whose verbs, answers and stops a test sets; it notes what they were asked."""
 
     has_stop_link = False
+    tells_absence = False
     announces_verbs = True
     reads: Mapping[str, str] = {"status": "getStatus", "state": "getState", "features": "getFeatures"}
     starts = "execute"
@@ -196,7 +197,7 @@ class ScriptedNetwork:
         return ReceivedCall("scripted", verb, arguments)
 
     async def stop_async(self, robot: str, within: float = STOP_S, robot_name: str = "") -> Envelope:
-        return self.stop(robot, within, robot_name) or error("none", stopped=None)
+        return self.stop(robot, within, robot_name) or error(f"No device {robot}.", stopped=None, in_reach=False)
 
     @property
     def key(self) -> NetworkKey:

@@ -35,6 +35,7 @@ class LocalMesh:
 
     name = MESH
     has_stop_link = False
+    tells_absence = False
 
     def __init__(self, source: str) -> None:
         self._source = source
