@@ -153,6 +153,8 @@ class ScriptedNetwork:
         return self.robots[robot] if self.announces_verbs else self.of_kind
 
     def describe(self, robot: str, *, anew: bool = False) -> object:
+        if robot not in self.robots:
+            raise NoSuchRobotError("gone", robot=robot)
         return self.robots[robot]
 
     def describe_each(self, robots: Iterable[str]) -> Mapping[str, object]:

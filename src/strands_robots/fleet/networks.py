@@ -309,7 +309,7 @@ class Networks:
         return self._chosen(robot, verb, others, moves=moves) if others else None
 
     def decides(self, robot: str) -> bool:
-        """Return whether it has to be decided which robot of this id a motion goes to; asks no one."""
+        """Return whether a motion needs a decision which robot it is for; asks no one."""
         return len(self.bearers(robot)) > 1 or bool(self._enrolled_on_absent(robot))
 
     def decided(self, robot: str) -> NetworkAdapter | None:
@@ -415,7 +415,7 @@ class Networks:
         return await self._off_loop(partial(self.of, robot, verb, moves=moves))
 
     async def _off_loop(self, work: Callable[[], R]) -> R:
-        """Return what ``work`` returns, on a thread that no stop and no other work of the loop needs."""
+        """Return what ``work`` returns, on a thread that no stop needs."""
         with self._change:
             if self._closed:
                 raise UnreachableError(CLOSED)
@@ -604,7 +604,7 @@ class Networks:
         return decided(self._shared_id(robot), robot, verb, bearers, absent)
 
     def _enrolled_on_absent(self, robot: str) -> dict[str, bytes]:
-        """Return the keys of an id that are enrolled on stated networks which are not joined."""
+        """Return the keys of an id that are enrolled on networks which are gone."""
         joined, keys = self.joined, dict[str, bytes]()
         for each in self.stated:
             if each not in joined:
