@@ -99,7 +99,7 @@ def _proven(
 
 
 def _signing_key(robot: str, network: NetworkAdapter) -> tuple[bool, bytes | None]:
-    """Return whether the robot is there, and the key that signs its answer to a fresh question."""
+    """Return whether the robot is there, and the key that signs a fresh answer."""
     nonce = secrets.token_hex(16)
     try:
         answer = network.call(robot, network.reads["status"], {"nonce": nonce}, ASK_S)

@@ -65,7 +65,7 @@ def side_by_side(work: Callable[[T], R], items: Sequence[T]) -> list[R]:
 
 
 def those(test: Callable[[T], bool], items: Sequence[T], *, every: bool) -> list[T]:
-    """Return the items for which ``test`` is true: all, or those that are known at the first one.
+    """Return items for which ``test`` is true: all, or those known at the first one.
 
     One that raises is none.
     """

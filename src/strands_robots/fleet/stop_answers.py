@@ -23,7 +23,7 @@ logger = logging.getLogger(__name__)
 
 
 def by_bearer(robot: str, answers: Mapping[str, Envelope]) -> dict[str, Envelope]:
-    """Return answers by network under the robot's name, of several with the network's."""
+    """Return answers by network under names that tell their robots apart."""
     several = len(answers) > 1
     return {f"{robot} on {network}" if several else robot: said for network, said in answers.items()}
 
@@ -113,7 +113,7 @@ def not_reached(network: NetworkKey, *, left: bool = False) -> StopOutcome:
 def remembered(
     robot: str, keys: Mapping[str, Callable[[], NetworkKey]], whys: Mapping[str, str]
 ) -> dict[str, Envelope]:
-    """Return by network what stands for the answer of a silent robot that is remembered there.
+    """Return by network the answer of a silent robot that is remembered there.
 
     Args:
         robot: its id.

@@ -55,7 +55,7 @@ VERB_S = 2.0
 """Seconds in which a peer has to describe a verb of its own before that is called."""
 
 UNSEEN_S = 0.2
-"""Seconds in which a peer that was not seen has to answer a stop, once the peers in reach are known."""
+"""Seconds in which an unseen peer has to answer a stop, once peers are known."""
 
 ALWAYS_SENT = ("stop", "releaseTorque")
 """Actions that take energy away: they are sent to a peer that was not seen, too."""
