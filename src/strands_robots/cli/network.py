@@ -139,13 +139,16 @@ class Network:
     def _stated(self) -> LinkFlags:
         return self._flags_over(self._profile)
 
-    def networks(self, *, on_mesh: bool = False, source: str | None = None, stays: bool = False) -> Networks:
+    def networks(
+        self, *, on_mesh: bool = False, source: str | None = None, stays: bool = False, console: bool = False
+    ) -> Networks:
         """Return the networks of the flags, not joined yet.
 
         Args:
             on_mesh: the native mesh alone.
             source: the caller's name; by default that of :meth:`caller`.
             stays: the command lasts, and goes on trying to join what is not there yet.
+            console: a safety controller, whose name is its whole id on the mesh.
 
         Raises:
             CliError: the flags contradict one another, or leave this machine without authentication.
@@ -158,9 +161,11 @@ class Network:
             self.use_mesh()
             if mesh_env_request() is False:
                 raise CliError("The native mesh is off: STRANDS_MESH switches it off.", Exit.SILENT)
-            return networks_of(None, {}, name, devices=False, mesh=True, stays=stays)
+            return networks_of(None, {}, name, devices=False, mesh=True, stays=stays, console=console)
         try:
-            networks = networks_of(self._profile, self._given, name, mesh=self._usable_mesh, stays=stays)
+            networks = networks_of(
+                self._profile, self._given, name, mesh=self._usable_mesh, stays=stays, console=console
+            )
         except ValidationError as exc:
             raise CliError(str(exc), Exit.USAGE) from exc
         if not networks.stated and not self.on_mesh_alone:

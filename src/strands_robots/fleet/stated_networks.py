@@ -28,6 +28,7 @@ def networks_of(
     mesh: bool | None = None,
     stays: bool = False,
     preload: bool = False,
+    console: bool = False,
 ) -> Networks:
     """Return the networks of a caller, not joined yet.
 
@@ -42,6 +43,7 @@ def networks_of(
         mesh: True joins the mesh in any case, False leaves it out.
         stays: go on trying to join what is not there yet, such as the mesh once its hub has come.
         preload: load now what a stop must not wait for, as a program does that lasts longer than a command.
+        console: on the mesh the caller's name is its whole id, by which robots may know a safety controller.
 
     Raises:
         ValidationError: the profile or the flags cannot be used.
@@ -75,18 +77,18 @@ def networks_of(
     elif MESH in unasked:
         # Its code is not loaded: most machines have no mesh.
         if stays or not (why := no_hub()):
-            networks.append(cast("NetworkAdapter", LocalMesh(source)))
+            networks.append(cast("NetworkAdapter", LocalMesh(source, console=console)))
         else:
             absent[MESH], keys[MESH] = why, local_key
     else:
-        networks.append(_mesh(source, stated))
+        networks.append(_mesh(source, stated, console))
     return Networks(networks, absent, keys, stays=stays, unasked=unasked)
 
 
-def _mesh(source: str, stated: Mapping[str, str] | None) -> NetworkAdapter:
+def _mesh(source: str, stated: Mapping[str, str] | None, console: bool) -> NetworkAdapter:
     from strands_robots.fleet.mesh.network import MeshNetwork  # noqa: PLC0415 - loaded when it is used
 
-    return MeshNetwork(source, stated)
+    return MeshNetwork(source, stated, console=console)
 
 
 def networks_for_stop(

@@ -40,7 +40,7 @@ class StandingController:
     def problem(self) -> str:
         """Empty while it stands on each network, else the reasons why it does not."""
         absent, missing = self._networks.absent, self._networks.missing
-        # A mesh that no one asked for need not be there.
+        # A network that no one asked for need not be there.
         named = [each.name for each in self._networks.stated if each.name in missing or each.name not in absent]
         why = {name: self._problem_on(name) for name in named}
         return "; ".join(f"{name}: {problem}" for name, problem in why.items() if problem)

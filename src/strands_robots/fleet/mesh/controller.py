@@ -7,11 +7,12 @@ import time
 from collections.abc import Collection
 from typing import TYPE_CHECKING, Any
 
+from strands_robots.fleet.mesh.discovery import LOOK_S
 from strands_robots.fleet.mesh.lockouts import lockable_peers
 from strands_robots.fleet.mesh.standing import MeshReports, mesh_network
 from strands_robots.fleet.stop_answers import stop_outcome
 from strands_robots.safety.answers import Answer
-from strands_robots.safety.controller import OnProgress, Progress, StopReport
+from strands_robots.safety.controller import DEADLINE_S, OnProgress, Progress, StopReport
 from strands_robots.safety.orders import new_epoch
 from strands_robots.safety.peer_answers import enrolled_peers, stop_distrust
 from strands_robots.safety.presses import Press, Presses
@@ -47,8 +48,10 @@ class MeshController:
 
     @property
     def link_up(self) -> bool:
-        """True while this peer is on the mesh."""
-        return self._mesh.alive
+        """True while this peer is on the mesh, and linked to its hub."""
+        from strands_robots.mesh import session  # noqa: PLC0415 - the network is loaded when it is used
+
+        return self._mesh.alive and not session.cut_off()
 
     def press(self, estop_id: str) -> Press:
         """Note the moment of a press, from which its answers are counted."""
@@ -102,7 +105,7 @@ class MeshController:
                 )
             )
 
-        up = self.link_up
+        until = time.monotonic() + DEADLINE_S
         self._reports.inbox.open(epoch, on_report)
         # On a thread: a disk that hangs delays no sending.
         reading = threading.Thread(target=self._load_keys, name="enrolled keys", daemon=True)
@@ -115,6 +118,10 @@ class MeshController:
             remembers=robots_known_at(mesh_network),
             on_widened=lambda: widened.append(True),
         )
+        up = self.link_up
+        # Without a hub nothing left; a stop that goes on is sent again in the moment it is back.
+        while not up and not self.link_up and time.monotonic() < until:
+            time.sleep(LOOK_S)
         self._reports.inbox.close(epoch)
         reading.join(READ_WITHIN_S)
         # By the keys of now: a robot may have been enrolled since the last stop.

@@ -31,14 +31,15 @@ class LocalMesh:
 
     Args:
         source: the first part of this peer's id.
+        console: it is a safety controller, whose id is ``source``.
     """
 
     name = MESH
     has_stop_link = False
     tells_absence = False
 
-    def __init__(self, source: str) -> None:
-        self._source = source
+    def __init__(self, source: str, *, console: bool = False) -> None:
+        self._source, self._console = source, console
         self._found: MeshNetwork | None = None
 
     def open(self) -> None:
@@ -49,7 +50,7 @@ class LocalMesh:
                 raise UnreachableError(why)
             from strands_robots.fleet.mesh.network import MeshNetwork  # noqa: PLC0415 - loaded when it is used
 
-            self._found = MeshNetwork(self._source)
+            self._found = MeshNetwork(self._source, console=self._console)
         self._found.open()
 
     def close(self) -> None:

@@ -70,6 +70,7 @@ class MeshNetwork:
     Args:
         source: the first part of this peer's id.
         stated: settings of the mesh that a connection profile states, by variable; they hold while it is joined.
+        console: ``source`` is the whole id, by which robots may know a safety controller.
     """
 
     name = MESH
@@ -79,8 +80,8 @@ class MeshNetwork:
     reads: Mapping[str, str] = {"status": "status", "state": "state", "features": "features"}
     starts = "start"
 
-    def __init__(self, source: str, stated: Mapping[str, str] | None = None) -> None:
-        self._source = source
+    def __init__(self, source: str, stated: Mapping[str, str] | None = None, *, console: bool = False) -> None:
+        self._source, self._console = source, console
         self._settings = MeshSettings(stated or {})
         # Of a profile's mesh it is known once its settings are put.
         self._key = None if stated else mesh_network()
@@ -116,7 +117,8 @@ class MeshNetwork:
         from strands_robots.mesh.wire_identity import IdentityError, visitor_id  # noqa: PLC0415 - as above
 
         try:
-            mesh = Mesh(None, visitor_id(self._source), CALLER, parts=Parts(acquire=session.dial))
+            name, kind = (self._source, "controller") if self._console else (visitor_id(self._source), CALLER)
+            mesh = Mesh(None, name, kind, parts=Parts(acquire=session.dial))
             try:
                 mesh.start()
             except BaseException:
@@ -125,6 +127,11 @@ class MeshNetwork:
         except (TransportError, IdentityError, MissingExtraError, ValueError) as exc:
             raise UnreachableError(plain_text(str(exc))) from exc
         return mesh
+
+    @property
+    def peer(self) -> Mesh:
+        """This caller as a peer, once it has joined."""
+        return self._joined_mesh
 
     def find(self, timeout: float = FIND_S) -> list[FoundRobot]:
         """Return the robots in reach, once they had the time to announce themselves."""
