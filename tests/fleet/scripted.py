@@ -73,6 +73,7 @@ class ScriptedNetwork:
     """Robots whose verbs, answers and stops a test sets; it notes what they were asked."""
 
     has_stop_link = False
+    tells_absence = False
     announces_verbs = True
     reads: Mapping[str, str] = {"status": "getStatus", "state": "getState", "features": "getFeatures"}
     starts = "execute"
@@ -152,6 +153,8 @@ class ScriptedNetwork:
         return self.robots[robot] if self.announces_verbs else self.of_kind
 
     def describe(self, robot: str, *, anew: bool = False) -> object:
+        if robot not in self.robots:
+            raise NoSuchRobotError("gone", robot=robot)
         return self.robots[robot]
 
     def describe_each(self, robots: Iterable[str]) -> Mapping[str, object]:
@@ -196,7 +199,7 @@ class ScriptedNetwork:
         return ReceivedCall("scripted", verb, arguments)
 
     async def stop_async(self, robot: str, within: float = STOP_S, robot_name: str = "") -> Envelope:
-        return self.stop(robot, within, robot_name) or error("none", stopped=None)
+        return self.stop(robot, within, robot_name) or error(f"No device {robot}.", stopped=None, in_reach=False)
 
     @property
     def key(self) -> NetworkKey:
