@@ -57,6 +57,9 @@ FLOORS: list[set[str]] = [
 ASKS_KINDS = {"contract"}
 """The module that asks of which kind a robot is."""
 
+NAMES_NO_NETWORK = ("mcp", "cli.mcp")
+"""Faces of every network at once, which reach them through the fleet."""
+
 SIBLING_NAMES: dict[str, str] = {}
 """Public class names that stand for the same idea in sibling backends."""
 
@@ -206,6 +209,13 @@ def test_device_connect_and_the_mesh_never_import_one_another() -> None:
         here, there = module.split(".")[0], {imported.split(".")[0] for imported in imports(module)}
         assert not (here == "device_connect" and "mesh" in there), module
         assert not (here == "mesh" and "device_connect" in there), module
+
+
+def test_faces_of_every_network_name_none() -> None:
+    faces = [module for module in MODULES if f"{module}.".startswith(tuple(f"{each}." for each in NAMES_NO_NETWORK))]
+    assert set(NAMES_NO_NETWORK) <= set(faces)
+    network = re.compile(r"device.connect|\bmesh\b", re.IGNORECASE)
+    assert [module for module in faces if network.search(MODULES[module].read_text(encoding="utf-8"))] == []
 
 
 def test_a_public_class_name_stands_for_one_idea() -> None:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections.abc import Iterator
+from contextlib import closing
 from typing import Any
 
 import pytest
 from fixtures.waiting import eventually
-from tests.fleet.scripted import OURS, ScriptedNetwork
+from tests.fleet.scripted import OURS, ScriptedNetwork, function
 
 from strands_robots import errors
 from strands_robots.envelope import Envelope, error, success
@@ -156,6 +157,66 @@ def test_networks_that_are_left_while_one_is_being_joined_leave_it_too(near: Scr
     assert networks.joined == ()
 
 
+def test_absent_networks_that_no_one_asked_for_are_not_told(near: ScriptedNetwork) -> None:
+    far = ScriptedNetwork(MESH)
+    far.unreachable = "no hub"
+    with Networks([near, far], {"other": "left out"}, unasked=(MESH, "other")) as networks:
+        networks.settled()
+        assert networks.absent == {MESH: "no hub", "other": "left out"}
+        assert networks.missing == {}
+    near.unreachable = "no broker"
+    with pytest.raises(errors.UnreachableError) as refused, Networks([near, far], unasked=(MESH,)):
+        pytest.fail("joined")
+    assert refused.value.why == "no broker"
+
+
+class TestInTurn:
+    """The second network is joined only where the first one does not do."""
+
+    @pytest.fixture
+    def far(self) -> ScriptedNetwork:
+        return ScriptedNetwork(MESH, {"arm-2": OURS, "both": OURS})
+
+    @pytest.fixture
+    def networks(self, near: ScriptedNetwork, far: ScriptedNetwork) -> Iterator[Networks]:
+        with closing(Networks([near, far])) as networks:
+            networks.open(in_turn=True)
+            yield networks
+
+    def test_read_of_a_robot_of_the_first_joins_no_other(self, networks: Networks, far: ScriptedNetwork) -> None:
+        assert networks.call("both", "getStatus", {}, 5.0, moves=False)["status"] == "success"
+        assert not far.joined
+
+    def test_read_of_a_robot_of_the_second_joins_it(self, networks: Networks, far: ScriptedNetwork) -> None:
+        assert networks.call("arm-2", "getStatus", {}, 5.0, moves=False)["status"] == "success"
+        assert far.calls
+
+    def test_absent_robot_is_asked_for_once(
+        self, networks: Networks, near: ScriptedNetwork, far: ScriptedNetwork
+    ) -> None:
+        far.unreachable = "no hub"
+        with pytest.raises(errors.NoSuchRobotError):
+            networks.call("arm-9", "getStatus", {}, 5.0, moves=False)
+        assert len(near.calls) == 1
+
+    def test_motion_and_search_join_all(self, networks: Networks, far: ScriptedNetwork) -> None:
+        with pytest.raises(errors.AmbiguousRobotError):
+            networks.call("both", "moveTo", {"x": 1}, 5.0)
+        assert far.joined
+        assert sorted(networks.find()) == ["arm-1", "arm-2", "both"]
+
+    def test_second_is_joined_where_the_first_cannot_be(self, near: ScriptedNetwork, far: ScriptedNetwork) -> None:
+        near.unreachable = "no broker"
+        with closing(Networks([near, far])) as networks:
+            networks.open(in_turn=True)
+            assert networks.joined == (far,)
+            assert networks.missing == {DEVICE_CONNECT: "no broker"}
+
+    def test_stop_leaves_on_both(self, networks: Networks, near: ScriptedNetwork, far: ScriptedNetwork) -> None:
+        networks.stop("both")
+        assert (near.stopped, far.stopped) == (["both"], ["both"])
+
+
 class TestStays:
     """Networks of a face that lasts: what is not there yet is joined when it comes."""
 
@@ -244,6 +305,18 @@ class TestRouting:
             assert asyncio.run(networks.of_async(robot)) is there
             assert asyncio.run(networks.describe_async(robot, 5.0)).functions == OURS
         assert near.asked == far.asked == []
+
+    def test_own_verb_is_called_where_it_was_described(
+        self, networks: Networks, near: ScriptedNetwork, far: ScriptedNetwork
+    ) -> None:
+        assert networks.described("both", "getStatus")[0] is near
+        network, verb = networks.described("arm-2", "moveTo")
+        assert network is far
+        assert verb is not None
+        near.robots["both"] = far.robots["both"] = (function("brewCoffee"), function("beansLeft", "read"))
+        assert networks.described("both", "beansLeft")[0] is near
+        with pytest.raises(errors.AmbiguousRobotError):
+            networks.described("both", "brewCoffee")
 
     def test_motion_of_an_id_on_both_is_refused_naming_both(self, networks: Networks) -> None:
         with pytest.raises(errors.AmbiguousRobotError, match="device_connect and mesh"):

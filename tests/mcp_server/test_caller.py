@@ -7,10 +7,19 @@ from collections.abc import Mapping
 from typing import Any
 
 import pytest
-from device_connect_edge.messaging import MessagingError
+from tests.fleet.scripted import ScriptedNetwork
 
-from strands_robots.device_connect.client import DeviceTimeoutError, NoSuchDeviceError
 from strands_robots.envelope import Envelope, error, is_error, success, text_of
+from strands_robots.errors import (
+    LockoutError,
+    NoAnswerError,
+    NoSuchRobotError,
+    RefusalError,
+    UnknownVerbError,
+    UnreachableError,
+)
+from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH, STOP_S, FoundRobot, NetworkAdapter
+from strands_robots.fleet.networks import Networks
 from strands_robots.mcp import caller as module
 from strands_robots.mcp.caller import Caller
 from strands_robots.serving.advertised import AdvertisedVerb, find_verb
@@ -18,44 +27,60 @@ from strands_robots.serving.advertised import AdvertisedVerb, find_verb
 RUNNING = success("under way", task_id="moveTo-1", task_status="running")
 
 
-class FakeFleet:
-    """A connection that gives the answers, or raises the errors, that a test sets."""
+def description(*parameters: str) -> tuple[dict[str, Any], ...]:
+    """Return the functions of a robot whose verbs have these parameters."""
+    properties = {name: {"type": "string", "description": "As lease_ttl_s."} for name in parameters}
+    schema = {"type": "object", "properties": properties}
+    return tuple({"name": verb, "parameters": schema} for verb in ("moveTo", "execute", "start"))
 
-    def __init__(self, **answers: Envelope | Exception) -> None:
-        self.answers = answers
+
+class FakeNetwork(ScriptedNetwork):
+    """A network whose robot gives the answers, or raises the refusals, that a test sets."""
+
+    def __init__(self, name: str = DEVICE_CONNECT, **answers: Envelope | Exception) -> None:
+        super().__init__(name, {"arm-1": description(), "bar-1": description()})
+        self.starts = "start" if name == MESH else "execute"
+        self.given: dict[str, Envelope | Exception] = dict(answers)
+        self.described: object = None
+        self.descriptions = 0
         self.stop_answers = [success("Stopped.", stopped=True)]
-        self.stops = 0
-        self.calls: list[tuple[str, dict[str, Any]]] = []
+        self.stop_count = 0
 
     def sent(self, verb: str) -> dict[str, Any]:
         """Return the parameters of the last call of a verb."""
-        return next(params for name, params in reversed(self.calls) if name == verb)
+        return next(params for _, name, params, _ in reversed(self.calls) if name == verb)
 
-    async def call_async(self, robot: str, verb: str, params: Mapping[str, Any], within: float) -> Envelope:
+    @property
+    def verbs(self) -> list[str]:
+        """The verbs that were called."""
+        return [verb for _, verb, *_ in self.calls]
+
+    async def call_async(self, robot: str, verb: str, arguments: Mapping[str, Any], within: float) -> Envelope:
         """Answer a call."""
-        self.calls.append((verb, dict(params)))
-        answer = description() if verb == "requestRegistration" and verb not in self.answers else self.answers[verb]
+        self.calls.append((robot, verb, dict(arguments), within))
+        answer = self.given[verb]
         if isinstance(answer, Exception):
             raise answer
         return answer
 
-    async def stop_async(self, robot: str, within: float = 5.0, robot_name: str = "") -> Envelope:
+    async def describe_async(self, robot: str, within: float) -> FoundRobot:
+        """Describe the robot as the test says."""
+        self.descriptions += 1
+        if isinstance(self.described, Exception):
+            raise self.described
+        return FoundRobot(robot, functions=description() if self.described is None else self.described)
+
+    async def stop_async(self, robot: str, within: float = STOP_S, robot_name: str = "") -> Envelope:
         """Count the stop; the last answer is given again and again."""
-        self.stops += 1
+        self.stop_count += 1
         return self.stop_answers.pop(0) if len(self.stop_answers) > 1 else self.stop_answers[0]
 
 
-def description(*parameters: str) -> Envelope:
-    """Return the description of a robot whose verbs have these parameters."""
-    properties = {name: {"type": "string", "description": "As lease_ttl_s."} for name in parameters}
-    schema = {"type": "object", "properties": properties}
-    functions = [{"name": verb, "parameters": schema} for verb in ("moveTo", "execute")]
-    return {"device_id": "arm-1", "status": {}, "capabilities": {"functions": functions}}
-
-
-def client_of(fleet: FakeFleet) -> Caller:
-    connection: Any = fleet
-    return Caller(connection)
+def client_of(*networks: NetworkAdapter) -> Caller:
+    opened = Networks(networks)
+    opened.open()
+    opened.settled()
+    return Caller(opened)
 
 
 @pytest.fixture(autouse=True)
@@ -64,50 +89,84 @@ def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "POLL_S", 0.01)
 
 
-LOST = [
-    MessagingError("the connection is lost"),
-    NoSuchDeviceError("No device 'arm-1'."),
-    DeviceTimeoutError("arm-1 did not answer."),
+LOST: list[RefusalError] = [
+    UnreachableError("the connection is lost"),
+    NoSuchRobotError("No device 'arm-1'."),
+    NoAnswerError("arm-1 did not answer."),
 ]
 
 
 @pytest.mark.parametrize("lost", LOST)
 async def test_motion_that_is_out_of_sight_is_halted(lost: Exception) -> None:
-    fleet = FakeFleet(moveTo=RUNNING, wait=lost)
+    fleet = FakeNetwork(moveTo=RUNNING, wait=lost)
     answer = await client_of(fleet).move("arm-1", "moveTo", {"x": 0.1}, wait=True)
     assert is_error(answer) and "told to stop." in text_of(answer)
-    assert fleet.stops == 1
+    assert fleet.stop_count == 1
 
 
 @pytest.mark.parametrize("lost", LOST)
-async def test_policy_that_is_out_of_sight_is_halted(lost: Exception) -> None:
-    fleet = FakeFleet(execute=success("under way"), getStatus=lost)
+@pytest.mark.parametrize("name", [DEVICE_CONNECT, MESH])
+async def test_policy_that_is_out_of_sight_is_halted(name: str, lost: Exception) -> None:
+    fleet = FakeNetwork(name, getStatus=lost)
+    fleet.given[fleet.starts] = success("under way")
     answer = await client_of(fleet).run_policy("arm-1", {}, wait=True)
     assert is_error(answer)
-    assert fleet.stops == 1
+    assert fleet.stop_count == 1
 
 
 async def test_stop_of_a_lost_motion_is_repeated_until_it_is_confirmed() -> None:
-    fleet = FakeFleet(moveTo=RUNNING, wait=MessagingError("the connection is lost"))
+    fleet = FakeNetwork(moveTo=RUNNING, wait=UnreachableError("the connection is lost"))
     fleet.stop_answers = [error("no link", stopped=None), success("Stopped.", stopped=True)]
     answer = await client_of(fleet).move("arm-1", "moveTo", {"x": 0.1}, wait=True)
-    assert fleet.stops == 2
+    assert fleet.stop_count == 2
     assert "not confirmed" not in text_of(answer)
 
 
 async def test_stop_that_is_not_confirmed_is_told() -> None:
-    fleet = FakeFleet(moveTo=RUNNING, wait=MessagingError("the connection is lost"))
+    fleet = FakeNetwork(moveTo=RUNNING, wait=UnreachableError("the connection is lost"))
     fleet.stop_answers = [error("no link", stopped=None)]
     answer = await client_of(fleet).move("arm-1", "moveTo", {"x": 0.1}, wait=True)
-    assert fleet.stops == module.STOPS_MAX
+    assert fleet.stop_count == module.STOPS_MAX
     assert "not confirmed: no link" in text_of(answer)
 
 
 async def test_motion_that_ended_by_itself_is_not_stopped() -> None:
-    fleet = FakeFleet(moveTo=RUNNING, wait=success("there", task_status="completed"))
+    fleet = FakeNetwork(moveTo=RUNNING, wait=success("there", task_status="completed"))
     assert not is_error(await client_of(fleet).move("arm-1", "moveTo", {"x": 0.1}, wait=True))
     await asyncio.sleep(0)
-    assert fleet.stops == 0
+    assert fleet.stop_count == 0
+
+
+@pytest.mark.parametrize("refusal", [LockoutError("locked"), UnknownVerbError("no such verb"), LOST[0], LOST[1]])
+async def test_motion_that_was_refused_is_not_stopped(refusal: RefusalError) -> None:
+    fleet = FakeNetwork(moveTo=refusal)
+    answer = await client_of(fleet).move("arm-1", "moveTo", {"x": 0.1}, wait=True)
+    assert is_error(answer)
+    assert refusal.why in text_of(answer)
+    assert fleet.stop_count == 0
+
+
+async def test_motion_that_may_have_begun_is_stopped() -> None:
+    fleet = FakeNetwork(moveTo=NoAnswerError("arm-1 did not answer"))
+    assert "told to stop" in text_of(await client_of(fleet).move("arm-1", "moveTo", {"x": 0.1}, wait=True))
+    assert fleet.stop_count == 1
+
+
+async def test_motion_of_an_id_on_two_networks_goes_to_neither_and_its_stop_to_both() -> None:
+    near, far = (FakeNetwork(name, getStatus=success("idle")) for name in (DEVICE_CONNECT, MESH))
+    client = client_of(near, far)
+    for answer in (
+        await client.move("arm-1", "moveTo", {"x": 0.1}, wait=True),
+        await client.run_policy("arm-1", {}, wait=True),
+        await client.acquire("arm-1", 60.0, ""),
+    ):
+        assert "device_connect and mesh both have" in text_of(answer)
+    assert not {"moveTo", "execute", "start", "acquireControl"} & {*near.verbs, *far.verbs}
+    far.stop_answers = [error("no brakes", stopped=False)]
+    stopped = await client.stop("arm-1")
+    assert (near.stop_count, far.stop_count) == (1, 1)
+    assert stopped["stopped"] is False
+    assert "arm-1 on mesh" in text_of(stopped)
 
 
 @pytest.mark.parametrize(
@@ -116,45 +175,43 @@ async def test_motion_that_ended_by_itself_is_not_stopped() -> None:
         (description("x", "lease_id", "lease_ttl_s"), True),
         (description("x", "lease_id"), False),
         (description("x"), False),
-        ({"device_id": "arm-1"}, False),
-        ({"capabilities": {"functions": [{"name": "moveTo", "parameters": ["lease_ttl_s"]}]}}, False),
-        (DeviceTimeoutError("arm-1 did not answer."), True),
+        ((), False),
+        ([{"name": "moveTo", "parameters": ["lease_ttl_s"]}], False),
+        (NoAnswerError("arm-1 did not answer."), True),
     ],
 )
+@pytest.mark.parametrize("name", [DEVICE_CONNECT, MESH])
 async def test_motion_carries_a_lease_only_to_a_robot_that_publishes_it(
-    published: Envelope | Exception, bound: bool, monkeypatch: pytest.MonkeyPatch
+    name: str, published: object, bound: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "SILENCE_S", 0.0)
-    fleet = FakeFleet(
-        requestRegistration=published,
-        moveTo=RUNNING,
-        execute=RUNNING,
-        getStatus=success("idle"),
-        renewControl=success(""),
-    )
-    fleet.answers["wait"] = success("there", task_status="completed")
+    fleet = FakeNetwork(name, moveTo=RUNNING, getStatus=success("idle"), renewControl=success(""))
+    fleet.given |= {"wait": success("there", task_status="completed"), fleet.starts: RUNNING}
+    fleet.described = published
     client = client_of(fleet)
     assert not is_error(await client.move("arm-1", "moveTo", {"x": 0.1}, wait=True))
     assert not is_error(await client.run_policy("arm-1", {"instruction": "wave"}, wait=True))
-    for verb in ("moveTo", "execute"):
-        assert [name in fleet.sent(verb) for name in ("lease_id", "lease_ttl_s")] == [bound, bound]
-    assert bound == any(verb == "renewControl" for verb, _ in fleet.calls)
-    assert sum(verb == "requestRegistration" for verb, _ in fleet.calls) == 2
+    for verb in ("moveTo", fleet.starts):
+        assert [each in fleet.sent(verb) for each in ("lease_id", "lease_ttl_s")] == [bound, bound]
+    assert bound == ("renewControl" in fleet.verbs)
+    assert fleet.descriptions == 2
 
 
 async def test_robot_is_asked_once_whether_it_takes_the_lease_of_a_motion() -> None:
-    fleet = FakeFleet(requestRegistration=description("lease_ttl_s"), moveTo=success("", task_status="completed"))
+    fleet = FakeNetwork(moveTo=success("", task_status="completed"))
+    fleet.described = description("lease_ttl_s")
     client = client_of(fleet)
     for _ in range(3):
         await client.move("arm-1", "moveTo", {"x": 0.1}, wait=True)
-    assert sum(verb == "requestRegistration" for verb, _ in fleet.calls) == 1
+    assert fleet.descriptions == 1
 
 
 async def test_held_lease_goes_to_any_robot_that_gave_it() -> None:
-    fleet = FakeFleet(
+    fleet = FakeNetwork(
         acquireControl=success("", lease_id="a" * 32), getStatus=success("idle"), renewControl=success("")
     )
-    fleet.answers |= {"moveTo": success("", task_status="completed"), "requestRegistration": description("x")}
+    fleet.given["moveTo"] = success("", task_status="completed")
+    fleet.described = description("x")
     client = client_of(fleet)
     assert not is_error(await client.acquire("arm-1", 60.0, ""))
     assert "lease_id" not in fleet.sent("acquireControl")
@@ -165,7 +222,7 @@ async def test_held_lease_goes_to_any_robot_that_gave_it() -> None:
 
 
 async def test_client_that_moves_a_robot_acquires_it_by_the_secret_of_its_motion() -> None:
-    fleet = FakeFleet(moveTo=RUNNING, getStatus=success("idle"), acquireControl=error("held"))
+    fleet = FakeNetwork(moveTo=RUNNING, getStatus=success("idle"), acquireControl=error("held"))
     asked = asyncio.Event()
     go_on = asyncio.Event()
     answer = fleet.call_async
@@ -178,7 +235,7 @@ async def test_client_that_moves_a_robot_acquires_it_by_the_secret_of_its_motion
         return await answer(robot, verb, params, within)
 
     fleet.call_async = waits  # type: ignore[method-assign]
-    fleet.answers["requestRegistration"] = description("lease_id", "lease_ttl_s")
+    fleet.described = description("lease_id", "lease_ttl_s")
     client = client_of(fleet)
     motion = asyncio.ensure_future(client.move("arm-1", "moveTo", {"x": 0.1}, wait=True))
     await asyncio.wait_for(asked.wait(), 20.0)
@@ -200,7 +257,7 @@ def own_verb(name: str = "brewCoffee", *leases: str, **more: Any) -> AdvertisedV
 async def test_own_verb_carries_the_lease_that_it_takes_and_is_waited_for(
     leases: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    fleet, waits = FakeFleet(brewCoffee=success("brewed")), list[float]()
+    fleet, waits = FakeNetwork(brewCoffee=success("brewed")), list[float]()
     call = fleet.call_async
 
     async def timed(robot: str, verb: str, params: Mapping[str, Any], within: float) -> Envelope:
@@ -212,11 +269,11 @@ async def test_own_verb_carries_the_lease_that_it_takes_and_is_waited_for(
     assert text_of(answer) == "brewed"
     assert set(fleet.sent("brewCoffee")) == {"cups", *leases}
     assert waits == [100.0]
-    assert fleet.stops == 0
+    assert fleet.stop_count == 0
 
 
 async def test_held_lease_goes_with_no_verb_that_does_not_take_it() -> None:
-    fleet = FakeFleet(
+    fleet = FakeNetwork(
         brewCoffee=success("brewed"),
         acquireControl=success("held", lease_id="secret", robot_name=""),
         getStatus=success("idle"),
@@ -231,14 +288,14 @@ async def test_held_lease_goes_with_no_verb_that_does_not_take_it() -> None:
 
 
 async def test_motion_that_goes_on_after_its_answer_is_followed_to_its_end() -> None:
-    fleet = FakeFleet(brewCoffee=RUNNING, getStatus=success("over", task_status="completed"))
+    fleet = FakeNetwork(brewCoffee=RUNNING, getStatus=success("over", task_status="completed"))
     answer = await client_of(fleet).act("bar-1", own_verb("brewCoffee", "lease_id"), {})
     assert text_of(answer) == "under way"
-    assert [verb for verb, _ in fleet.calls] == ["brewCoffee", "getStatus"]
+    assert fleet.verbs == ["brewCoffee", "getStatus"]
 
 
 async def test_own_verb_whose_call_is_cancelled_is_halted(monkeypatch: pytest.MonkeyPatch) -> None:
-    fleet, begun = FakeFleet(), asyncio.Event()
+    fleet, begun = FakeNetwork(), asyncio.Event()
 
     async def hangs(robot: str, verb: str, params: Mapping[str, Any], within: float) -> Envelope:
         begun.set()
@@ -250,4 +307,4 @@ async def test_own_verb_whose_call_is_cancelled_is_halted(monkeypatch: pytest.Mo
     await begun.wait()
     acting.cancel()
     await asyncio.wait([acting])
-    assert fleet.stops >= 1
+    assert fleet.stop_count >= 1

@@ -3,38 +3,45 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Mapping
+from typing import Any
 
 import pytest
+from tests.fleet.scripted import ScriptedNetwork
 
-from strands_robots.envelope import is_error, success, text_of
+from strands_robots.envelope import Envelope, is_error, success, text_of
+from strands_robots.fleet.networks import Networks
 from strands_robots.mcp import caller as calls
 from strands_robots.mcp import queries as module
 from strands_robots.mcp.caller import Caller
 from strands_robots.mcp.queries import AT_ONCE, NoTurnError, Queries
 
 
-class Robots:
+class Robots(ScriptedNetwork):
     """Robots that answer once they may, and count the reads that they have at a time."""
 
     def __init__(self) -> None:
+        super().__init__()
         self.may_answer = asyncio.Event()
-        self.open, self.most = 0, 0
+        self.waiting, self.most = 0, 0
 
-    async def call_async(self, robot: str, verb: str, params: object, within: float) -> dict[str, object]:
-        self.open += 1
-        self.most = max(self.most, self.open)
+    async def call_async(self, robot: str, verb: str, arguments: Mapping[str, Any], within: float) -> Envelope:
+        self.waiting += 1
+        self.most = max(self.most, self.waiting)
         await self.may_answer.wait()
-        self.open -= 1
+        self.waiting -= 1
         return success("here", robot=robot)
 
 
 def client_of(robots: Robots) -> Caller:
-    return Caller(robots)  # type: ignore[arg-type]
+    networks = Networks([robots])
+    networks.open()
+    return Caller(networks)
 
 
 async def until_waiting(robots: Robots, number: int) -> None:
     async with asyncio.timeout(30):
-        while robots.open < number:  # noqa: ASYNC110 - the robots stand for many events
+        while robots.waiting < number:  # noqa: ASYNC110 - the robots stand for many events
             await asyncio.sleep(0)
 
 

@@ -1,29 +1,50 @@
-"""E-stop link of an MCP server: opened behind its start, closed at its end."""
+"""E-stop links of an MCP server: opened behind its start on each network, closed at its end."""
 
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import pytest
 from fixtures.waiting import eventually, free_port
+from tests.fleet.scripted import ScriptedNetwork
 
-from strands_robots.device_connect.backends import LinkConfig, loopback_config
+from strands_robots.device_connect.backends import loopback_config
+from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
+from strands_robots.fleet.device_connect.network import DeviceConnectNetwork
+from strands_robots.fleet.networks import Networks
 from strands_robots.mcp import standing as module
-from strands_robots.mcp.standing import StandingController
+from strands_robots.mcp.standing import DOWN, OPENING, StandingController
 
 
-class FakeController:
-    """A controller, or what follows stops for it, that notes its end."""
+class Sender:
+    """A controller whose link a test sets."""
 
     link_up = True
 
-    def __init__(self, name: str, closed: list[str]) -> None:
-        self._name, self._closed = name, closed
 
-    def close(self) -> None:
-        """Note the end."""
-        self._closed.append(self._name)
+class StandNetwork(ScriptedNetwork):
+    """A network whose e-stop link opens once ``may_open`` is set, and fails while ``fault`` is set."""
+
+    def __init__(self, name: str = DEVICE_CONNECT) -> None:
+        super().__init__(name)
+        self.may_open, self.fault = threading.Event(), ""
+        self.tries, self.sender = 0, Sender()
+        self.may_open.set()
+
+    @contextmanager
+    def standing(self, signing_key: Any, known: Callable[[], Collection[str]]) -> Iterator[Any]:
+        self.tries += 1
+        assert self.may_open.wait(30)
+        if self.fault:
+            raise OSError(self.fault)
+        self.standing_for.append(known)
+        try:
+            yield self.sender
+        finally:
+            self.standing_for.remove(known)
 
 
 def names() -> set[str]:
@@ -31,76 +52,93 @@ def names() -> set[str]:
 
 
 @pytest.fixture
-def link() -> LinkConfig:
-    return loopback_config(free_port())
+def near() -> StandNetwork:
+    return StandNetwork()
 
 
-def test_server_goes_on_while_its_link_is_opened(monkeypatch: pytest.MonkeyPatch, link: LinkConfig) -> None:
-    slow, opened, closed = threading.Event(), list[tuple[str, bool]](), list[str]()
+@pytest.fixture
+def networks(near: StandNetwork) -> Iterator[Networks]:
+    with Networks([near]) as joined:
+        yield joined
 
-    def make(source: str, _link: LinkConfig, *, stands: bool) -> Any:
-        assert slow.wait(30)
-        opened.append((source, stands))
-        return FakeController("controller", closed)
 
-    monkeypatch.setattr(module, "safety_controller", make)
-    monkeypatch.setattr(module, "stand", lambda _controller, _link: FakeController("roster", closed))
-    standing = StandingController("helper", link)
+def test_server_goes_on_while_its_link_is_opened(near: StandNetwork, networks: Networks) -> None:
+    near.may_open.clear()
+    standing = StandingController("helper", networks)
+    assert standing.problem == f"{near.name}: {OPENING}"
     standing.open()
-    assert not opened, "the server waited for its e-stop link"
-    slow.set()
+    assert not near.standing_for, "the server waited for its e-stop link"
+    near.may_open.set()
+    eventually(lambda: standing.problem == "", what="its stand")
+    near.sender.link_up = False
+    assert standing.problem == f"{near.name}: {DOWN}"
     standing.close()
-    assert opened == [("helper", True)]
-    assert closed == ["roster", "controller"]
-    assert "standing controller" not in names()
+    assert not near.standing_for
+    assert f"stand on {near.name}" not in names()
 
 
 def test_link_that_cannot_be_opened_is_told_and_tried_again(
-    monkeypatch: pytest.MonkeyPatch, link: LinkConfig, caplog: pytest.LogCaptureFixture
+    near: StandNetwork, networks: Networks, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    tries, works, closed = list[str](), threading.Event(), list[str]()
-
-    def make(source: str, *_arguments: Any, **_options: Any) -> Any:
-        tries.append(source)
-        if not works.is_set():
-            raise OSError("no file descriptor is left")
-        return FakeController("controller", closed)
-
-    monkeypatch.setattr(module, "safety_controller", make)
-    monkeypatch.setattr(module, "stand", lambda _controller, _link: FakeController("roster", closed))
+    near.fault = "no file descriptor is left"
     monkeypatch.setattr(module, "AGAIN_S", 0.01)
-    standing = StandingController("helper", link)
+    standing = StandingController("helper", networks)
     standing.open()
-    eventually(lambda: len(tries) > 2, what="further tries")
+    eventually(lambda: near.tries > 2, what="further tries")
     assert "no file descriptor is left" in standing.problem
     assert caplog.text.count("helper does not report whom it misses") == 1
-    works.set()
+    near.fault = ""
     eventually(lambda: standing.problem == "", what="its stand")
     standing.close()
-    assert closed == ["roster", "controller"]
+    assert not near.standing_for
 
 
-def test_close_waits_for_no_further_try(monkeypatch: pytest.MonkeyPatch, link: LinkConfig) -> None:
-    def make(*_arguments: Any, **_options: Any) -> Any:
-        raise OSError("no file descriptor is left")
-
-    monkeypatch.setattr(module, "safety_controller", make)
+def test_close_waits_for_no_further_try(
+    near: StandNetwork, networks: Networks, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    near.fault = "no file descriptor is left"
     monkeypatch.setattr(module, "AGAIN_S", 1000.0)
-    standing = StandingController("helper", link)
+    standing = StandingController("helper", networks)
     standing.open()
     eventually(lambda: "no file descriptor" in standing.problem, what="the failure")
     standing.close()
-    assert "standing controller" not in names()
+    assert f"stand on {near.name}" not in names()
 
 
-def test_controller_that_was_never_opened_can_be_closed(link: LinkConfig) -> None:
-    StandingController("helper", link).close()
+def test_it_stands_on_a_network_that_comes_later_and_names_the_one_where_it_does_not(near: StandNetwork) -> None:
+    far, there = StandNetwork(MESH), threading.Event()
+    later = [lambda: far if there.is_set() else None]
+    with Networks([near], {MESH: "no hub"}, stays=True, later=later) as networks:
+        standing = StandingController("helper", networks)
+        standing.open()
+        eventually(lambda: standing.problem == "", what="its stand on the one network that is there")
+        far.fault = "refused"
+        there.set()
+        eventually(lambda: "refused" in standing.problem, what="the failure")
+        assert standing.problem.startswith(f"{MESH}: ")
+        assert near.standing_for
+        standing.close()
 
 
-def test_no_thread_is_left_of_a_true_link(link: LinkConfig) -> None:
+def test_network_that_is_not_joined_is_named(near: StandNetwork) -> None:
+    near.unreachable = "no broker"
+    with Networks([near], stays=True) as networks:
+        standing = StandingController("helper", networks)
+        standing.open()
+        assert standing.problem == f"{near.name}: no broker"
+        standing.close()
+
+
+def test_controller_that_was_never_opened_can_be_closed(networks: Networks) -> None:
+    StandingController("helper", networks).close()
+
+
+def test_no_thread_is_left_of_a_true_link() -> None:
     before = names()
-    standing = StandingController("helper", link)
-    standing.open()
-    eventually(lambda: "standing roster" in names(), 30.0, what="the link")
-    standing.close()
-    eventually(lambda: not {"standing roster", "standing controller"} & (names() - before), 10.0, what="its end")
+    with Networks([DeviceConnectNetwork(loopback_config(free_port()), "helper")]) as networks:
+        standing = StandingController("helper", networks)
+        standing.open()
+        eventually(lambda: standing.problem == "" and "standing roster" in names(), 30.0, what="the link")
+        standing.close()
+        left = {"standing roster", f"stand on {DEVICE_CONNECT}"}
+        eventually(lambda: not left & (names() - before), 10.0, what="its end")

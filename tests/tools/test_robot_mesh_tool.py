@@ -352,6 +352,12 @@ def test_own_verb_is_called_with_its_arguments_for_as_long_as_it_lasts(bar: Scri
     assert bar.calls == [("bar-1", "brewCoffee", {"cups": 2}, 125.0), ("bar-1", "ownUnknown", {}, 35.0)]
 
 
+def test_error_without_content_is_an_error_to_the_model(bar: ScriptedNetwork) -> None:
+    bar.answers["brewCoffee"] = lambda _: {"status": "error", "error": "resume rejected"}
+    answer = robot_mesh(action="call", target="bar-1", verb="brewCoffee", arguments={"cups": 2})
+    assert (answer["status"], answer["content"][0]) == ("error", {"text": "resume rejected"})
+
+
 def test_peers_name_own_verbs_with_their_parameters_and_devices_that_cannot_be_stopped(bar: ScriptedNetwork) -> None:
     ours, echo = robot_mesh(action="peers")["peers"]
     assert ours["functions"][:3] == ["brewCoffee", "resume", "acquireControl"]

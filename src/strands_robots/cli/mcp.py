@@ -1,11 +1,11 @@
-"""``mcp``: all robots of a network for MCP clients, on stdio or over HTTP."""
+"""``mcp``: all robots for MCP clients, on stdio or over HTTP."""
 
 from __future__ import annotations
 
 import asyncio
 from contextlib import closing
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -14,6 +14,9 @@ from strands_robots.cli.network import Network
 from strands_robots.cli.output import CliError, Exit, Screen
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.utils import device_id, install_line, port
+
+if TYPE_CHECKING:
+    from strands_robots.fleet.networks import Networks
 
 
 def register(app: typer.Typer) -> None:
@@ -39,42 +42,42 @@ def mcp(
     """Serve all robots to an MCP client that starts this (stdio), or over HTTP."""
     name = device_id("--as", source)
     try:
-        from strands_robots.mcp.caller import Caller  # noqa: PLC0415 - loaded when it is used
-        from strands_robots.mcp.server import serve_stdio  # noqa: PLC0415 - as above
+        from strands_robots.mcp.server import serve_stdio  # noqa: PLC0415 - loaded when it is used
         from strands_robots.mcp.standing import StandingController  # noqa: PLC0415 - as above
     except ModuleNotFoundError as missing:
         raise CliError(f"The MCP server needs the extra mcp ({install_line('mcp')}): {missing}.") from missing
-    if http is None:
-        with network.fleet(name) as fleet, closing(StandingController(name, fleet.link)) as standing:
+
+    def networks_of(caller: str) -> Networks:
+        return network.networks(source=caller, stays=True)
+
+    with networks_of(name) as networks, closing(StandingController(name, networks)) as standing:
+        if http is None:
             standing.open()
-            asyncio.run(serve_stdio(Caller(fleet), read_only=read_only, standing=lambda: standing.problem))
-        return
-    from strands_robots.device_connect import FleetClient  # noqa: PLC0415 - as above
-    from strands_robots.mcp.http import Address, serve_http  # noqa: PLC0415 - as above
-    from strands_robots.mcp.tokens import Token  # noqa: PLC0415 - as above
+            asyncio.run(serve_stdio(networks, read_only=read_only, standing=lambda: standing.problem))
+            return
+        from strands_robots.mcp.http import Address, serve_http  # noqa: PLC0415 - as above
+        from strands_robots.mcp.tokens import Token  # noqa: PLC0415 - as above
 
-    host, _, number = http.rpartition(":")
-    try:
-        at = port("--http", int(number))
-    except ValueError:
-        raise CliError(f"--http takes a port or HOST:PORT, not {http!r}.", Exit.USAGE) from None
-    address = Address(host.strip("[]") or "127.0.0.1", at, http_cert, http_key, tuple(http_name or ()))
-    link = network.link()
-    default = Token(name, read_only=read_only)
+        host, _, number = http.rpartition(":")
+        try:
+            at = port("--http", int(number))
+        except ValueError:
+            raise CliError(f"--http takes a port or HOST:PORT, not {http!r}.", Exit.USAGE) from None
+        address = Address(host.strip("[]") or "127.0.0.1", at, http_cert, http_key, tuple(http_name or ()))
 
-    def ready(url: str) -> None:
-        screen.say(url)
-        standing.open()
+        def ready(url: str) -> None:
+            screen.say(url)
+            standing.open()
 
-    try:
-        with closing(StandingController(name, link)) as standing:
-            serving = serve_http(
-                lambda who: FleetClient(link, who),
-                address,
-                default=default,
-                ready=ready,
-                standing=lambda: standing.problem,
-            )
+        serving = serve_http(
+            networks,
+            networks_of,
+            address,
+            default=Token(name, read_only=read_only),
+            ready=ready,
+            standing=lambda: standing.problem,
+        )
+        try:
             asyncio.run(serving)
-    except (StrandsRobotsError, OSError) as problem:
-        raise CliError(str(problem), Exit.USAGE) from problem
+        except (StrandsRobotsError, OSError) as problem:
+            raise CliError(str(problem), Exit.USAGE) from problem

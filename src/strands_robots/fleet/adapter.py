@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
+from enum import Enum
 from typing import TYPE_CHECKING, Any, Protocol
 
 from strands_robots.envelope import Envelope
@@ -83,6 +84,7 @@ class RobotEvent:
         load: of the robot's host, 1 for all of its cores.
         frequent: one of many of its kind, which report a state.
         alive: False where a broker may have kept it, so that it proves no life.
+        picture: a JPEG of the camera that ``part`` names.
     """
 
     robot: str
@@ -94,10 +96,20 @@ class RobotEvent:
     load: float | None = field(default=None, repr=False, compare=False)
     frequent: bool = field(default=False, repr=False, compare=False)
     alive: bool = field(default=True, repr=False, compare=False)
+    picture: bytes | None = field(default=None, repr=False, compare=False)
 
 
 EVERY = "*"
 """Every robot of a network, where one is followed."""
+
+
+class Detail(Enum):
+    """Messages of a robot that are followed, where its network tells them apart."""
+
+    EVENTS = "its events"
+    STATES = "its states besides"
+    ALL = "its pictures besides, and the stops and resumes of the fleet"
+
 
 OnEvent = Callable[[RobotEvent], None]
 """Takes an event on a thread of the network: it returns at once and does not raise."""
@@ -214,7 +226,7 @@ class NetworkAdapter(Protocol):
         """Return a call as the robot receives it; asks no one.
 
         Raises:
-            ValidationError: it would refuse the arguments.
+            RefusalError: it would refuse the arguments.
         """
 
     async def call_async(self, robot: str, verb: str, arguments: Mapping[str, Any], within: float) -> Envelope:
@@ -338,12 +350,16 @@ class NetworkAdapter(Protocol):
             timeout: seconds in which each robot has to answer.
         """
 
-    def subscribe(self, robot: str, on_event: OnEvent) -> Callable[[], None]:
+    def beats_every(self, robot: str) -> float:
+        """Return the seconds between two beats of a robot."""
+
+    def subscribe(self, robot: str, on_event: OnEvent, detail: Detail = Detail.EVENTS) -> Callable[[], None]:
         """Receive the robot's events; return what ends it, which never fails.
 
         Args:
             robot: an id, or :data:`EVERY` for all robots: then also their states and signs of life.
             on_event: takes each event.
+            detail: the messages that are events.
         """
 
     def close(self) -> None:

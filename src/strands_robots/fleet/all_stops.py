@@ -94,7 +94,10 @@ def estop_all(
             on_progress=lambda progress: on_progress(network.name, progress),
         )
         # A link that is down where devices could be looked for is one to which no robot is connected.
-        return NetworkVerdict(network.name, outcome, absent="" if outcome.report.link else "; ".join(outcome.problems))
+        why = "" if outcome.report.link else "; ".join(outcome.problems)
+        if why:
+            networks.absent[network.name] = why
+        return NetworkVerdict(network.name, outcome, absent=why)
 
     verdicts = _told_once(_on_each(networks, stopped, apart=True), {*scope.only, *named})
     reached, unreached = _parted(verdicts)
@@ -119,7 +122,9 @@ def not_left(network: str, key: Callable[[], NetworkKey], why: object) -> Networ
 
 
 def answer_of(verdict: FleetVerdict, networks: Networks) -> Envelope:
-    """Return the verdict as one answer; that of one network alone as this network words it.
+    """Return the verdict as one answer.
+
+    That of one network alone is as this network words it.
 
     With several, ``stopped`` is True, False, or None where it is not known, ``not_stopped`` and ``silent`` list robots,
     ``robots`` has the answers by id and ``networks`` the facts of each network.
@@ -168,13 +173,10 @@ def _on_each(networks: Networks, stop: Callable[[NetworkAdapter], NetworkVerdict
             return not_left(network.name, lambda: network.key, exc), True
         return verdict, verdict.outcome is None or verdict.outcome.report.link
 
-    stated = networks.stated
-    stops = side_by_side(stopped, stated)
+    stops = side_by_side(stopped, networks.stated)
     stops += [
         (not_left(name, key, networks.absent.get(name, "it is not joined")), False)
         for name, key in networks.keys.items()
-        # One of them may have come since the stop left.
-        if all(name != each.name for each in stated)
     ]
     return stops
 

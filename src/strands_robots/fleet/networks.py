@@ -12,17 +12,16 @@ from typing import TYPE_CHECKING, Any, Self
 
 from strands_robots.envelope import Envelope, error
 from strands_robots.errors import NoSuchRobotError, RefusalError, UnreachableError
-from strands_robots.fleet.adapter import FIND_S, STOP_S, FoundRobot, NetworkAdapter, OnEvent
-from strands_robots.fleet.fleet_verdict import combined, verdict_of_answer
+from strands_robots.fleet.adapter import FIND_S, STOP_S, Detail, FoundRobot, NetworkAdapter, OnEvent
 from strands_robots.fleet.refusals import answered
-from strands_robots.fleet.shared_id import SharedId, decided
 from strands_robots.fleet.side_by_side import side_by_side
-from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.known_verbs import READS, RESUMES, STOPS
 from strands_robots.utils import near, plain_text
 
 if TYPE_CHECKING:
+    from strands_robots.fleet.shared_id import SharedId
     from strands_robots.safety.network_key import NetworkKey
+    from strands_robots.safety.stopping import StopVerdict
     from strands_robots.serving.advertised import AdvertisedVerb
 
 logger = logging.getLogger(__name__)
@@ -131,10 +130,10 @@ class Networks:
         absent: networks that are not joined, with the reason.
         keys: names of absent networks under which their robots are remembered, so that a stop names these.
         stays: go on trying to join those that are not there yet.
-        later: absent networks that may come: each returns its network once that is there, and is asked every second.
+        unasked: networks that no one asked for, so that their absence is not told.
 
     Attributes:
-        stated: as given, and those that came later.
+        stated: as given.
         keys: as given.
         absent: networks that are not joined or do not answer, with the reason.
     """
@@ -146,14 +145,14 @@ class Networks:
         keys: Mapping[str, Callable[[], NetworkKey]] | None = None,
         *,
         stays: bool = False,
-        later: Sequence[Callable[[], NetworkAdapter | None]] = (),
+        unasked: Collection[str] = (),
     ) -> None:
         self.stated = tuple(stated)
+        self._unasked = frozenset(unasked)
         self.absent: dict[str, str] = dict(absent or {})
         self.keys = dict(keys or {})
-        self._stays, self._later = stays, later
-        self._closed = self._waiting = False
-        self._left: threading.Event | None = None
+        self._stays = stays
+        self._opened = self._closed = False
         self._joinings: tuple[_Joining, ...] = ()
         self._change = threading.Condition()
         self._listeners: list[Callable[[NetworkAdapter], None]] = []
@@ -167,13 +166,19 @@ class Networks:
     def __exit__(self, *_exception: object) -> None:
         self.close()
 
-    def open(self) -> None:
+    def open(self, *, in_turn: bool = False) -> None:
         """Begin to join all networks; return once one of them is joined.
+
+        Args:
+            in_turn: join the others only once the first one cannot be joined, or lacks what is asked for.
 
         Raises:
             UnreachableError: none of them can be reached, and they do not stay.
         """
-        self.begin(here=len(self.stated) == 1 and not self._stays)
+        if in_turn and self.stated and not self._stays:
+            self._attempts()[0].begin(here=True)
+        if not self.joined:
+            self.begin(here=len(self.stated) == 1 and not self._stays)
         with self._change:
             self._change.wait_for(lambda: self.joined or all(each.attempted.is_set() for each in self._joinings))
         unexpected = next((each.unexpected for each in self._joinings if each.unexpected), None)
@@ -190,19 +195,13 @@ class Networks:
         self._closed = False
         for each in self._attempts():
             each.begin(here=here)
-        with self._change:
-            later, self._waiting, left = self._later if not self._waiting else (), True, self._left
-        for came in later:
-            threading.Thread(target=self._await, args=(came, left), name="await a network", daemon=True).start()
 
     def close(self) -> None:
         """Leave the networks."""
         with self._change:
-            self._closed, joinings, self._joinings = True, self._joinings, ()
-            left, self._left, self._waiting = self._left, None, False
+            self._closed, self._opened = True, False
+            joinings, self._joinings = self._joinings, ()
             self._told.clear()
-        if left is not None:
-            left.set()
         for each in joinings:
             each.close()
 
@@ -225,7 +224,7 @@ class Networks:
         Raises:
             UnreachableError: as it says.
         """
-        if self._left is None:
+        if not self._opened:
             raise UnreachableError("not joined: use it as a context manager", remedy="with connect() as fleet: ...")
 
     def settled(self) -> tuple[NetworkAdapter, ...]:
@@ -257,9 +256,17 @@ class Networks:
         return "" if joining.up else joining.why or CLOSED
 
     @property
+    def missing(self) -> dict[str, str]:
+        """The absent networks that someone asked for, with their reasons."""
+        return {name: why for name, why in self.absent.copy().items() if name not in self._unasked}
+
+    @property
     def absences(self) -> str:
-        """The absent networks with their reasons, as one text."""
-        return "; ".join(f"{name}: {why.rstrip('.')}" for name, why in self.absent.items())
+        """Reasons why networks are absent, first of those that someone asked for."""
+        stated = self.missing or self.absent
+        if len(stated) == 1:
+            return next(iter(stated.values()))
+        return "; ".join(f"{name}: {why.rstrip('.')}" for name, why in stated.items())
 
     @property
     def reach(self) -> str:
@@ -353,6 +360,8 @@ class Networks:
             raise NoSuchRobotError(f"No robot {robot[:100]!r} is in reach", robot=robot, verb=verb, remedy=remedy)
         if len(bearers) == 1 or not moves:
             return self._decided(robot, bearers) or bearers[0]
+        from strands_robots.fleet.shared_id import decided  # noqa: PLC0415 - few ids are on two networks
+
         return decided(self._shared_id(robot), robot, verb, bearers)
 
     def session(self, robot: str) -> object:
@@ -399,6 +408,13 @@ class Networks:
         Raises:
             RefusalError: as :meth:`NetworkAdapter.call`, or as :meth:`of`.
         """
+        if len(self.joined) == 1 and not moves:
+            # The others are not joined before the first one lacks the robot.
+            try:
+                return self.joined[0].call(robot, verb, arguments, timeout)
+            except NoSuchRobotError:
+                if len(self.settled()) == 1:
+                    raise
         return self.of(robot, verb, moves=moves).call(robot, verb, arguments, timeout)
 
     async def call_async(
@@ -449,6 +465,8 @@ class Networks:
 
     def halt(self, robot: str, robot_name: str = "") -> StopVerdict:
         """Stop every bearer of an id; return the verdict."""
+        from strands_robots.fleet.fleet_verdict import combined, verdict_of_answer  # noqa: PLC0415 - a call need not load it
+
         began, answers = time.monotonic(), self.stop(robot, robot_name=robot_name)
         name = f"{robot}/{robot_name}" if robot_name else robot
         verdicts = [
@@ -483,7 +501,7 @@ class Networks:
         of_bearers = {each.name: said for each, said in answers.items() if each in graded or _bears(each, robot)}
         return of_bearers or {each.name: said for each, said in answers.items()}
 
-    def subscribe(self, robot: str, on_event: OnEvent) -> Callable[[], None]:
+    def subscribe(self, robot: str, on_event: OnEvent, detail: Detail = Detail.EVENTS) -> Callable[[], None]:
         """Receive a robot's events on every network, also on those that are joined later.
 
         Returns:
@@ -493,7 +511,7 @@ class Networks:
 
         def follow(network: NetworkAdapter) -> None:
             try:
-                end = network.subscribe(robot, on_event)
+                end = network.subscribe(robot, on_event, detail)
             except RefusalError as exc:
                 logger.warning("Events on %s cannot be received: %s", network.name, exc)
                 return
@@ -518,22 +536,10 @@ class Networks:
     def _attempts(self) -> tuple[_Joining, ...]:
         """Return the attempts to join each network; none once they were left."""
         with self._change:
-            if self._left is None and not self._closed:
-                self._left = threading.Event()
+            if not self._opened and not self._closed:
+                self._opened = True
                 self._joinings = tuple(_Joining(each, again=self._stays, changed=self._changed) for each in self.stated)
             return self._joinings
-
-    def _await(self, came: Callable[[], NetworkAdapter | None], left: threading.Event) -> None:
-        """Join a network once it is there."""
-        while (network := came()) is None:
-            if left.wait(AGAIN_S):
-                return
-        joining = _Joining(network, again=True, changed=self._changed)
-        with self._change:
-            if left.is_set():
-                return
-            self.stated, self._joinings = (*self.stated, network), (*self._joinings, joining)
-        joining.begin(here=True)
 
     def _changed(self, joining: _Joining) -> None:
         if joining.up:
@@ -567,7 +573,7 @@ class Networks:
         return {each.name: said for each, said in zip(self.stated, answers, strict=True) if said is not None}
 
     def _at_once(self, robot: str, *, moves: bool) -> NetworkAdapter | None:
-        """Return the network on which a robot is called, where that is known without a question."""
+        """Return the network of a robot where it is known without a question."""
         joined = self.joined
         if len(joined) == 1 and all(each.attempted.is_set() for each in self._joinings):
             return joined[0]
@@ -575,6 +581,8 @@ class Networks:
         return None if moves or not bearers else self._decided(robot, bearers) or bearers[0]
 
     def _shared_id(self, robot: str) -> SharedId:
+        from strands_robots.fleet.shared_id import SharedId  # noqa: PLC0415 - as above
+
         with self._change:
             if len(self._shared_ids) >= SHARED_IDS_MAX and robot not in self._shared_ids:
                 del self._shared_ids[next(iter(self._shared_ids))]

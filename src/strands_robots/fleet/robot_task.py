@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from strands_robots.contract import RUNNING
 from strands_robots.utils import plain_text
 
 TASK_MAX = 2000
@@ -33,6 +34,14 @@ def task_of(facts: Mapping[str, Any]) -> dict[str, Any]:
         }
     task = {"state": _text(facts.get("task_status")).lower() or "idle", "instruction": _text(facts.get("instruction"))}
     return task | _step(facts.get("step_count"))
+
+
+def runs(facts: Mapping[str, Any], robot_name: str = "") -> bool:
+    """Return whether a robot, or one of a world, runs a task by its status."""
+    running = facts.get("running_policies")
+    if isinstance(running, Mapping):
+        return robot_name in running if robot_name else bool(running)
+    return str(facts.get("task_status", "")).lower() in RUNNING
 
 
 def _text(value: object) -> str:

@@ -1,1 +1,1 @@
-"""MCP server over all robots of a network: ``strands-robots mcp``."""
+"""MCP server over all robots: ``strands-robots mcp``."""

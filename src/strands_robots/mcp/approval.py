@@ -31,7 +31,9 @@ from mcp.types import (
 from pydantic import BaseModel, Field
 
 from strands_robots.envelope import Envelope, error, is_error
+from strands_robots.fleet.adapter import ReceivedCall
 from strands_robots.mcp.access import ClientAccess
+from strands_robots.mcp.caller import Caller
 from strands_robots.mcp.results import jpeg_of, result
 from strands_robots.safety.approval import Approval, Grants, digest
 from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS
@@ -59,6 +61,8 @@ WITHOUT_PARTS = "2026-07-28"
 """The first revision in which a question is a result, and its answer comes with the call anew."""
 
 Outcome: TypeAlias = CallToolResult | InputRequiredResult
+Motion: TypeAlias = tuple[Caller, str]
+"""Client and motion of a question."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +81,10 @@ class Wish:
     sent: Mapping[str, Any]
     run: Callable[[], Awaitable[Envelope]]
 
+    async def received(self, access: ClientAccess) -> ReceivedCall:
+        """Return the motion as its robot receives it; raises as :meth:`Networks.of`."""
+        return await access.caller.received(self.robot, self.verb, self.sent)
+
 
 class Approve(BaseModel):
     """The form that a user fills in."""
@@ -90,18 +98,17 @@ class Approvals:
 
     def __init__(self, grants: Callable[[], Grants] = lambda: Grants(state_dir() / "grants")) -> None:
         self._grants = grants
-        self._asked: dict[str, tuple[float, str]] = {}
+        self._asked: dict[str, tuple[float, Motion | None]] = {}
 
     async def carry_out(self, context: Context[Any, Any], access: ClientAccess, wish: Wish) -> Outcome:
         """Carry out a motion, with the approval of the client's user if it needs one."""
         robot, verb, params = wish.robot, wish.verb, wish.params
-        source = access.caller.fleet.source
-        motion = json.dumps([source, robot, verb, wish.sent], sort_keys=True, default=str)
+        motion = access.caller, json.dumps([robot, verb, wish.sent], sort_keys=True, default=str)
         answered = self._answered(context, motion)
         if answered is not None:
-            return result(await self._granted(wish, source) if answered else _declined(robot, verb))
+            return result(await self._granted(access, wish) if answered else _declined(robot, verb))
         answer = await wish.run()
-        if answer.get("reason") != Approval.refusal(verb, robot):
+        if not is_error(answer) or not _unapproved(answer, robot, await wish.received(access)):
             return result(answer)
         question, encoded = await _question(access, robot, verb, params)
         image = [ImageContent(type="image", data=encoded, mime_type="image/jpeg")] if encoded else []
@@ -112,9 +119,9 @@ class Approvals:
         if str(context.protocol_version or "") >= WITHOUT_PARTS:
             return self._ask(message, motion)
         yes = await _approved(context, message)
-        return result(await self._granted(wish, source) if yes else _declined(robot, verb))
+        return result(await self._granted(access, wish) if yes else _declined(robot, verb))
 
-    def _ask(self, message: str, motion: str) -> InputRequiredResult:
+    def _ask(self, message: str, motion: Motion) -> InputRequiredResult:
         now = time.monotonic()
         self._asked = {key: each for key, each in self._asked.items() if now - each[0] < ASKED_S}
         while len(self._asked) >= ASKED_MAX:
@@ -124,12 +131,12 @@ class Approvals:
         form = ElicitRequestFormParams(message=message, requested_schema=Approve.model_json_schema())
         return InputRequiredResult(input_requests={KEY: ElicitRequest(params=form)}, request_state=nonce)
 
-    def _answered(self, context: Context[Any, Any], motion: str) -> bool | None:
+    def _answered(self, context: Context[Any, Any], motion: Motion) -> bool | None:
         """Return the user's answer; None where this motion was not asked about."""
         replies, nonce = context.input_responses, context.request_state
         if not replies or not nonce:
             return None
-        at, asked = self._asked.pop(nonce, (0.0, ""))
+        at, asked = self._asked.pop(nonce, (0.0, None))
         if asked != motion or time.monotonic() - at > ASKED_S:
             return None
         reply = replies.get(KEY)
@@ -137,11 +144,11 @@ class Approvals:
             return False
         return (reply.content or {}).get("approve") is True
 
-    async def _granted(self, wish: Wish, source: str) -> Envelope:
-        robot, verb = wish.robot, wish.verb
+    async def _granted(self, access: ClientAccess, wish: Wish) -> Envelope:
+        robot, received = wish.robot, await wish.received(access)
         try:
-            bound = {"caller": source, "arguments_digest": digest(wish.sent)}
-            grant = self._grants().grant(verb, robot, GRANT_S, **bound)
+            bound = {"caller": received.caller, "arguments_digest": digest(received.arguments)}
+            grant = self._grants().grant(received.verb, robot, GRANT_S, **bound)
         except (StateFileError, ValidationError, OSError) as refused:
             return error(f"The approval could not be recorded: {refused}")
         try:
@@ -150,9 +157,15 @@ class Approvals:
             # Where the robot did not take it, as one on another machine does not, nobody else may.
             unused = grant.exists()
             grant.unlink(missing_ok=True)
-        if is_error(answer) and unused and answer.get("reason") == Approval.refusal(verb, robot):
+        if unused and _unapproved(answer, robot, received):
             return {**answer, "approved_here": "the robot is served by another machine or user, which has to approve"}
         return answer
+
+
+def _unapproved(answer: Envelope, robot: str, received: ReceivedCall) -> bool:
+    """Return whether a motion was refused for lack of its operator's approval."""
+    # A network may put the robot's id before it.
+    return is_error(answer) and str(answer.get("reason", "")).endswith(Approval.refusal(received.verb, robot))
 
 
 async def _approved(context: Context[Any, Any], message: str) -> bool:

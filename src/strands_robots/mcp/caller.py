@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import secrets
 import time
 from collections.abc import Awaitable, Callable, Mapping
@@ -11,16 +12,20 @@ from dataclasses import dataclass
 from typing import Any
 
 import anyio
-from device_connect_edge.messaging import MessagingError
 
 from strands_robots.arm_mixin import WAIT_S
 from strands_robots.contract import RUNNING
-from strands_robots.device_connect import FleetClient
-from strands_robots.device_connect.client import CallRefusedError, DeviceTimeoutError, NoSuchDeviceError
-from strands_robots.device_connect.discovery import Peer
 from strands_robots.envelope import Envelope, error, is_error, success, text_of
-from strands_robots.fleet.device_connect.stops import stop_and_lock, stop_everything
+from strands_robots.errors import NoAnswerError, NoSuchRobotError, RefusalError, UnreachableError
+from strands_robots.fleet.adapter import FoundRobot, NetworkAdapter, ReceivedCall
+from strands_robots.fleet.all_stops import answer_of, estop_all, stop_all
+from strands_robots.fleet.fleet_verdict import FleetVerdict
+from strands_robots.fleet.networks import Networks
+from strands_robots.fleet.refusals import LEASE_CODES, said
+from strands_robots.fleet.robot_task import runs
+from strands_robots.fleet.stop_answers import combined_verdict
 from strands_robots.mcp.queries import NoTurnError, Queries
+from strands_robots.mcp.results import refused
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.safety.stopping import Outcome, grade
 from strands_robots.serving.advertised import AdvertisedVerb, find_verb
@@ -48,8 +53,11 @@ RENEWED_S = 2.0
 URGENT_MAX = 8
 """Stops of all robots that one client has running at once."""
 
-OVER = frozenset({"displaced", "lease_over", "not_holder"})
-"""Answers to a renewal after which the lease is another's, or nobody's."""
+RUN_POLICY = "execute"
+"""Verb that runs a policy and answers at its start; some networks call it otherwise."""
+
+OUT_OF_SIGHT = (NoAnswerError, NoSuchRobotError, UnreachableError)
+"""Refusals after which nobody knows what the robot does."""
 
 Target = tuple[str, str]
 """A robot's id, and the name of one robot of its world or nothing."""
@@ -69,18 +77,19 @@ class _Held:
 
 
 class Caller:
-    """One client of the server: the connection of its name, and its leases.
+    """One client of the server: the networks under its name, and its leases.
 
     Args:
+        networks: opened ones.
         present: whether the client is there now; its leases are renewed as long as it is.
     """
 
-    def __init__(self, fleet: FleetClient, present: Callable[[], bool] = lambda: True) -> None:
-        self.fleet = fleet
+    def __init__(self, networks: Networks, present: Callable[[], bool] = lambda: True) -> None:
+        self.networks = networks
         self._present = present
         self._leases: dict[Target, _Held] = {}
         self._first: dict[str, str] = {}
-        self._moving: set[_Halting] = set()
+        self._moving: dict[asyncio.Task[Envelope], Target] = {}
         self._secrets: dict[str, str] = {}
         self._binding: set[tuple[str, str]] = set()
         self._used_at = time.monotonic()
@@ -96,10 +105,7 @@ class Caller:
         self, robot: str, verb: str, params: Mapping[str, Any] | None = None, lasts_s: float = 0.0
     ) -> Envelope:
         """Call a verb that moves nothing, and may last so long."""
-        try:
-            return await self._call(robot, verb, params or {}, ANSWER_S + lasts_s)
-        except DeviceTimeoutError as exc:
-            return error(str(exc))
+        return await self._call(robot, verb, params or {}, ANSWER_S + lasts_s)
 
     async def query(
         self, robot: str, verb: str, params: Mapping[str, Any] | None = None, lasts_s: float = 0.0
@@ -111,65 +117,61 @@ class Caller:
         except NoTurnError as refused:
             return error(str(refused))
 
-    async def describe(self, robot: str) -> Peer | Envelope:
-        """Return a robot as it describes itself now, or why it does not."""
-        description = await self.read(robot, "requestRegistration")
-        return description if is_error(description) else Peer.of(description)
+    async def describe(self, robot: str) -> FoundRobot:
+        """Return a robot as it describes itself now.
+
+        Raises:
+            RefusalError: it does not.
+        """
+        return await self.networks.describe_async(robot, ANSWER_S)
+
+    async def received(self, robot: str, verb: str, params: Mapping[str, Any]) -> ReceivedCall:
+        """Return a motion as its robot receives it; raises as :meth:`Networks.of`."""
+        network = await self.networks.of_async(robot, verb, moves=True)
+        return network.received(robot, _named_on(network, verb), params)
 
     async def move(self, robot: str, verb: str, params: Mapping[str, Any], *, wait: bool) -> Envelope:
         """Carry out a motion of an arm; a call that is given up halts it.
 
         Without ``wait`` the lease has to be held, whose end halts the robot of a client that went away.
         """
-        target = await self._target(robot, params)
-        if not wait and not self._holds(target):
-            return _needs_lease()
-        lease = await self._for_motion(target, verb)
-        arguments = {**move_arguments(params, wait=wait), **lease}
 
-        async def to_the_end(motion: _Halting) -> Envelope:
-            answer = await motion.begin(verb, arguments, ANSWER_S + WAIT_S)
-            while wait and str(answer.get("task_status", "")).lower() in RUNNING:
+        async def ended(answer: Envelope) -> Envelope:
+            while str(answer.get("task_status", "")).lower() in RUNNING:
                 task = {"task_id": answer.get("task_id", ""), **_named(params)}
                 answer = await self._followed(robot, "wait", task, ANSWER_S + WAIT_S)
             return answer
 
-        return await self._halting(target, lease, to_the_end)
+        return await self._carried_out(
+            robot, verb, move_arguments(params, wait=wait), ANSWER_S + WAIT_S, ended if wait else None
+        )
 
     async def run_policy(self, robot: str, params: Mapping[str, Any], *, wait: bool) -> Envelope:
         """Run a policy, to its end with ``wait``; halted and refused as :meth:`move`."""
-        target = await self._target(robot, params)
-        if not wait and not self._holds(target):
-            return _needs_lease()
-        lease = await self._for_motion(target, "execute")
 
-        async def to_the_end(motion: _Halting) -> Envelope:
-            answer = await motion.begin("execute", {**params, **lease}, ANSWER_S)
+        async def ended(answer: Envelope) -> Envelope:
             one = str(answer.get("robot_name") or params.get("robot_name") or "")
-            while wait and not is_error(answer):
+            while not is_error(answer):
                 await asyncio.sleep(POLL_S)
                 answer = await self._followed(robot, "getStatus", {}, ANSWER_S)
                 if not runs(answer, one):
                     break
             return answer
 
-        return await self._halting(target, lease, to_the_end)
+        return await self._carried_out(robot, RUN_POLICY, params, ANSWER_S, ended if wait else None)
 
     async def act(self, robot: str, verb: AdvertisedVerb, params: Mapping[str, Any]) -> Envelope:
         """Carry out a verb as the robot describes it, to its end; halted as :meth:`move`."""
-        target = await self._target(robot, params)
-        lease = self._lease_of(target, verb.leases)
 
-        async def to_the_end(motion: _Halting) -> Envelope:
-            answer = await motion.begin(verb.name, {**params, **lease}, ANSWER_S + verb.lasts_s)
+        async def ended(answer: Envelope) -> Envelope:
             status = answer
             # Where its answer says that it goes on, as that of a drive does, the end is waited for.
-            while verb.leases and not is_error(status) and runs(status, ""):
+            while verb.leases and not is_error(status) and runs(status):
                 await asyncio.sleep(POLL_S)
                 status = await self._followed(robot, "getStatus", {}, ANSWER_S)
             return status if is_error(status) else answer
 
-        return await self._halting(target, lease, to_the_end)
+        return await self._carried_out(robot, verb.name, params, ANSWER_S + verb.lasts_s, ended, takes=verb.leases)
 
     async def acquire(self, robot: str, ttl_s: float, robot_name: str) -> Envelope:
         """Acquire the control lease; motions of this client carry it from then on.
@@ -185,9 +187,9 @@ class Caller:
         at_robot = min(lasts, SILENCE_S)
         params = acquire_arguments(lasts, robot_name)
         # While a motion of its own runs, the secret of that motion says that the robot is this client's.
-        moves = any(each.target[0] == robot for each in self._moving)
+        moves = any(each == robot for each, _ in self._moving.values())
         own = self._lease(target) or ({LEASE_ID: self._secret(robot)} if moves else {})
-        answer = await self.read(robot, "acquireControl", {**params, **own})
+        answer = await self._call(robot, "acquireControl", {**params, **own}, ANSWER_S, moves=True)
         lease_id = answer.get(LEASE_ID)
         # The secret stays here: a model has no use for it.
         told = {name: value for name, value in answer.items() if name != LEASE_ID}
@@ -213,17 +215,21 @@ class Caller:
     async def stop(self, robot: str, robot_name: str = "") -> Envelope:
         """Stop a robot, one of a world, or all robots, without a lease or a wait."""
         if not robot:
-            loop = asyncio.get_running_loop()
-            return await loop.run_in_executor(self._urgent, stop_everything, self.fleet)
-        try:
-            return await self.fleet.stop_async(robot, robot_name=robot_name)
-        except ValidationError as refused:
-            return error(str(refused), stopped=None)
+            return await self._urgently(lambda: stop_all(self.networks))
+        answers = await self.networks.stop_async(robot, robot_name=robot_name)
+        if len(answers) == 1:
+            return next(iter(answers.values()))
+        return combined_verdict(
+            {f"{robot} on {each}": answer for each, answer in answers.items()}, self.networks.absences
+        )
 
     async def emergency_stop(self, reason: str, scope: Scope = EVERY_ROBOT) -> Envelope:
         """Stop and lock every robot, or those of ``scope``."""
-        loop = asyncio.get_running_loop()
-        return await loop.run_in_executor(self._urgent, stop_and_lock, self.fleet, reason, scope)
+        return await self._urgently(lambda: estop_all(self.networks, reason, scope=scope))
+
+    async def _urgently(self, stop: Callable[[], FleetVerdict]) -> Envelope:
+        verdict = await asyncio.get_running_loop().run_in_executor(self._urgent, stop)
+        return answer_of(verdict, self.networks)
 
     async def leave(self) -> None:
         """Halt what this client moves and holds, and release it."""
@@ -231,35 +237,65 @@ class Caller:
             each.end()
         with anyio.CancelScope(shield=True):
             held = tuple(self._leases)
-            await asyncio.gather(*(self.stop(*target) for target in {*held, *(each.target for each in self._moving)}))
+            await asyncio.gather(*(self.stop(*target) for target in {*held, *self._moving.values()}))
             await asyncio.gather(*(self.release(*target) for target in held))
 
     def close(self) -> None:
         """End the thread of the emergency stop."""
         self._urgent.shutdown(wait=False)
 
-    def motion(self, robot: str, verb: str, params: Mapping[str, Any], seconds: float) -> asyncio.Task[Envelope]:
-        """Start the call that begins a motion."""
-        return asyncio.ensure_future(self._call(robot, verb, params, seconds))
-
-    def watch(self, motion: _Halting, *, ended: bool) -> None:
-        """Keep a motion among those that :meth:`leave` halts."""
-        (self._moving.discard if ended else self._moving.add)(motion)
-
-    async def _halting(
-        self, target: Target, lease: Mapping[str, Any], work: Callable[[_Halting], Awaitable[Envelope]]
+    async def _carried_out(
+        self,
+        robot: str,
+        verb: str,
+        params: Mapping[str, Any],
+        seconds: float,
+        ended: Callable[[Envelope], Awaitable[Envelope]] | None,
+        *,
+        takes: frozenset[str] | None = None,
     ) -> Envelope:
-        halting = _Halting(self, target)
+        """Carry out a motion; halt it where it is given up or out of sight.
+
+        ``ended`` waits for the end of what the answer says, None for no end; ``takes`` names the lease's parameters
+        that the verb takes, for which the robot is asked by default.
+        """
+        target = await self._target(robot, params)
+        if ended is None and not self._holds(target):
+            return _needs_lease()
+        lease = await self._for_motion(target, verb) if takes is None else self._lease_of(target, takes)
+        call = self._call(robot, verb, {**params, **lease}, seconds, moves=True, lost=(NoAnswerError,))
+        begun = asyncio.ensure_future(call)
         renewing = asyncio.ensure_future(self._renew_motion(target)) if LEASE_TTL_S in lease else None
+        self._moving[begun] = target
         try:
-            async with halting as motion:
-                return await work(motion)
-        except (DeviceTimeoutError, NoSuchDeviceError, MessagingError) as exc:
-            confirmed = f", which is not confirmed: {halting.moves}" if halting.moves else "."
-            return error(f"{exc} What the call began was told to stop{confirmed}")
+            # The call goes on when its caller is cancelled: its answer says whether the stop came after the start.
+            answer = await asyncio.shield(begun)
+            return answer if ended is None else await ended(answer)
+        except BaseException as given_up:
+            moves = await self._halt(target, begun)
+            if not isinstance(given_up, OUT_OF_SIGHT):
+                raise
+            confirmed = f", which is not confirmed: {moves}" if moves else "."
+            return error(f"{said(given_up)} What the call began was told to stop{confirmed}")
         finally:
+            del self._moving[begun]
             if renewing is not None:
                 renewing.cancel()
+
+    async def _halt(self, target: Target, begun: asyncio.Task[Envelope]) -> str:
+        """Stop what a call began; return why it may still move, or ""."""
+        moves = ""
+        with anyio.CancelScope(shield=True):
+            for _attempt in range(STOPS_MAX):
+                is_answered = begun.done()
+                stop = await self.stop(*target)
+                moves = "" if grade(stop) is Outcome.STOPPED else text_of(stop)
+                # A stop may overtake the command that it is meant for, so one more follows until that is answered.
+                if is_answered and not moves:
+                    break
+                await (asyncio.sleep(SETTLE_S) if is_answered else asyncio.wait([begun], timeout=SETTLE_S))
+            begun.cancel()
+        return moves
 
     async def _renew_motion(self, target: Target) -> None:
         """Renew the lease of one motion until its call ends."""
@@ -271,7 +307,7 @@ class Caller:
         """Renew a held lease while its client is there, and its time after."""
         while self._present() or time.monotonic() - self._used_at < held.ttl_s:
             await asyncio.sleep(every_s)
-            if await self._renewed(target, held.lease_id) in OVER:
+            if await self._renewed(target, held.lease_id) in LEASE_CODES:
                 # A motion carries it all the same: the robot's refusal says who has taken control.
                 held.live = False
                 return
@@ -280,11 +316,8 @@ class Caller:
 
     async def _renewed(self, target: Target, lease_id: str) -> str:
         """Renew a lease at the robot; return the code of its refusal, or nothing."""
-        try:
-            answer = await self._call(target[0], "renewControl", {LEASE_ID: lease_id, **_world(target)}, RENEWED_S)
-        except DeviceTimeoutError:
-            return ""
-        return str(answer.get("code", ""))
+        params = {LEASE_ID: lease_id, **_world(target)}
+        return str((await self._call(target[0], "renewControl", params, RENEWED_S)).get("code", ""))
 
     async def _target(self, robot: str, params: Mapping[str, Any], *, leased: bool = False) -> Target:
         """Return the robot that is meant, of a world the first where none is named."""
@@ -296,23 +329,31 @@ class Caller:
             status = await self.read(robot, "getStatus")
             names = status.get("robots")
             if not is_error(status):
-                self._first[robot] = str(next(iter(names), "")) if isinstance(names, Mapping) else ""
+                self._first[robot] = str(next(iter(names), "")) if isinstance(names, Mapping | list) else ""
         return robot, self._first.get(robot, "")
 
-    async def _call(self, robot: str, verb: str, params: Mapping[str, Any], seconds: float) -> Envelope:
+    async def _call(
+        self,
+        robot: str,
+        verb: str,
+        params: Mapping[str, Any],
+        seconds: float,
+        *,
+        moves: bool = False,
+        lost: tuple[type[RefusalError], ...] = (),
+    ) -> Envelope:
+        """Call a verb; a refusal is an answer, one of ``lost`` is raised."""
         try:
-            return await self.fleet.call_async(robot, verb, params, seconds)
-        except NoSuchDeviceError as exc:
-            return error(f"{exc} list_robots names those that there are.")
-        except (CallRefusedError, ValidationError, MessagingError) as exc:
-            return error(str(exc))
+            network = await self.networks.of_async(robot, verb, moves=moves)
+            return await network.call_async(robot, _named_on(network, verb), params, seconds)
+        except lost:
+            raise
+        except RefusalError as refusal:
+            return refused(refusal)
 
     async def _followed(self, robot: str, verb: str, params: Mapping[str, Any], seconds: float) -> Envelope:
         """Ask about a motion that was begun; no answer ends its block, which halts it."""
-        try:
-            return await self.fleet.call_async(robot, verb, params, seconds)
-        except (CallRefusedError, ValidationError) as exc:
-            return error(str(exc))
+        return await self._call(robot, verb, params, seconds, lost=OUT_OF_SIGHT)
 
     def _holds(self, target: Target) -> bool:
         held = self._leases.get(target)
@@ -325,12 +366,11 @@ class Caller:
     async def _for_motion(self, target: Target, verb: str) -> dict[str, Any]:
         """Return the held lease, or one for this motion where the robot knows such."""
         if (robot := target[0], verb) not in self._binding and not self._lease(target):
-            description = await self.describe(robot)
-            published = find_verb(description.functions, verb) if isinstance(description, Peer) else None
-            if isinstance(description, Peer) and LEASE_TTL_S not in (published.leases if published else ()):
-                return {}
-            # One that did not answer is asked again.
-            if published is not None:
+            # One that does not answer is asked again.
+            with contextlib.suppress(RefusalError):
+                published = find_verb((await self.describe(robot)).functions, verb)
+                if published is None or LEASE_TTL_S not in published.leases:
+                    return {}
                 self._binding.add((robot, verb))
         return self._lease_of(target, LEASE_NAMES)
 
@@ -350,51 +390,8 @@ class Caller:
             held.end()
 
 
-class _Halting:
-    """A block that halts the robot when its call is given up."""
-
-    def __init__(self, caller: Caller, target: Target) -> None:
-        self.target = target
-        self.moves = ""
-        """Why the robot may still move after the halt; empty once it has confirmed its stop."""
-        self._caller = caller
-        self._begun: asyncio.Task[Envelope] | None = None
-
-    async def begin(self, verb: str, params: Mapping[str, Any], seconds: float) -> Envelope:
-        self._begun = self._caller.motion(self.target[0], verb, params, seconds)
-        self._caller.watch(self, ended=False)
-        # The call goes on when its caller is cancelled: its answer says whether the stop came after the start.
-        return await asyncio.shield(self._begun)
-
-    async def __aenter__(self) -> _Halting:
-        return self
-
-    async def __aexit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        try:
-            if kind is not None and self._begun is not None:
-                await self._halt(self._begun)
-        finally:
-            self._caller.watch(self, ended=True)
-
-    async def _halt(self, begun: asyncio.Task[Envelope]) -> None:
-        with anyio.CancelScope(shield=True):
-            for _attempt in range(STOPS_MAX):
-                answered = begun.done()
-                stop = await self._caller.stop(*self.target)
-                self.moves = "" if grade(stop) is Outcome.STOPPED else text_of(stop)
-                # A stop may overtake the command that it is meant for, so one more follows until that is answered.
-                if answered and not self.moves:
-                    break
-                await (asyncio.sleep(SETTLE_S) if answered else asyncio.wait([begun], timeout=SETTLE_S))
-            begun.cancel()
-
-
-def runs(status: Envelope, robot_name: str) -> bool:
-    """True while the robot, or the named robot of a world, runs a policy."""
-    policies = status.get("running_policies")
-    if isinstance(policies, Mapping):
-        return robot_name in policies if robot_name else bool(policies)
-    return str(status.get("task_status", "")).lower() in RUNNING
+def _named_on(network: NetworkAdapter, verb: str) -> str:
+    return network.starts if verb == RUN_POLICY else verb
 
 
 def move_arguments(params: Mapping[str, Any], *, wait: bool) -> dict[str, Any]:

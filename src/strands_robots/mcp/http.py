@@ -24,8 +24,8 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 from starlette.types import Message, Receive, Scope, Send
 
-from strands_robots.device_connect import FleetClient
 from strands_robots.errors import StrandsRobotsError
+from strands_robots.fleet.networks import Networks
 from strands_robots.mcp.access import ClientAccess
 from strands_robots.mcp.approval import Approvals
 from strands_robots.mcp.caller import Caller
@@ -97,7 +97,7 @@ class Address:
 
 
 class _Client:
-    """One token's client: its connection to the robots, and its open requests."""
+    """One token's client: its networks, and its open requests."""
 
     def __init__(self, token: Token, caller: Caller, show_picture: Callable[[bytes], str]) -> None:
         self.token = token
@@ -132,21 +132,23 @@ class HttpServer:
     """ASGI application that checks tokens, over a server for each permission.
 
     Args:
-        link_fleet: connects to the robots under a caller's name.
+        networks: of the server itself, opened.
+        networks_of: returns the networks of a caller's name, not opened yet.
         default: the client without a token, while there is no token; None requires one.
         standing: returns why this process does not answer the stops of others, or "".
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0917 - its parts
         self,
-        link_fleet: Callable[[str], FleetClient],
+        networks: Networks,
+        networks_of: Callable[[str], Networks],
         tokens: TokenFile,
         address: Address,
         default: Token | None,
         standing: Callable[[], str] = str,
     ) -> None:
-        self._standing = standing
-        self._link_fleet, self._tokens, self._address, self._default = link_fleet, tokens, address, default
+        self._networks, self._networks_of, self._standing = networks, networks_of, standing
+        self._tokens, self._address, self._default = tokens, address, default
         self._clients: dict[Token, asyncio.Task[_Client]] = {}
         self._pictures: dict[str, bytes] = {}
         # Of its own: the other threads may all be reading lists of robots when a new client wants to stop one.
@@ -162,8 +164,7 @@ class HttpServer:
         """Serve for the length of the block; clients leave at its end."""
         async with AsyncExitStack() as stack:
             self._running = stack
-            fleet = await self._connected("mcp-resources")
-            resources, approvals = RobotResources(fleet), Approvals()
+            resources, approvals = RobotResources(self._networks), Approvals()
             for read_only in (False, True):
                 server = build(_access_of, resources, approvals, read_only=read_only, standing=self._standing)
                 server.streamable_http_app(
@@ -287,11 +288,11 @@ class HttpServer:
         made.append(_Client(token, caller, self._show))
         return made[0]
 
-    async def _connected(self, name: str) -> FleetClient:
-        fleet = self._link_fleet(name)
-        await asyncio.get_running_loop().run_in_executor(self._connecting, fleet.__enter__)
-        self._running.push_async_callback(asyncio.to_thread, fleet.close)
-        return fleet
+    async def _connected(self, name: str) -> Networks:
+        networks = self._networks_of(name)
+        await asyncio.get_running_loop().run_in_executor(self._connecting, networks.open)
+        self._running.push_async_callback(asyncio.to_thread, networks.close)
+        return networks
 
     async def leave_all(self) -> None:
         """Halt and release what every client has."""
@@ -333,7 +334,8 @@ def require_secure(address: Address, tokens: TokenFile) -> None:
 
 
 async def serve_http(
-    link_fleet: Callable[[str], FleetClient],
+    networks: Networks,
+    networks_of: Callable[[str], Networks],
     address: Address,
     *,
     default: Token,
@@ -343,13 +345,14 @@ async def serve_http(
     """Serve clients over HTTP until the process is told to end.
 
     Args:
+        networks, networks_of: as of :class:`HttpServer`.
         default: the client without a token, while this machine has no token and no other reaches the server.
         ready: called with the URL once it listens.
         standing: as of :class:`HttpServer`.
     """
     tokens = TokenFile()
     require_secure(address, tokens)
-    app = HttpServer(link_fleet, tokens, address, default if address.loopback else None, standing)
+    app = HttpServer(networks, networks_of, tokens, address, default if address.loopback else None, standing)
     config = uvicorn.Config(
         app,
         lifespan="off",

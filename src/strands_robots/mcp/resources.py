@@ -20,8 +20,7 @@ from mcp.types import (
     UnsubscribeRequestParams,
 )
 
-from strands_robots.device_connect import FleetClient
-from strands_robots.device_connect.client import EventSubscription
+from strands_robots.fleet.networks import Networks
 from strands_robots.mcp._compat import lowlevel
 from strands_robots.mcp.access import AccessOf
 from strands_robots.mcp.results import facts, quoted
@@ -42,17 +41,17 @@ WATCHED_MAX = 64
 
 
 class RobotResources:
-    """The robots of a network as resources, and who is told of their updates.
+    """The robots of all networks as resources, and who is told of their updates.
 
     Args:
-        fleet: follows the events of the robots.
+        networks: follow the events of the robots.
     """
 
-    def __init__(self, fleet: FleetClient) -> None:
+    def __init__(self, networks: Networks) -> None:
         self.bus = InMemorySubscriptionBus()
-        self._fleet = fleet
+        self._networks = networks
         self._changed: set[str] = set()
-        self._watched: dict[str, EventSubscription] = {}
+        self._watched: dict[str, Callable[[], None]] = {}
         self._wanted: Counter[str] = Counter()
         self._sessions: dict[str, set[Any]] = {}
         self._watching = asyncio.Lock()
@@ -83,12 +82,12 @@ class RobotResources:
                 task.cancel()
             await asyncio.wait(tasks)
             watched, self._watched = self._watched, {}
-            for subscription in watched.values():
-                await asyncio.to_thread(subscription.close)
+            for end in watched.values():
+                await asyncio.to_thread(end)
 
     async def _list(self, context: Any, params: Any) -> ListResourcesResult:
-        peers = await asyncio.to_thread(self._fleet.peers)
-        ids = [peer.id for peer in peers if _robot_of(SCHEME + peer.id)]
+        found = await asyncio.to_thread(self._networks.find)
+        ids = sorted(name for name, (each, _) in found.items() if not each.world and _robot_of(SCHEME + name))
         cursor = str(params.cursor or "") if params is not None else ""
         start = int(cursor) if cursor.isdecimal() and len(cursor) < 8 else 0
         page = [
@@ -135,14 +134,14 @@ class RobotResources:
                 def changed(_event: object, robot: str = robot) -> None:
                     loop.call_soon_threadsafe(self._changed.add, robot)
 
-                self._watched[robot] = await asyncio.to_thread(self._fleet.subscription, robot, changed)
+                self._watched[robot] = await asyncio.to_thread(self._networks.subscribe, robot, changed)
 
     async def _unwatch(self, uris: list[str]) -> None:
         async with self._watching:
             for robot in filter(None, map(_robot_of, uris)):
                 self._wanted[robot] -= 1
                 if self._wanted[robot] <= 0 and robot in self._watched:
-                    await asyncio.to_thread(self._watched.pop(robot).close)
+                    await asyncio.to_thread(self._watched.pop(robot))
 
     async def _publish(self) -> None:
         while True:
@@ -159,9 +158,9 @@ class RobotResources:
                         await self._unwatch([uri])
 
     async def _look(self) -> None:
-        before: tuple[str, ...] | None = None
+        before: list[str] | None = None
         while True:
-            now = self._fleet.known()
+            now = sorted(self._networks.announced())
             if before is not None and now != before:
                 await self.bus.publish(ResourcesListChanged())
             before = now

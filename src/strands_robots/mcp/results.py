@@ -11,8 +11,10 @@ from typing import Annotated, Any, Literal, TypeAlias, TypeVar
 from mcp.types import CallToolResult, ContentBlock, ImageContent, TextContent
 from pydantic import BaseModel, ValidationError
 
-from strands_robots.device_connect.discovery import Peer
 from strands_robots.envelope import Envelope, error, is_error, jsonable, text_of
+from strands_robots.errors import NoSuchRobotError, RefusalError
+from strands_robots.fleet.adapter import FoundRobot
+from strands_robots.fleet.refusals import answer_to
 from strands_robots.utils import shown
 
 T = TypeVar("T")
@@ -111,7 +113,13 @@ def refused_arguments(tool: str, problem: ValidationError) -> str:
     return f"{tool} is refused: {'; '.join(lines)}."
 
 
-def row(peer: Peer) -> dict[str, str]:
+def refused(refusal: RefusalError) -> Envelope:
+    """Return a refusal as an answer."""
+    answer = answer_to(refusal)
+    absent = isinstance(refusal, NoSuchRobotError)
+    return error(f"{text_of(answer)} list_robots names those that there are.") if absent else answer
+
+
+def row(found: FoundRobot) -> dict[str, str]:
     """Return what a list of robots has of one."""
-    availability = str(peer.status.get("availability", ""))
-    return {"id": peer.id[:128], "type": peer.type[:40], "model": peer.model[:60], "availability": availability[:20]}
+    return {"id": found.id[:128], "type": found.type[:40], "model": found.model[:60], "availability": found.status[:20]}

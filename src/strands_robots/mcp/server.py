@@ -20,12 +20,14 @@ from pydantic import ValidationError as Unfit
 
 from strands_robots import __version__
 from strands_robots.envelope import error
+from strands_robots.errors import RefusalError
+from strands_robots.fleet.networks import Networks
 from strands_robots.mcp._compat import lowlevel
 from strands_robots.mcp.access import AccessOf, ClientAccess, PictureFiles
 from strands_robots.mcp.approval import Approvals
 from strands_robots.mcp.caller import Caller
 from strands_robots.mcp.resources import RobotResources
-from strands_robots.mcp.results import refused_arguments, result, unknown_arguments, with_note
+from strands_robots.mcp.results import refused, refused_arguments, result, unknown_arguments, with_note
 from strands_robots.mcp.tools import add_calls, add_control, add_motions, add_reads, add_stops
 from strands_robots.safety.sightings import flush_sightings
 from strands_robots.serving import robot_verbs  # noqa: F401 - so that the first stop of a client loads nothing
@@ -77,9 +79,11 @@ class RobotServer(MCPServer[Any]):
         call = super().call_tool(name, arguments, context)
         try:
             return await (call if gone is None else _until(gone, call))
-        except ToolError as refused:
-            if isinstance(refused.__cause__, Unfit):
-                return result(error(refused_arguments(name, refused.__cause__)))
+        except ToolError as failed:
+            if isinstance(failed.__cause__, Unfit):
+                return result(error(refused_arguments(name, failed.__cause__)))
+            if isinstance(failed.__cause__, RefusalError):
+                return result(refused(failed.__cause__))
             raise
 
 
@@ -151,11 +155,11 @@ class _Lines:
         return await anyio.to_thread.run_sync(self._stream.readline, MESSAGE_MAX)
 
 
-async def serve_stdio(caller: Caller, *, read_only: bool = False, standing: Callable[[], str] = str) -> None:
+async def serve_stdio(networks: Networks, *, read_only: bool = False, standing: Callable[[], str] = str) -> None:
     """Serve one client on stdio; at its end halt what it moves and holds."""
-    pictures = PictureFiles()
+    pictures, caller = PictureFiles(), Caller(networks)
     access = ClientAccess(caller, approves=True, show_picture=pictures.show)
-    resources = RobotResources(caller.fleet)
+    resources = RobotResources(networks)
     server = build(lambda _context: access, resources, Approvals(), read_only=read_only, standing=standing)
     ending: list[asyncio.Task[None]] = []
 

@@ -18,9 +18,8 @@ from mcp.server.mcpserver import Context, MCPServer
 from mcp.types import InputRequiredResult, ToolAnnotations
 from pydantic import Field
 
-from strands_robots.device_connect.discovery import Peer
 from strands_robots.envelope import Envelope, error, is_error, success
-from strands_robots.fleet.device_connect.lockouts import ask_robots, lockable_robots
+from strands_robots.fleet.all_lockouts import ask_lockouts, by_robot
 from strands_robots.mcp.access import AccessOf
 from strands_robots.mcp.approval import Approvals, Wish
 from strands_robots.mcp.caller import acquire_arguments, move_arguments
@@ -69,7 +68,9 @@ def add_reads(server: MCPServer[Any], access: AccessOf, standing: Callable[[], s
         context: Context[Any, Any], start: Annotated[Count, Field(description="next_start of a page")] = 0
     ) -> Result:
         """List the robots on the network, in pages: id, type, model, availability."""
-        rows = [row(peer) for peer in await asyncio.to_thread(access(context).caller.fleet.peers)]
+        found = await asyncio.to_thread(access(context).caller.networks.find)
+        # A world stands for its robots.
+        rows = [row(each) for _, (each, _) in sorted(found.items()) if not each.world]
         page = list[dict[str, str]]()
         for each in rows[start:]:
             if page and len(json.dumps([*page, each])) > PAGE_BYTES:
@@ -82,8 +83,7 @@ def add_reads(server: MCPServer[Any], access: AccessOf, standing: Callable[[], s
     @server.tool(annotations=READ)
     async def describe_robot(context: Context[Any, Any], robot: Robot) -> Result:
         """Describe one robot: type, model, verbs, and the JSON Schema of each."""
-        found = await access(context).caller.describe(robot)
-        return result(described(found) if isinstance(found, Peer) else found)
+        return result(described(await access(context).caller.describe(robot)))
 
     @server.tool(annotations=READ)
     async def get_state(context: Context[Any, Any], robot: Robot) -> Result:
@@ -131,15 +131,12 @@ def add_reads(server: MCPServer[Any], access: AccessOf, standing: Callable[[], s
     @server.tool(annotations=READ)
     async def lockouts(context: Context[Any, Any]) -> Result:
         """Read which robots are locked by an emergency stop, since when and by whom."""
-        fleet = access(context).caller.fleet
-        reports = await asyncio.to_thread(lambda: ask_robots(fleet, lockable_robots(fleet), 2.0))
+        reports = by_robot(await asyncio.to_thread(ask_lockouts, access(context).caller.networks, 2.0))
         rows = {
-            each.name: {"problem": each.problem}
-            if each.problem
-            else {"lockouts": [one.fields() for one in each.lockouts]}
-            for each in reports
+            name: {"problem": each.problem} if each.problem else {"lockouts": [one.fields() for one in each.lockouts]}
+            for name, each in reports.items()
         }
-        locked = sum(bool(each.lockouts) for each in reports)
+        locked = sum(bool(each.lockouts) for each in reports.values())
         problem = standing()
         absent = f" This server does not answer the stops of others: {problem}." if problem else ""
         return result(success(f"{locked} of {len(rows)} robots are locked.{absent}", robots=rows, stands=not problem))
@@ -260,8 +257,7 @@ def add_calls(server: MCPServer[Any], access: AccessOf, approvals: Approvals) ->
         given, caller = dict(arguments or {}), access(context).caller
         if verb in INSTEAD:
             return result(error(f"call_robot does not call {verb}: {INSTEAD[verb]}."))
-        peer = await caller.describe(robot)
-        found = wanted(peer, verb, given) if isinstance(peer, Peer) else peer
+        found = wanted(await caller.describe(robot), verb, given)
         if not isinstance(found, AdvertisedVerb):
             return result(found)
         if found.reads:

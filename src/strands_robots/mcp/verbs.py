@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-from strands_robots.device_connect.discovery import Peer
 from strands_robots.envelope import Envelope, error, success
+from strands_robots.fleet.adapter import FoundRobot
 from strands_robots.mcp.results import row
 from strands_robots.serving.advertised import AdvertisedVerb, RobotDescription, find_verb, fitting, verb_names
 from strands_robots.serving.known_verbs import STOPS
@@ -28,17 +28,17 @@ INSTEAD = {
 """Verbs that ``call_robot`` refuses, and what to do instead."""
 
 
-def described(peer: Peer) -> Envelope:
+def described(found: FoundRobot) -> Envelope:
     """Return a robot's description: its verbs in its own words, within a bound."""
-    description = RobotDescription.of(peer.functions)
+    description = RobotDescription.of(found.functions)
     known = [each for each in description.verbs.values() if each.name not in INSTEAD]
     # Its own ones first: the others are known without it.
     rows = [_verb_row(each) for each in sorted(known, key=lambda each: not each.own)]
     verbs = fitting(rows, VERBS_BYTES)
-    more = sum(name not in INSTEAD for name in verb_names(peer.functions)) - len(verbs)
+    more = sum(name not in INSTEAD for name in verb_names(found.functions)) - len(verbs)
     left_out = {"verbs_left_out": more} if more else {}
     note = {"note": description.absent} if description.absent else {}
-    return success("Described, in the robot's words.", **row(peer), **note, **left_out, verbs=verbs)
+    return success("Described, in the robot's words.", **row(found), **note, **left_out, verbs=verbs)
 
 
 def _verb_row(verb: AdvertisedVerb) -> dict[str, Any]:
@@ -52,11 +52,11 @@ def _verb_row(verb: AdvertisedVerb) -> dict[str, Any]:
     }
 
 
-def wanted(peer: Peer, verb: str, arguments: Iterable[str]) -> AdvertisedVerb | Envelope:
+def wanted(robot: FoundRobot, verb: str, arguments: Iterable[str]) -> AdvertisedVerb | Envelope:
     """Return the verb that a client wants to call, or why it is refused."""
-    found = find_verb(peer.functions, verb)
+    found = find_verb(robot.functions, verb)
     if found is None:
-        alike = near(verb, (name for name in verb_names(peer.functions) if name not in INSTEAD))
-        return error(f"{shown(peer.id)} has no verb {shown(verb)}.{alike}")
+        alike = near(verb, (name for name in verb_names(robot.functions) if name not in INSTEAD))
+        return error(f"{shown(robot.id)} has no verb {shown(verb)}.{alike}")
     problem = found.unknown(arguments)
     return error(problem) if problem else found

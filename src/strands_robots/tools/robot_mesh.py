@@ -18,7 +18,7 @@ from typing import Any
 
 from strands_robots import settings
 from strands_robots.agent_tool import fitted, tool
-from strands_robots.envelope import Envelope, error, success
+from strands_robots.envelope import Envelope, error, is_error, success, text_of
 from strands_robots.errors import RefusalError, StrandsRobotsError
 from strands_robots.fleet.adapter import STOP_S, FoundRobot
 from strands_robots.fleet.all_stops import answer_of, estop_all, stop_all
@@ -33,7 +33,7 @@ from strands_robots.serving.advertised import RobotDescription, fitting
 from strands_robots.serving.robot_verbs import ARM_VERBS, WORLD_VERBS
 from strands_robots.serving.stop_arguments import noted, stop_reason, stop_robot, stop_scope
 from strands_robots.serving.verbs import unknown_arguments
-from strands_robots.utils import WAIT_S, ValidationError, choice, device_id, identifier, mapping, shown
+from strands_robots.utils import WAIT_S, ValidationError, choice, device_id, identifier, mapping, plain_text, shown
 
 CALLED = {"move": "moveTo", "picture": "getPicture", "wait": "wait"}
 """Verb of each action that calls one where none is named."""
@@ -169,7 +169,7 @@ def _stop(target: object, arguments: object) -> dict[str, Any]:
         names = [robot] if len(answers) == 1 else [f"{robot} on {network}" for network in answers]
         return combined_verdict(dict(zip(names, answers.values(), strict=True)))
 
-    answer = _asked(stopped, stops=True) if robot else _all_stopped(stop_all)
+    answer = _answer(stopped, stops=True) if robot else _all_stopped(stop_all)
     return noted(answer, unknown, unread)
 
 
@@ -191,14 +191,14 @@ def _all_stopped(stop: Callable[[Networks], FleetVerdict]) -> Envelope:
     return _answer(lambda there: answer_of(stop(there), there), stops=True)
 
 
-def _asked(work: Callable[[Networks], Envelope], *, stops: bool = False) -> Envelope:
+def _asked(work: Callable[[Networks], Envelope]) -> Envelope:
     """Return what ``work`` answers on networks that are joined; as :func:`_answer`."""
 
     def joined(there: Networks) -> Envelope:
         there.open()
         return work(there)
 
-    return _answer(joined, stops=stops)
+    return _answer(joined, stops=False)
 
 
 def _answer(work: Callable[[Networks], Envelope], *, stops: bool) -> Envelope:
@@ -215,11 +215,19 @@ def _answer(work: Callable[[Networks], Envelope], *, stops: bool) -> Envelope:
     make, fields = (networks_for_stop, {"stopped": None}) if stops else (networks_of, {})
     try:
         with closing(make(profile_for(None, {}), {}, TOOL, devices=not on_mesh)) as there:
-            return work(there)
+            return _read_by_a_model(work(there))
     except RefusalError as refusal:
         return error(said(refusal), **fields)
     except (StrandsRobotsError, LookupError, TimeoutError, RuntimeError, ValueError) as exc:
         return error(str(exc.args[0]) if exc.args else type(exc).__name__, **fields)
+
+
+def _read_by_a_model(answer: Envelope) -> Envelope:
+    """Return an answer whose error has a text, as a model reads it."""
+    if not is_error(answer) or "content" in answer:
+        return answer
+    fields = {name: value for name, value in answer.items() if name not in ("status", "reason")}
+    return error(plain_text(text_of(answer)) or "It gave no reason.", **fields)
 
 
 def _row(found: FoundRobot, network: str, functions: object) -> dict[str, Any]:

@@ -10,14 +10,17 @@ from fixtures.mcp_site import WAVE, McpSite
 
 pytest.importorskip("mcp.server.mcpserver", reason="needs the extra mcp", exc_type=ImportError)
 
+from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
 from strands_robots.mcp.results import MARK
 from strands_robots.mcp.server import INSTRUCTIONS
 
+EACH = pytest.mark.parametrize("site", [DEVICE_CONNECT, MESH], indirect=True)
 BOTH = pytest.mark.parametrize("mode", ["legacy", "2026-07-28"])
 ARM = "robot://arm-1"
 SHORT = {**WAVE, "duration": 2.0}
 
 
+@EACH
 @BOTH
 async def test_robots_are_resources_whose_state_is_quoted(site: McpSite, mode: str) -> None:
     async with site.client(mode=mode) as client:
@@ -28,6 +31,7 @@ async def test_robots_are_resources_whose_state_is_quoted(site: McpSite, mode: s
         assert "running_policies" in read.contents[0].text
 
 
+@EACH
 async def test_a_stream_of_the_newest_revision_tells_of_updates(site: McpSite) -> None:
     async with site.client(mode="2026-07-28") as client:
         async with client.listen(resource_subscriptions=[ARM]) as events:
@@ -36,6 +40,7 @@ async def test_a_stream_of_the_newest_revision_tells_of_updates(site: McpSite) -
             assert event.uri == ARM
 
 
+@EACH
 async def test_a_subscription_of_an_older_revision_tells_of_updates(site: McpSite) -> None:
     told = asyncio.Event()
 
@@ -50,6 +55,7 @@ async def test_a_subscription_of_an_older_revision_tells_of_updates(site: McpSit
         await client.session.unsubscribe_resource(ARM)
 
 
+@EACH
 @BOTH
 async def test_progress_says_what_the_robot_does(site: McpSite, mode: str) -> None:
     said: list[str] = []

@@ -12,6 +12,9 @@ from fixtures.waiting import eventually_async
 
 pytest.importorskip("mcp.server.mcpserver", reason="needs the extra mcp", exc_type=ImportError)
 
+from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
+
+pytestmark = pytest.mark.parametrize("site", [DEVICE_CONNECT, MESH], indirect=True)
 BOTH = pytest.mark.parametrize("mode", ["legacy", "2026-07-28"])
 
 

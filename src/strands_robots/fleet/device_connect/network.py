@@ -18,7 +18,16 @@ from strands_robots.errors import (
     UnknownVerbError,
     UnreachableError,
 )
-from strands_robots.fleet.adapter import CLOSED, DEVICE_CONNECT, FIND_S, STOP_S, FoundRobot, OnEvent, ReceivedCall
+from strands_robots.fleet.adapter import (
+    CLOSED,
+    DEVICE_CONNECT,
+    FIND_S,
+    STOP_S,
+    Detail,
+    FoundRobot,
+    OnEvent,
+    ReceivedCall,
+)
 from strands_robots.fleet.link_flags import described
 from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope
 from strands_robots.utils import ValidationError, device_id, plain_text
@@ -64,6 +73,7 @@ class DeviceConnectNetwork:
     announces_verbs = True
     reads: Mapping[str, str] = {"status": "getStatus", "state": "getState", "features": "getFeatures"}
     starts = "execute"
+    _aliases: Mapping[str, str] = {**reads, "start": starts}
 
     def __init__(self, link: LinkConfig, source: str, *, preload: bool = False) -> None:
         self._link, self._source, self._preload = link, device_id("source", source), preload
@@ -174,10 +184,17 @@ class DeviceConnectNetwork:
     def verb(self, robot: str, name: str) -> AdvertisedVerb | None:
         """Return a function as the device itself describes it."""
         with self._asked(robot, name):
-            return self._connected.verb(robot, name)
+            described = self._connected.verb(robot, name)
+            if described is None and (alias := self._aliases.get(name)):
+                return self._connected.verb(robot, alias)
+            return described
 
     def call(self, robot: str, verb: str, arguments: Mapping[str, Any], timeout: float) -> Envelope:
-        """Call a function of the device."""
+        """Call a function of the device, also by its name on the mesh."""
+        if verb in self._aliases:
+            # A device may have a function of that name.
+            described = self.verb(robot, verb)
+            verb = self._aliases[verb] if described is None else described.name
         with self._asked(robot, verb):
             return self._connected.call(robot, verb, arguments, timeout)
 
@@ -338,8 +355,13 @@ class DeviceConnectNetwork:
         with _carried():
             return resume_robots(self._connected, reports, signer, timeout)
 
-    def subscribe(self, robot: str, on_event: OnEvent) -> Callable[[], None]:
-        """Receive the device's events."""
+    def beats_every(self, robot: str) -> float:
+        """Return the seconds between two heartbeats of the device, or of its process."""
+        return self._connected.beats_every(robot)
+
+    def subscribe(self, robot: str, on_event: OnEvent, detail: Detail = Detail.EVENTS) -> Callable[[], None]:
+        """Receive the device's events, which are all that it sends."""
+        del detail
         from strands_robots.fleet.device_connect.events import robot_event  # noqa: PLC0415 - a call need not load it
 
         with _carried():
@@ -375,7 +397,7 @@ class DeviceConnectNetwork:
 
     @contextmanager
     def _asked(self, robot: str, verb: str) -> Iterator[None]:
-        """Raise what a call raises as a :class:`RefusalError`; forget a device that is gone."""
+        """Raise refusals for a call's exceptions; forget a device that is gone."""
         try:
             yield
         except RefusalError:

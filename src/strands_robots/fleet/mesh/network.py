@@ -22,18 +22,18 @@ from strands_robots.errors import (
     UnknownVerbError,
     UnreachableError,
 )
-from strands_robots.fleet.adapter import CLOSED, FIND_S, MESH, STOP_S, FoundRobot, OnEvent, ReceivedCall
+from strands_robots.fleet.adapter import CLOSED, FIND_S, MESH, STOP_S, Detail, FoundRobot, OnEvent, ReceivedCall
 from strands_robots.fleet.lockout_report import LockoutReport, Resumed
 from strands_robots.fleet.mesh.controller import MeshController
 from strands_robots.fleet.mesh.descriptions import functions_of, functions_of_each, functions_of_kind
-from strands_robots.fleet.mesh.discovery import awaited, discover, in_reach, is_in_reach
+from strands_robots.fleet.mesh.discovery import CALLER, awaited, discover, has_robot, in_reach, is_in_reach
 from strands_robots.fleet.mesh.events import follow
 from strands_robots.fleet.mesh.lockouts import ask_peers, lockable_peers, resume_peers
 from strands_robots.fleet.mesh.requests import PeerRequests
 from strands_robots.fleet.mesh.standing import mesh_network, stand_on_mesh
 from strands_robots.fleet.mesh.stops import lock_peers, stop_answer, stop_peers
 from strands_robots.fleet.mesh_settings import MeshSettings
-from strands_robots.fleet.refusals import refusal_of_text
+from strands_robots.fleet.refusals import refusal_of_text, with_meaning
 from strands_robots.fleet.stop_answers import roster_verdict
 from strands_robots.fleet.stop_button import StopSender
 from strands_robots.safety.controller import OnProgress
@@ -113,7 +113,7 @@ class MeshNetwork:
         from strands_robots.mesh.wire_identity import IdentityError, visitor_id  # noqa: PLC0415 - as above
 
         try:
-            name, kind = (self._source, "controller") if self._console else (visitor_id(self._source), "tool")
+            name, kind = (self._source, "controller") if self._console else (visitor_id(self._source), CALLER)
             mesh = Mesh(None, name, kind, parts=Parts(acquire=session.dial))
             try:
                 mesh.start()
@@ -128,7 +128,7 @@ class MeshNetwork:
         """Return the robots in reach, once they had the time to announce themselves."""
         discover(self._joined_mesh, since=self._joined, within=timeout)
         self._discoveries += 1
-        lockable, rows = {*lockable_peers(self._joined_mesh)}, {str(row["peer_id"]): row for row in self._rows()}
+        lockable, rows = {*lockable_peers(self._joined_mesh)}, {str(row["peer_id"]): row for row in self._judged()}
         return [
             replace(
                 _found(row),
@@ -136,7 +136,7 @@ class MeshNetwork:
                 world=world if (world := name.rpartition("__")[0]) in rows else "",
             )
             for name, row in rows.items()
-            if _has_robot(row)
+            if has_robot(row)
         ]
 
     def listed(self, timeout: float | None = None) -> list[FoundRobot]:
@@ -145,12 +145,7 @@ class MeshNetwork:
             discover(self._joined_mesh, since=self._fresh)
         else:
             time.sleep(max(0.0, self._joined + timeout - time.monotonic()))
-        rows, keys = self._rows(), enrolled_peers()
-        for row in rows:
-            row["tags"] = list(read_tags(row.get("tags")))
-            if "locked" in row and (why := lockout_distrust(row["peer_id"], row, row.get("epochs") or [], keys)):
-                row["distrusted"] = why
-        return [_found(row) for row in rows]
+        return [_found(row) for row in self._judged()]
 
     def known(self, robot: str) -> FoundRobot:
         """Return what the peer announced last."""
@@ -158,12 +153,12 @@ class MeshNetwork:
 
     def announced(self) -> Collection[str]:
         """Return the robots in reach."""
-        return [str(row["peer_id"]) for row in self._rows() if _has_robot(row)]
+        return [str(row["peer_id"]) for row in self._rows() if has_robot(row)]
 
     def bears(self, robot: str) -> bool:
         """Return whether a robot of this id is in reach."""
         mesh = self._joined_mesh
-        return is_in_reach(mesh, robot) and _has_robot(mesh.get_peer(robot) or {})
+        return is_in_reach(mesh, robot) and has_robot(mesh.get_peer(robot) or {})
 
     def reaches(self, robot: str) -> bool:
         """Return whether a robot of this id is in reach, once peers are known."""
@@ -224,7 +219,7 @@ class MeshNetwork:
         reply = mesh.send(robot, {**arguments, "action": action}, timeout if there else min(timeout, STOP_S))
         if reply.get("type") == "response":
             result = reply.get("result")
-            return dict(result) if isinstance(result, Mapping) else {"result": result}
+            return _named_as(verb, result) if isinstance(result, Mapping) else {"result": result}
         if self._mesh is None:
             raise NoAnswerError(CLOSED, robot=robot, verb=verb)
         if reply.get("status") == "timeout":
@@ -232,7 +227,7 @@ class MeshNetwork:
                 raise self._absent(robot, verb)
             raise NoAnswerError(f"{robot} did not answer", robot=robot, verb=verb)
         why = plain_text(reply.get("error") or reply.get("reason"))
-        said = error(f"{robot}: {why or 'refused'}")
+        said = error(f"{robot}: {with_meaning(why) or 'refused'}")
         if reply.get("type") == "error" or why.startswith("validation: "):
             raise refusal_of_text(robot, verb, why, said)
         raise UnreachableError(why or "the mesh did not carry the call", robot=robot, verb=verb, envelope=said)
@@ -251,13 +246,16 @@ class MeshNetwork:
         return stop_answer(robot, reply, enrolled_peers())
 
     def received(self, robot: str, verb: str, arguments: Mapping[str, Any]) -> ReceivedCall:
-        """Return the call with the action's defaults; of a verb of the robot's own as it is."""
+        """Return the call with the defaults of an action of ours."""
         from strands_robots.mesh.security import validate_command  # noqa: PLC0415 - loaded when it is used
         from strands_robots.serving.verbs import LEASE_NAMES  # noqa: PLC0415 - as above
 
         mesh, action = self._joined_mesh, self._action(robot, verb)
         given = self._given_to(robot, action, arguments)
-        sent = given if self._owns(robot, action) else validate_command({**given, "action": action})
+        try:
+            sent = given if self._owns(robot, action) else validate_command({**given, "action": action})
+        except ValidationError as exc:
+            raise ArgumentsError(str(exc), robot=robot, verb=verb) from exc
         left_out = LEASE_NAMES | {"action"}
         return ReceivedCall(mesh.peer_id, action, {name: value for name, value in sent.items() if name not in left_out})
 
@@ -269,7 +267,7 @@ class MeshNetwork:
         return await self._requests.call(lambda: self.call(robot, verb, self._given_to(robot, verb, arguments), within))
 
     async def describe_async(self, robot: str, within: float) -> FoundRobot:
-        """Return the peer with the functions that it describes, of an older one those of its kind."""
+        """Return the peer as it describes itself, an older one by its kind."""
         try:
             functions = (await self.call_async(robot, "describe", {}, within)).get("functions")
         except UnknownVerbError:
@@ -386,9 +384,16 @@ class MeshNetwork:
         """Send the resumes of these peers, which relay them."""
         return resume_peers(self._joined_mesh, reports, signer, timeout)
 
-    def subscribe(self, robot: str, on_event: OnEvent) -> Callable[[], None]:
+    def beats_every(self, robot: str) -> float:
+        """Return twice the time between two heartbeats, as one may come late."""
+        from strands_robots.mesh import topics  # noqa: PLC0415 - loaded when it is used
+
+        del robot
+        return 2 / topics.BY_NAME["presence"].rate_hz
+
+    def subscribe(self, robot: str, on_event: OnEvent, detail: Detail = Detail.EVENTS) -> Callable[[], None]:
         """Receive a robot's policy steps and safety events, or what all say."""
-        return follow(self._joined_mesh, robot, on_event, next(self._subscriptions))
+        return follow(self._joined_mesh, robot, on_event, next(self._subscriptions), detail)
 
     def close(self) -> None:
         """Leave the mesh."""
@@ -423,6 +428,15 @@ class MeshNetwork:
         """Return the peers in reach, with a robot or without one."""
         return [row for row in self._joined_mesh.peers if row["reachable"]]
 
+    def _judged(self) -> list[dict[str, Any]]:
+        """Return the peers in reach, each with why its lockout is not believed."""
+        rows, keys = self._rows(), enrolled_peers()
+        for row in rows:
+            row["tags"] = list(read_tags(row.get("tags")))
+            if "locked" in row and (why := lockout_distrust(row["peer_id"], row, row.get("epochs") or [], keys)):
+                row["distrusted"] = why
+        return rows
+
     def _action(self, robot: str, verb: str) -> str:
         return verb if self._owns(robot, verb) else _ALIASES.get(verb, verb)
 
@@ -431,9 +445,19 @@ class MeshNetwork:
         return isinstance(own, list) and verb in own
 
     def _given_to(self, robot: str, verb: str, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-        if self._mesh is None or self._owns(robot, verb):
+        """Return the arguments that an action of ours is sent with."""
+        from strands_robots.serving.known_verbs import STOPS  # noqa: PLC0415 - loaded when it is used
+        from strands_robots.serving.peer_verbs import PEER_VERBS  # noqa: PLC0415 - as above
+
+        mesh = self._mesh
+        if mesh is None or self._owns(robot, verb):
             return arguments
-        return {name: value for name, value in arguments.items() if value not in ("", None)}
+        given = {name: value for name, value in arguments.items() if value not in ("", None)}
+        known, names = PEER_VERBS.get(verb), (mesh.get_peer(robot) or {}).get("sim_robots")
+        # Where none is named the first robot of a world is meant; a stop then means all of them.
+        if known is not None and "robot_name" in known.by_name and verb not in STOPS and isinstance(names, list):
+            given = {"robot_name": next(iter(names), ""), **given}
+        return given
 
     def _waited_for(self, robot: str, longest: float = math.inf) -> bool:
         """Return whether the peer is in reach, once that can be known."""
@@ -465,8 +489,13 @@ def _carried(robot: str, verb: str, arguments: Mapping[str, Any]) -> Mapping[str
     return {} if problem else arguments
 
 
-def _has_robot(row: Mapping[str, Any]) -> bool:
-    return "locked" in row or "tool_name" in row or "robot_kind" in row
+def _named_as(verb: str, result: Mapping[str, Any]) -> Envelope:
+    """Return an answer with the fields that its verb has on Device Connect."""
+    rows = result.get("policies")
+    if verb != "getStatus" or not isinstance(rows, list):
+        return dict(result)
+    running = {str(row.get("robot", "")): row for row in rows if isinstance(row, Mapping)}
+    return {**result, "running_policies": running}
 
 
 def _found(row: Mapping[str, Any]) -> FoundRobot:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection, Mapping
 from typing import TYPE_CHECKING, Any
 
 from strands_robots.envelope import Envelope, error, success
-from strands_robots.fleet.mesh.discovery import discover, in_reach
+from strands_robots.fleet.mesh.discovery import discover, must_answer
 from strands_robots.fleet.mesh.standing import MeshReports, mesh_network
 from strands_robots.fleet.stop_answers import measured, unanswered
 from strands_robots.safety.orders import new_epoch
@@ -164,7 +164,7 @@ def _stop_all(
         return answers
 
     def unconfirmed() -> bool:
-        seen.update(name for name in in_reach(mesh) if roster.scope.covers(name, _cells(mesh, name)))
+        seen.update(name for name in must_answer(mesh) if roster.scope.covers(name, _cells(mesh, name)))
         return any(not graded().get(name, {}).get("stopped") for name in seen)
 
     send()
