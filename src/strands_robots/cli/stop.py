@@ -368,7 +368,7 @@ def _report_one(screen: Screen, networks: Networks, device: str, robot: str, ans
 
 
 def _explained(there: NetworkAdapter, device: str, answer: Envelope) -> Envelope:
-    """Return an answer of unknown outcome with what this machine remembers of the robot."""
+    """Return an answer of unknown outcome with what is remembered of the robot."""
     stopped, said = stop_outcome(answer)
     if stopped is not None:
         return answer
@@ -387,7 +387,7 @@ def _estop_facts(networks: Networks, each: NetworkVerdict) -> Mapping[str, Any]:
 
 
 def _usable(networks: Networks, name: str) -> NetworkAdapter | None:
-    """Return the network of a stop that left, or could have; None for one that was not joined."""
+    """Return a network on which a stop could leave, None for another one."""
     there = [each for each in networks.stated if each.has_stop_link or each in networks.joined]
     return next((each for each in there if each.name == name), None)
 
