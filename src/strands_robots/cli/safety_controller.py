@@ -254,25 +254,26 @@ def _outcomes(buttons: Mapping[str, StopButton], links: Mapping[str, bool]) -> l
         for name, each in buttons.items()
         if name in links or (each.outcome is not None and each.outcome.size)
     }
-    return [_outcome(each, f"On {name}: " if len(shown) > 1 else "") for name, each in shown.items()]
+    return [line for name, each in shown.items() for line in _outcome(each, f"On {name}: " if len(shown) > 1 else "")]
 
 
-def _outcome(button: StopButton, where: str) -> Text:
+def _outcome(button: StopButton, where: str) -> list[Text]:
     if button.running and button.progress is not None:
         silent = button.progress.unconfirmed
         waiting = f"; unconfirmed: {', '.join(silent)}" if silent else ""
         link = "" if button.progress.link_up else "; THE LINK IS DOWN, the stop leaves when it is back"
         elapsed = button.progress.elapsed_ms
         age = f", pressed {elapsed / 1000:.1f} s ago" if elapsed > LATE_MS else ""
-        return label(f"{where}STOPPING{age}: {len(button.progress.answered)} answered{waiting}{link}", "bold red")
+        return [label(f"{where}STOPPING{age}: {len(button.progress.answered)} answered{waiting}{link}", "bold red")]
     if button.report is None:
-        return label("")
+        return []
     outcome = button.outcome
     report = button.report if outcome is None else outcome.report
     reasons = {} if outcome is None else outcome.reasons
     missing = [f"{name}{f' ({reasons[name]})' if name in reasons else ''}" for name in report.silent]
     silent_names = f" No answer: {', '.join(missing)}." if missing else ""
     alarms = " ".join(f" ALARM: {name}: {why}." for name, why in report.alarms.items())
-    told = "" if outcome is None else f"\n{' '.join([outcome.sentence, *outcome_lines(outcome)])}"
+    lines = [f"{where}{summary(report)}{silent_names}{alarms}"]
+    lines += [] if outcome is None else [" ".join([outcome.sentence, *outcome_lines(outcome)])]
     doubtful = alarms or (outcome is not None and outcome.problems)
-    return label(f"{where}{summary(report)}{silent_names}{alarms}{told}", "bold red" if doubtful else style_of(report))
+    return [label(line, "bold red" if doubtful else style_of(report)) for line in lines]

@@ -94,7 +94,10 @@ def estop_all(
             on_progress=lambda progress: on_progress(network.name, progress),
         )
         # A link that is down where devices could be looked for is one to which no robot is connected.
-        return NetworkVerdict(network.name, outcome, absent="" if outcome.report.link else "; ".join(outcome.problems))
+        why = "" if outcome.report.link else "; ".join(outcome.problems)
+        if why:
+            networks.absent[network.name] = why
+        return NetworkVerdict(network.name, outcome, absent=why)
 
     verdicts = _told_once(_on_each(networks, stopped, apart=True), {*scope.only, *named})
     reached, unreached = _parted(networks, verdicts)

@@ -82,17 +82,15 @@ class SafetyConsole:
         """
         up = {name: each.link_up for name, each in self._senders.items()}
         # What was asked for and is not there yet has no sender.
-        up |= {each.name: False for each in self._networks.stated if each.name not in up}
+        up |= {name: False for name in self.absent if name not in up}
         self._were_up |= {name for name, is_up in up.items() if is_up}
         known = self._were_up | self.absent.keys() | {name for name, each in self.watched.items() if each.reports}
         return {name: is_up for name, is_up in up.items() if name in known} or up
 
     @property
     def absent(self) -> Mapping[str, str]:
-        """Networks without a button, each with the reason."""
-        stated = {each.name for each in self._networks.stated}
-        missing = {name: why for name, why in self._networks.absent.copy().items() if name in stated}
-        return {**missing, **self.problems}
+        """Networks that someone asked for and that are not joined, with reasons."""
+        return {**self._networks.missing, **self.problems}
 
     def _joined(self, network: NetworkAdapter) -> None:
         if network.name not in self._senders:

@@ -31,11 +31,13 @@ class MeshController:
     """A safety controller whose stops and check-ins travel on the mesh.
 
     Args:
-        mesh: the peer that sends them, under its own id.
+        mesh: the peer that sends them, under its own id; it may have joined just now.
         signing_key: Ed25519 private key, for fleets that act on signed stops only.
     """
 
     def __init__(self, mesh: Mesh, signing_key: Any = None) -> None:
+        from strands_robots.mesh.transport.zenoh_config import DISCOVERY_S  # noqa: PLC0415 - the network is loaded when it is used
+
         self._mesh = mesh
         self._key = signing_key
         self._presses = Presses()
@@ -45,6 +47,7 @@ class MeshController:
         self.sending = Sending(signed=signing_key is not None)
         self._reports = MeshReports(mesh)
         self._reports.begin()
+        self._known_at = time.monotonic() + DISCOVERY_S
 
     @property
     def link_up(self) -> bool:
@@ -110,14 +113,22 @@ class MeshController:
         # On a thread: a disk that hangs delays no sending.
         reading = threading.Thread(target=self._load_keys, name="enrolled keys", daemon=True)
         reading.start()
-        replies = self._mesh.emergency_stop(
-            self._key,
-            estop_id=epoch,
-            on_answers=note,
-            scope=scope,
-            remembers=robots_known_at(mesh_network),
-            on_widened=lambda: widened.append(True),
-        )
+
+        def send() -> list[dict[str, Any]]:
+            return self._mesh.emergency_stop(
+                self._key,
+                estop_id=epoch,
+                on_answers=note,
+                scope=scope,
+                remembers=robots_known_at(mesh_network),
+                on_widened=lambda: widened.append(True),
+            )
+
+        replies = send()
+        if time.monotonic() < self._known_at:
+            # Peers that this one did not know yet have stopped, and were not waited for.
+            time.sleep(max(0.0, self._known_at - time.monotonic()))
+            replies = send()
         up = self.link_up
         # Without a hub nothing left; a stop that goes on is sent again in the moment it is back.
         while not up and not self.link_up and time.monotonic() < until:

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Any
 from strands_robots import settings
 from strands_robots.errors import UnreachableError
 from strands_robots.fleet.adapter import MESH
+from strands_robots.safety import network_key
+from strands_robots.safety.network_key import NetworkKey
 
 if TYPE_CHECKING:
     from strands_robots.fleet.mesh.network import MeshNetwork
-    from strands_robots.safety.network_key import NetworkKey
 
 CONNECT_S = 0.2
 """Seconds in which the hub takes a connection."""
@@ -31,7 +32,7 @@ class LocalMesh:
 
     Args:
         source: the first part of this peer's id.
-        console: it is a safety controller, whose id is ``source``.
+        console: as :class:`MeshNetwork` has it.
     """
 
     name = MESH
@@ -70,10 +71,8 @@ class LocalMesh:
 
 
 def local_key() -> NetworkKey:
-    """Return the name of this machine's mesh, under which its robots are remembered."""
-    from strands_robots.mesh.session import network  # noqa: PLC0415 - loaded when it is used
-
-    return network()
+    """Return the name of this machine's mesh, as ``mesh.session`` has it."""
+    return NetworkKey.of(network_key.MESH, [f"tcp/127.0.0.1:{settings.integer('STRANDS_MESH_PORT')}"])
 
 
 def no_hub() -> str:
