@@ -22,11 +22,12 @@ def follow(mesh: Mesh, robot: str, on_event: OnEvent, number: int) -> Callable[[
 
     Args:
         mesh: a joined peer.
-        robot: an id, whose policy steps and safety events are received, or :data:`EVERY`.
+        robot: an id, whose policy steps, safety events, and heartbeats that tell of another task or lockout are
+            received, or :data:`EVERY`.
         on_event: takes each event.
         number: tells this subscription from the others of the peer.
     """
-    receivers = _of_all(mesh, on_event) if robot == EVERY else _of_one(robot, on_event)
+    receivers = _of_all(mesh, on_event) if robot == EVERY else _of_one(mesh, robot, on_event)
     names = []
     for key, (name, receive) in receivers.items():
         names.append(f"fleet {number} {name}")
@@ -39,14 +40,28 @@ def follow(mesh: Mesh, robot: str, on_event: OnEvent, number: int) -> Callable[[
     return end
 
 
-def _of_one(robot: str, on_event: OnEvent) -> dict[str, tuple[str, OnMessage]]:
+def _of_one(mesh: Mesh, robot: str, on_event: OnEvent) -> dict[str, tuple[str, OnMessage]]:
     from strands_robots.mesh import topics  # noqa: PLC0415 - the network is loaded when it is used
+
+    last = [_condition(mesh.get_peer(robot))]
 
     def receiver(name: str) -> OnMessage:
         return lambda key, message: on_event(RobotEvent(robot, name, message))
 
-    keys = {"stream": topics.stream(robot), "safety_event": topics.safety_event(robot)}
-    return {key: (name, receiver(name)) for name, key in keys.items()}
+    def presence(key: str, message: Mapping[str, Any]) -> None:
+        row = mesh.get_peer(robot) if message.get("robot_id") == robot else None
+        if row is not None and last[0] != (now := _condition(row)):
+            last[0] = now
+            on_event(RobotEvent(robot, "presence", message, task=task_of(row)))
+
+    named = {topics.stream(robot): "stream", topics.safety_event(robot): "safety_event"}
+    receivers = {key: (name, receiver(name)) for key, name in named.items()}
+    return {**receivers, topics.presence(robot): ("presence", presence)}
+
+
+def _condition(row: Mapping[str, Any] | None) -> object:
+    """Return the task and the lockouts that a heartbeat tells, without the step."""
+    return None if row is None else ({**task_of(row), "step": None}, row.get("locked"), row.get("epochs"))
 
 
 def _of_all(mesh: Mesh, on_event: OnEvent) -> dict[str, tuple[str, OnMessage]]:
