@@ -7,6 +7,7 @@ import os
 import signal
 import tempfile
 import threading
+from collections import Counter
 from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
@@ -128,11 +129,15 @@ OURS = ("rollout-", "simulation", "device-connect", "fleet-client", "rosbridge",
 
 @pytest.fixture(autouse=True)
 def no_thread_of_ours_left(state_directory: Path) -> Iterator[None]:
-    """Every thread of the package that a test starts has ended when the test has, so that none meets the next one."""
-    before = set(threading.enumerate())
+    """Every thread of the package that a test starts has ended when the test has, so that none meets the next one.
+
+    A pool that the robots of a file use may have replaced one.
+    """
+    before = Counter(thread.name for thread in threading.enumerate())
     yield
 
     def left() -> list[str]:
-        return [t.name for t in threading.enumerate() if t not in before and t.name.startswith(OURS)]
+        now = Counter(thread.name for thread in threading.enumerate() if thread.name.startswith(OURS))
+        return sorted((now - before).elements())
 
     eventually(lambda: not left(), what=f"the end of {left()}")
