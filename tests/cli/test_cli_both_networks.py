@@ -87,7 +87,11 @@ class TestPeers:
     def test_robot_that_is_locked_on_one_of_two_is_shown_as_locked(
         self, run: Run, far: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr(far, "known", lambda name: FoundRobot(name, facts={"locked": True}))
+        def known(name: str) -> FoundRobot:
+            assert far.joined
+            return FoundRobot(name, facts={"locked": True})
+
+        monkeypatch.setattr(far, "known", known)
         locked = [line.split()[0] for line in run("peers").stdout.splitlines() if "LOCKED" in line]
         assert locked == ["both"]
 

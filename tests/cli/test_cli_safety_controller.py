@@ -15,8 +15,7 @@ from tests.fleet.scripted_sender import ScriptedSender
 from strands_robots.cli import safety_controller
 from strands_robots.cli.safety_controller import ConsoleScreen
 from strands_robots.cli.stop_report import style_of
-from strands_robots.fleet import networks as joining
-from strands_robots.fleet import watched_robots
+from strands_robots.fleet import joining, watched_robots
 from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
 from strands_robots.fleet.lockout_report import LockoutReport
 from strands_robots.fleet.networks import Networks

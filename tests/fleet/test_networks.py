@@ -14,6 +14,7 @@ from tests.fleet.scripted import OURS, ScriptedNetwork, function
 
 from strands_robots import errors
 from strands_robots.envelope import Envelope, error, success
+from strands_robots.fleet import joining
 from strands_robots.fleet import networks as module
 from strands_robots.fleet.adapter import DEVICE_CONNECT, FIND_S, MESH, STOP_S, FoundRobot, NetworkAdapter
 from strands_robots.fleet.all_stops import estop_all, stop_all
@@ -217,12 +218,89 @@ class TestInTurn:
         assert (near.stopped, far.stopped) == (["both"], ["both"])
 
 
+def test_networks_are_joined_anew_only_once_the_attempt_before_has_ended(
+    near: ScriptedNetwork, far: SlowNetwork
+) -> None:
+    networks = Networks([near, far])
+    networks.open()
+    assert far.opening.wait(30)
+    networks.close()
+    networks.open()
+    far.may_open.set()
+    assert networks.settled() == (near, far)
+    assert far.joined
+    networks.close()
+    assert not far.joined
+
+
+class Panic(BaseException):
+    """What a binding raises."""
+
+
+def test_panic_while_joining_hangs_no_stop(near: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch) -> None:
+    far = ScriptedNetwork(MESH, {})
+
+    def panics() -> None:
+        raise Panic("poisoned")
+
+    monkeypatch.setattr(far, "open", panics)
+    with Networks([near, far]) as networks:
+        assert stop_all(networks)["arm-1"].stopped
+        assert networks.absent == {MESH: "Panic: poisoned"}
+    with pytest.raises(Panic), Networks([far]):
+        pytest.fail("joined")
+
+
+def test_refusal_without_a_reason_is_no_joining(near: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch) -> None:
+    far = ScriptedNetwork(MESH)
+
+    def refused() -> None:
+        raise errors.UnreachableError("")
+
+    monkeypatch.setattr(far, "open", refused)
+    with Networks([near, far]) as networks:
+        assert networks.settled() == (near,)
+        assert networks.absent[MESH]
+
+
+def test_interrupt_while_joining_leaves_every_network(near: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted() -> None:
+        raise KeyboardInterrupt
+
+    networks = Networks([near])
+    monkeypatch.setattr(near, "open", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        networks.open()
+    with pytest.raises(errors.UnreachableError, match="not joined"):
+        networks.settled()
+
+
+def test_listener_that_fails_keeps_no_other_from_hearing(
+    near: ScriptedNetwork, caplog: pytest.LogCaptureFixture
+) -> None:
+    heard: list[NetworkAdapter] = []
+    networks = Networks([near])
+    networks.on_joined(lambda _network: heard[5])  # type: ignore[arg-type,return-value]
+    networks.on_joined(heard.append)
+    with networks:
+        assert heard == [near]
+    assert "A listener failed for device_connect" in caplog.text
+
+
+def test_events_can_be_ended_twice(near: ScriptedNetwork) -> None:
+    with Networks([near]) as networks:
+        end = networks.subscribe("*", lambda event: None)
+        end()
+        end()
+        assert near.subscribers == []
+
+
 class TestStays:
     """Networks of a face that lasts: what is not there yet is joined when it comes."""
 
     @pytest.fixture(autouse=True)
     def often(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(module, "AGAIN_S", 0.01)
+        monkeypatch.setattr(joining, "AGAIN_S", 0.01)
 
     def test_network_that_comes_later_is_joined_and_told_once(self, near: ScriptedNetwork) -> None:
         far = ScriptedNetwork(MESH, {"arm-2": OURS})

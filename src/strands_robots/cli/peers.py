@@ -6,7 +6,7 @@ import json
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import typer
 from rich.text import Text
@@ -59,7 +59,7 @@ def peers(
     wanted = None if device is None else identifier("DEVICE", device)
     with network.joined(on_mesh=on_mesh) as there:
         listed = there.listed(seconds) if on_mesh else there.find(seconds)
-        rows = [_Row(*listed[name], there.bearers(name)) for name in sorted(listed) if wanted in (None, name)]
+        rows = [_Row.of(*listed[name], there.bearers(name)) for name in sorted(listed) if wanted in (None, name)]
         functions = there.describe(wanted) if wanted is not None and rows else None
         reach, stale, whose = there.reach, there.stale, network.other_user(there)
     say_missing(screen, there)
@@ -81,23 +81,24 @@ def peers(
 
 @dataclass(frozen=True, slots=True)
 class _Row:
-    """One robot, the network that it is called on, and all that have it."""
+    """One robot.
+
+    Attributes:
+        robot: as the network has it on which it is called.
+        gravest: as the network has it on which it is locked, or receives no stops.
+        networks: names of those that have it, the one that it is called on first.
+    """
 
     robot: FoundRobot
-    network: NetworkAdapter
-    bearers: Sequence[NetworkAdapter]
+    gravest: FoundRobot
+    networks: Sequence[str]
 
-    @property
-    def names(self) -> list[str]:
-        """Networks that have it, the one that it is called on first."""
-        return list(dict.fromkeys(each.name for each in (self.network, *self.bearers)))
-
-    @property
-    def gravest(self) -> FoundRobot:
-        """The robot as the network has it on which it is locked, or receives no stops."""
-        others = [each.known(self.robot.id) for each in self.bearers if each is not self.network]
-        grave = (each for each in (self.robot, *others) if any(each.facts.get(name) for name in GRAVE))
-        return next(grave, self.robot)
+    @classmethod
+    def of(cls, robot: FoundRobot, network: NetworkAdapter, bearers: Sequence[NetworkAdapter]) -> Self:
+        others = [each for each in bearers if each is not network]
+        known = [robot, *(each.known(robot.id) for each in others)]
+        gravest = next((each for each in known if any(each.facts.get(name) for name in GRAVE)), robot)
+        return cls(robot, gravest, [network.name, *(each.name for each in others)])
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -107,13 +108,13 @@ class _Row:
             **robot.facts,
             **{"id": robot.id, "type": robot.type, "model": robot.model},
             "age_s": None if robot.age_s is None else round(robot.age_s, 3),
-            **{"network": self.network.name, "also_on": self.names[1:]},
+            **{"network": self.networks[0], "also_on": self.networks[1:]},
         }
 
 
 def _columns(rows: Sequence[_Row]) -> tuple[Sequence[str], Sequence[Sequence[object]]]:
     """Return heads and rows; a column that says nothing is left out."""
-    networks = {name for row in rows for name in row.names}
+    networks = {name for row in rows for name in row.networks}
     shown: dict[str, list[Any]] = {
         "peer": [row.robot.id for row in rows],
         "type": [row.robot.type for row in rows],
@@ -121,7 +122,7 @@ def _columns(rows: Sequence[_Row]) -> tuple[Sequence[str], Sequence[Sequence[obj
         "host": [str(row.robot.facts.get("hostname", "")) for row in rows],
         "status": [_status(row.gravest) for row in rows],
         "last heard": [_age(row.robot) for row in rows],
-        "network": [", ".join(row.names) for row in rows],
+        "network": [", ".join(row.networks) for row in rows],
         "tags": [", ".join(row.robot.tags) for row in rows],
     }
     told = {"host": any(shown["host"]), "network": len(networks) > 1, "tags": any(shown["tags"])}

@@ -104,7 +104,7 @@ def record_robot(
 
 
 def _record_network(there: Networks, network: NetworkAdapter, devices: Sequence[str], recorder: Recorder) -> None:
-    """Record what devices publish on one network; one that is on several is recorded on the first."""
+    """Record what devices publish, each on the first network that has it."""
 
     def take(event: RobotEvent) -> None:
         first, *_ = [*there.bearers(event.robot), network]

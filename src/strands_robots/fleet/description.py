@@ -26,10 +26,9 @@ def signature(verb: AdvertisedVerb) -> inspect.Signature:
 
 def docstring(verb: AdvertisedVerb, note: str = "") -> str:
     """Return the docstring of a verb as a method, marked as the robot's words."""
-    lines = [verb.description or verb.name]
+    lines = [verb.purpose or verb.name]
     if verb.parameters:
-        head = verb.description.partition("\n\nArgs:")[0].strip()
-        lines = [head or verb.name, "", "Args:", *(f"    {each.name}: {_meaning(each)}" for each in verb.parameters)]
+        lines += ["", "Args:", *(f"    {each.name}: {_meaning(each)}" for each in verb.parameters)]
     return "\n".join([*lines, "", *filter(None, [note]), MARK])
 
 

@@ -8,11 +8,13 @@ import threading
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
+from itertools import zip_longest
 from typing import TYPE_CHECKING, Any, Self
 
 from strands_robots.envelope import Envelope, error
 from strands_robots.errors import NoSuchRobotError, RefusalError, UnreachableError
 from strands_robots.fleet.adapter import FIND_S, STOP_S, Detail, FoundRobot, NetworkAdapter, OnEvent
+from strands_robots.fleet.joining import Joining
 from strands_robots.fleet.refusals import answered
 from strands_robots.fleet.side_by_side import side_by_side
 from strands_robots.serving.known_verbs import READS, RESUMES, STOPS
@@ -26,9 +28,6 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-AGAIN_S, AGAIN_MAX_S = 1.0, 5.0
-"""Seconds until a network that could not be joined is tried again: the first time, and at most."""
-
 SHARED_IDS_MAX = 1024
 """Ids on several networks of which the decided network is remembered."""
 
@@ -36,86 +35,6 @@ STILL = READS | STOPS | RESUMES | {"wait"}
 """Verbs of our robots that move nothing."""
 
 CLOSED = "the networks were left"
-
-
-class _Joining:
-    """One network, from the first attempt to join it to its end.
-
-    Attributes:
-        attempted: set once the first attempt is over.
-        why: the reason of the last attempt that failed; empty before the first.
-        unexpected: what an attempt raised that is no refusal.
-    """
-
-    def __init__(self, network: NetworkAdapter, *, again: bool, changed: Callable[[_Joining], None]) -> None:
-        self.network = network
-        self.attempted = threading.Event()
-        self.why = ""
-        self.unexpected: Exception | None = None
-        self._again, self._changed = again, changed
-        self._lock = threading.Lock()
-        self._closing = threading.Event()
-        self._begun = self._up = False
-
-    @property
-    def up(self) -> bool:
-        """True while the network is joined."""
-        return self._up
-
-    def begin(self, *, here: bool = False) -> None:
-        """Join on a thread of its own, or on this one; a second call does nothing."""
-        with self._lock:
-            begun, self._begun = self._begun, True
-        if begun:
-            return
-        try:
-            if not here:
-                threading.Thread(target=self._run, name=f"join {self.network.name}", daemon=True).start()
-                return
-        except RuntimeError:
-            # The interpreter ends and starts no thread.
-            logger.debug("%s is joined on the thread of its caller.", self.network.name)
-        self._run()
-
-    def _run(self) -> None:
-        """Join; go on trying where that is wanted."""
-        pause = AGAIN_S
-        while not self._attempt() and self._again and not self._closing.wait(pause):
-            pause = min(2 * pause, AGAIN_MAX_S)
-
-    def close(self) -> None:
-        """Leave the network; one that is being joined is left once it is."""
-        with self._lock:
-            self._closing.set()
-            joined, self._up = self._up, False
-        if joined:
-            self._leave()
-
-    def _attempt(self) -> bool:
-        try:
-            self.network.open()
-        except UnreachableError as exc:
-            self.why = exc.why
-        except Exception as exc:
-            if self.unexpected is None:
-                # The other networks are joined all the same.
-                logger.exception("%s cannot be joined.", self.network.name)
-            self.unexpected, self.why = exc, plain_text(f"{type(exc).__name__}: {exc}")
-        else:
-            self.why, self.unexpected = "", None
-            with self._lock:
-                self._up = not self._closing.is_set()
-            if not self._up:
-                self._leave()
-        self.attempted.set()
-        self._changed(self)
-        return not self.why
-
-    def _leave(self) -> None:
-        try:
-            self.network.close()
-        except Exception as exc:  # noqa: BLE001 - the others are left all the same
-            logger.warning("%s was not left in good order: %s", self.network.name, exc)
 
 
 class Networks:
@@ -153,7 +72,8 @@ class Networks:
         self.keys = dict(keys or {})
         self._stays = stays
         self._opened = self._closed = False
-        self._joinings: tuple[_Joining, ...] = ()
+        self._joinings: tuple[Joining, ...] = ()
+        self._last: tuple[Joining, ...] = ()
         self._change = threading.Condition()
         self._listeners: list[Callable[[NetworkAdapter], None]] = []
         self._told: list[NetworkAdapter] = []
@@ -175,12 +95,17 @@ class Networks:
         Raises:
             UnreachableError: none of them can be reached, and they do not stay.
         """
-        if in_turn and self.stated and not self._stays:
-            self._attempts()[0].begin(here=True)
-        if not self.joined:
-            self.begin(here=len(self.stated) == 1 and not self._stays)
-        with self._change:
-            self._change.wait_for(lambda: self.joined or all(each.attempted.is_set() for each in self._joinings))
+        self._closed = False
+        try:
+            if in_turn and self.stated and not self._stays:
+                self._attempts()[0].begin(here=True)
+            if not self.joined:
+                self.begin(here=len(self.stated) == 1 and not self._stays)
+            with self._change:
+                self._change.wait_for(lambda: self.joined or all(each.attempted.is_set() for each in self._joinings))
+        except BaseException:
+            self.close()
+            raise
         unexpected = next((each.unexpected for each in self._joinings if each.unexpected), None)
         if not self.joined and (unexpected or not self._stays):
             self.close()
@@ -211,7 +136,7 @@ class Networks:
             self._listeners.append(callback)
             joined = tuple(self._told)
         for each in joined:
-            callback(each)
+            _tell(callback, each)
 
     @property
     def joined(self) -> tuple[NetworkAdapter, ...]:
@@ -263,7 +188,7 @@ class Networks:
     @property
     def absences(self) -> str:
         """Reasons why networks are absent, first of those that someone asked for."""
-        stated = self.missing or self.absent
+        stated = self.missing or self.absent.copy()
         if len(stated) == 1:
             return next(iter(stated.values()))
         return "; ".join(f"{name}: {why.rstrip('.')}" for name, why in stated.items())
@@ -482,7 +407,7 @@ class Networks:
         are not waited for.
         """
 
-        async def stopped(joining: _Joining) -> Envelope:
+        async def stopped(joining: Joining) -> Envelope:
             if not joining.attempted.is_set():
                 await asyncio.to_thread(joining.attempted.wait)
             if not joining.up:
@@ -525,23 +450,27 @@ class Networks:
 
         def end_all() -> None:
             with self._change:
-                self._listeners.remove(follow)
+                self._listeners[:] = [each for each in self._listeners if each is not follow]
             with lock:
                 over.set()
-            for end in ends:
+                begun, ends[:] = list(ends), []
+            for end in begun:
                 end()
 
         return end_all
 
-    def _attempts(self) -> tuple[_Joining, ...]:
+    def _attempts(self) -> tuple[Joining, ...]:
         """Return the attempts to join each network; none once they were left."""
         with self._change:
             if not self._opened and not self._closed:
                 self._opened = True
-                self._joinings = tuple(_Joining(each, again=self._stays, changed=self._changed) for each in self.stated)
+                self._joinings = self._last = tuple(
+                    Joining(each, again=self._stays, changed=self._changed, before=last)
+                    for each, last in zip_longest(self.stated, self._last)
+                )
             return self._joinings
 
-    def _changed(self, joining: _Joining) -> None:
+    def _changed(self, joining: Joining) -> None:
         if joining.up:
             self.absent.pop(joining.network.name, None)
         elif joining.why:
@@ -551,7 +480,7 @@ class Networks:
             listeners = list(self._listeners) if joining.up else []
             self._told += [joining.network] if joining.up else []
         for each in listeners:
-            each(joining.network)
+            _tell(each, joining.network)
 
     def _stopped(self, robot: str, timeout: float, robot_name: str, *, insist: bool) -> dict[str, Envelope]:
         def stopped(network: NetworkAdapter) -> Envelope | None:
@@ -633,24 +562,36 @@ def _silent(network: NetworkAdapter, robot: str, why: str) -> Envelope | None:
     return error(f"{robot} did not answer: {reason or 'it is remembered there'}.", stopped=None)
 
 
+def _tell(listener: Callable[[NetworkAdapter], None], network: NetworkAdapter) -> None:
+    """Call a listener, whose failure keeps no other one from hearing."""
+    try:
+        listener(network)
+    except Exception:
+        logger.exception("A listener failed for %s.", network.name)
+
+
 def _waited_for(robot: str, networks: Sequence[NetworkAdapter], *, every: bool) -> list[NetworkAdapter]:
     """Return the networks that have a robot: all, or the first one that is known to."""
     found: dict[NetworkAdapter, bool] = {}
     change = threading.Condition()
 
     def ask(network: NetworkAdapter) -> None:
+        there = False
         try:
             there = network.reaches(robot)
         except RefusalError as exc:
             logger.debug("%s: %s cannot be looked for: %s", network.name, robot, exc)
-            there = False
-        with change:
-            found[network] = there
-            change.notify_all()
+        finally:
+            with change:
+                found[network] = there
+                change.notify_all()
 
-    for each in networks[1:]:
-        threading.Thread(target=ask, args=(each,), name=f"look on {each.name}", daemon=True).start()
-    ask(networks[0])
+    for each in networks:
+        try:
+            threading.Thread(target=ask, args=(each,), name=f"look on {each.name}", daemon=True).start()
+        except RuntimeError:
+            # The interpreter ends and starts no thread.
+            ask(each)
     with change:
         change.wait_for(lambda: len(found) == len(networks) or (not every and any(found.values())))
         return [each for each in networks if found.get(each)]

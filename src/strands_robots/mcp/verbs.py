@@ -44,7 +44,7 @@ def described(found: FoundRobot) -> Envelope:
 def _verb_row(verb: AdvertisedVerb) -> dict[str, Any]:
     return {
         "name": verb.name,
-        "description": verb.description,
+        "description": verb.purpose,
         "moves": not verb.reads,
         **({"own": True} if verb.own else {}),
         **({"lasts_s": verb.lasts_s} if verb.lasts_s else {}),

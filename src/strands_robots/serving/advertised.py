@@ -155,6 +155,12 @@ class AdvertisedVerb:
         return self.description.partition("\n")[0]
 
     @property
+    def purpose(self) -> str:
+        """Its description without the list of the parameters, which are described by themselves."""
+        stated = self.parameters or self.leases
+        return self.description.partition("\n\nArgs:")[0].strip() if stated else self.description
+
+    @property
     def by_name(self) -> dict[str, AdvertisedParameter]:
         """Its parameters by name."""
         return {each.name: each for each in self.parameters}

@@ -17,10 +17,11 @@ pytest.importorskip("mcp.server.mcpserver", reason="needs the extra mcp", exc_ty
 
 from mcp.types import ElicitResult
 
-from strands_robots.device_connect import init_device_connect_sync, loopback_config, stop_device_connect
+from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
 
+EACH = pytest.mark.parametrize("site", [DEVICE_CONNECT, MESH], indirect=True)
 BOTH = pytest.mark.parametrize("mode", ["legacy", "2026-07-28"])
-SHORT = {"instruction": "wave", "duration": 0.3}
+SHORT = {"instruction": "wave", "duration": 0.3, "policy_provider": "mock"}
 REFUSED = {
     "stop": "use stop",
     "stopMotion": "use stop",
@@ -52,16 +53,16 @@ class Kettle(DeviceDriver):  # type: ignore[misc]
 @pytest.fixture(scope="module")
 def barista(site: McpSite) -> Iterator[Barista]:
     robot = Barista()
-    runtime = init_device_connect_sync(robot, peer_id="barista-1", link=loopback_config(site.port))
+    leave = site.serve("barista-1", robot)
     yield robot
-    stop_device_connect(runtime)
+    leave()
 
 
 @pytest.fixture(scope="module", autouse=True)
 def kettle(site: McpSite) -> Iterator[None]:
-    runtime = init_device_connect_sync(Kettle(), peer_id="kettle-1", link=loopback_config(site.port))
+    leave = site.serve("kettle-1", Kettle(), DEVICE_CONNECT)
     yield
-    stop_device_connect(runtime)
+    leave()
 
 
 @pytest.fixture(autouse=True)
@@ -92,6 +93,7 @@ async def test_device_of_another_maker_is_described_and_called(site: McpSite) ->
         assert "takes no argument 'liters'; its arguments: litres." in wrong.structured_content["text"]
 
 
+@EACH
 async def test_verbs_of_our_robots_are_described_without_leases_and_within_a_bound(site: McpSite) -> None:
     async with site.client() as client:
         answer = await client.call_tool("describe_robot", {"robot": "arm-2"})
@@ -117,9 +119,10 @@ async def test_what_has_a_tool_of_its_own_is_refused_with_its_name(site: McpSite
         assert "call_robot" not in {tool.name for tool in (await client.list_tools()).tools}
 
 
+@EACH
 @BOTH
 async def test_motion_that_is_called_is_halted_when_its_call_is_cancelled(site: McpSite, mode: str) -> None:
-    wave = {name: value for name, value in WAVE.items() if name != "robot"}
+    wave = {**SHORT, "duration": WAVE["duration"]}
     async with site.client(mode=mode) as client:
         call = asyncio.ensure_future(called(client, "arm-1", "execute", **wave))
         await site.until(True)
@@ -137,6 +140,7 @@ async def test_robot_that_another_client_holds_refuses_a_called_motion(site: Mcp
         assert not (await called(client, "arm-1", "step", n_steps=1)).is_error
 
 
+@EACH
 @BOTH
 async def test_real_hardware_is_moved_after_the_users_yes_alone(site: McpSite, mode: str) -> None:
     asked: list[str] = []
@@ -156,6 +160,7 @@ async def test_real_hardware_is_moved_after_the_users_yes_alone(site: McpSite, m
     assert "How far: not known before; it is a verb of the robot's own" in asked[2]
 
 
+@EACH
 async def test_own_verb_is_described_called_refused_and_stopped_in_its_middle(site: McpSite, barista: Barista) -> None:
     async with site.client(elicitation_callback=_approving) as client:
         said = (await client.call_tool("describe_robot", {"robot": "barista-1"})).structured_content["data"]

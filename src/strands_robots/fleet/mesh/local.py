@@ -32,7 +32,7 @@ class LocalMesh:
 
     Args:
         source: the first part of this peer's id.
-        console: as :class:`MeshNetwork` has it.
+        console: it is a safety controller, whose id is ``source``.
     """
 
     name = MESH

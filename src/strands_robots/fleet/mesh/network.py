@@ -124,6 +124,11 @@ class MeshNetwork:
             raise UnreachableError(plain_text(str(exc))) from exc
         return mesh
 
+    @property
+    def peer(self) -> Mesh:
+        """This caller as a peer, once it has joined."""
+        return self._joined_mesh
+
     def find(self, timeout: float = FIND_S) -> list[FoundRobot]:
         """Return the robots in reach, once they had the time to announce themselves."""
         discover(self._joined_mesh, since=self._joined, within=timeout)
