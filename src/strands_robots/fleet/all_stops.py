@@ -165,7 +165,7 @@ def _on_each(networks: Networks, stop: Callable[[NetworkAdapter], NetworkVerdict
     """
 
     def stopped(network: NetworkAdapter) -> Stopped:
-        if not (apart and network.has_stop_link) and (why := networks.awaited(network)):
+        if not (apart and network.has_stop_link) and (why := networks.awaited(network, stops=True)):
             return not_left(network.name, lambda: network.key, why), False
         try:
             verdict = stop(network)
