@@ -70,10 +70,13 @@ class LocalMesh:
 
 
 def local_key() -> NetworkKey:
-    """Return the name of this machine's mesh, under which its robots are remembered."""
-    from strands_robots.mesh.session import network  # noqa: PLC0415 - loaded when it is used
+    """Return the name of this machine's mesh, under which its robots are remembered.
 
-    return network()
+    Where no endpoint is stated it is that of :func:`strands_robots.mesh.session.network`, whose code is not loaded.
+    """
+    from strands_robots.safety import network_key  # noqa: PLC0415 - loaded when it is used
+
+    return network_key.NetworkKey.of(network_key.MESH, [f"tcp/127.0.0.1:{settings.integer('STRANDS_MESH_PORT')}"])
 
 
 def no_hub() -> str:
