@@ -81,7 +81,10 @@ def estop_all(
         on_progress: called on a thread of the stop; it returns at once.
     """
     epoch, over, answered = estop_id or new_epoch(), threading.Event(), set[str]()
-    keys = [*(partial(getattr, each, "key") for each in networks.stated), *networks.keys.values()]
+    keys: list[Callable[[], NetworkKey]] = [
+        *(partial(getattr, each, "key") for each in networks.stated),
+        *networks.keys.values(),
+    ]
 
     def remembers(meant: Scope) -> bool:
         # Of the robots that a stop means none need be on each network; only where none is on any all are stopped.
