@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fixtures.page_feed import JPEG, PageFeed
+from fixtures.page_feed import JPEG, PageFeed, page_feeds
 from fixtures.waiting import eventually
 from starlette.testclient import TestClient, WebSocketTestSession
 from starlette.websockets import WebSocketDisconnect
@@ -57,7 +57,7 @@ def make(tmp_path: Path) -> Iterator[Make]:
     def made(access: Access | None = None, client: str = "127.0.0.1", key: Path | None = None) -> Site:
         model, feed = FleetModel(), PageFeed()
         model.update("dc", "arm-1", kind="strands_robot", forms=FORMS, expected=True)
-        page = Dashboard(model, [feed], access or Access(loopback_origins(8800)), OperatorKey(key))
+        page = Dashboard(model, page_feeds(model, feed), access or Access(loopback_origins(8800)), OperatorKey(key))
         browser = TestClient(page.app(), base_url=ORIGIN, client=(client, 4000))
         stack.append(browser)
         browser.__enter__()

@@ -140,12 +140,19 @@ class Network:
         return self._flags_over(self._profile)
 
     def networks(
-        self, *, on_mesh: bool = False, source: str | None = None, stays: bool = False, console: bool = False
+        self,
+        *,
+        on_mesh: bool = False,
+        source: str | None = None,
+        stays: bool = False,
+        console: bool = False,
+        with_mesh: bool = False,
     ) -> Networks:
         """Return the networks of the flags, not joined yet.
 
         Args:
             on_mesh: the native mesh alone.
+            with_mesh: the native mesh in any case, so that its absence is told.
             source: the caller's name; by default that of :meth:`caller`.
             stays: the command lasts, and goes on trying to join what is not there yet.
             console: a safety controller, whose name is its whole id on the mesh.
@@ -163,9 +170,8 @@ class Network:
                 raise CliError("The native mesh is off: STRANDS_MESH switches it off.", Exit.SILENT)
             return networks_of(None, {}, name, devices=False, mesh=True, stays=stays, console=console)
         try:
-            networks = networks_of(
-                self._profile, self._given, name, mesh=self._usable_mesh, stays=stays, console=console
-            )
+            mesh = True if with_mesh else self._usable_mesh
+            networks = networks_of(self._profile, self._given, name, mesh=mesh, stays=stays, console=console)
         except ValidationError as exc:
             raise CliError(str(exc), Exit.USAGE) from exc
         if not networks.stated and not self.on_mesh_alone:

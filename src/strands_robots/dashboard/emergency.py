@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import math
+import threading
 import time
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any
 
 from strands_robots.dashboard.feed import FleetFeed
-from strands_robots.dashboard.fleet_model import FleetModel
+from strands_robots.dashboard.feeds import Feeds
+from strands_robots.dashboard.fleet_model import FleetModel, key_of
+from strands_robots.fleet.fleet_verdict import NetworkVerdict
 from strands_robots.fleet.stop_button import StopButton
 from strands_robots.safety.answers import Answer
 from strands_robots.safety.controller import UNCONFIRMED_S, Progress, StopReport
+from strands_robots.safety.orders import new_epoch
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.safety.statements import Proof
 from strands_robots.safety.stop_notes import stop_notes
@@ -22,21 +27,25 @@ NOTES_MAX = 16
 SILENT_S = 0.9
 """A network whose robots were all silent for longer may be gone."""
 
+UNASKED_S = 60.0
+"""Seconds in which a press leaves on a network that no one asked for, and that is joined after it.
+
+On one that is missing it leaves whenever that is joined, as on one whose link is down.
+"""
+
 
 class FleetStop:
     """STOP on all networks at once; the answers go into the model.
 
     The networks' controllers send on connections and threads of their own. A press runs until every expected robot has
-    answered, and a further one meanwhile is part of it.
+    answered, and a further one meanwhile is part of it. On a network that is not joined a stop leaves once it is.
     """
 
-    def __init__(self, model: FleetModel, feeds: Iterable[FleetFeed]) -> None:
-        self._model = model
-        self._feeds = tuple(feeds)
-        self._buttons = {
-            feed.network: StopButton(feed.controller, _expected(model, feed.network), REASON) for feed in self._feeds
-        }
-        self._some: dict[tuple[str, Scope], StopButton] = {}
+    def __init__(self, model: FleetModel, feeds: Feeds) -> None:
+        self._model, self._feeds = model, feeds
+        self._buttons: dict[tuple[str, Scope], StopButton] = {}
+        self._unsent: Mapping[str, float] = {}
+        self._not_left: Mapping[str, NetworkVerdict] = {}
         self._seen: dict[tuple[str, Scope], tuple[object, bool, frozenset[str]]] = {}
         self._pressed_at: float | None = None
         self._by = ""
@@ -48,18 +57,20 @@ class FleetStop:
         Args:
             who: of whose robot the button was, for the timeline; a robot's own button stops all robots, too.
         """
-        for button in self._buttons.values():
-            button.press()
-        self._pressed_at, self._by, self._for = time.time(), who, (EVERY_ROBOT, ())
+        self._press(self._feeds.joined, EVERY_ROBOT, who)
+        absent, missing, now = self._feeds.absent, self._feeds.missing, self._model.clock()
+        self._unsent = {name: math.inf if name in missing else now + UNASKED_S for name in absent}
+        if absent:
+            threading.Thread(target=self._name_missed, args=(absent,), name="missed robots", daemon=True).start()
 
-    def press_one(self, network: str, robot: str) -> None:
-        """Stop and lock one robot; returns at once. Every robot where it is none."""
-        feeds = [each for each in self._feeds if each.network == network]
+    def press_one(self, robot: str) -> None:
+        """Stop and lock every robot of an id, or all where there is none."""
         scope = Scope.named([robot])
+        feeds = [each for each in self._feeds.joined if self._model.row(key_of(each.network, robot)) is not None]
         if not feeds or scope.everything:
             self.press(robot)
         else:
-            self._press_some(feeds, scope, robot)
+            self._press(feeds, scope, robot)
 
     def press_cell(self, cell: str) -> None:
         """Stop and lock the robots of a cell and those without one; returns at once.
@@ -70,34 +81,61 @@ class FleetStop:
         if scope.everything or all(row.cell != scope.cell for row in self._model.rows()):
             self.press(cell)
             return
-        feeds = [each for each in self._feeds if self._model.expected(each.network, scope)]
-        self._press_some(feeds or self._feeds, scope, cell)
+        feeds = [each for each in self._feeds.joined if self._model.expected(each.network, scope)]
+        self._press(feeds or self._feeds.joined, scope, cell)
 
-    def _press_some(self, feeds: Iterable[FleetFeed], scope: Scope, who: str) -> None:
-        pressed = []
-        for feed in feeds:
-            button = self._some.get((feed.network, scope))
-            if button is None:
-                button = StopButton(feed.controller, _expected(self._model, feed.network, scope), REASON, scope)
-                self._some = {**self._some, (feed.network, scope): button}
+    def _press(self, feeds: Iterable[FleetFeed], scope: Scope, who: str) -> None:
+        pressed = [self._button(each, scope) for each in feeds]
+        for button in pressed:
             button.press()
-            pressed.append(button)
         self._pressed_at, self._by, self._for = time.time(), who, (scope, tuple(pressed))
+        self._not_left = {}
+
+    def _button(self, feed: FleetFeed, scope: Scope) -> StopButton:
+        button = self._buttons.get((feed.network, scope))
+        if button is None:
+            button = StopButton(feed.controller, _expected(self._model, feed.network, scope), REASON, scope)
+            self._buttons = {**self._buttons, (feed.network, scope): button}
+        return button
+
+    def _name_missed(self, absent: Mapping[str, Callable[[], NetworkVerdict]]) -> None:
+        """Show the robots of the roster on networks on which a stop of all did not leave."""
+        about = {"id": new_epoch(), "at": self._pressed_at, "state": "silent", "ms": None, "signed": False}
+        for name, not_left in absent.items():
+            verdict = not_left()
+            outcome = verdict.outcome
+            told = name in self._feeds.missing and not self._feeds.joined
+            # Of a network whose roster cannot be read it is not known whether a robot is there.
+            if outcome is not None and not outcome.size and not told:
+                continue
+            self._not_left = {**self._not_left, name: verdict}
+            for robot in () if outcome is None else outcome.report.silent:
+                self._model.verdict(name, robot, {**about, "why": f"the stop did not leave: {verdict.absent}"[:300]})
+
+    def _press_unsent(self) -> None:
+        """Send a stop of all on networks that were joined after its press."""
+        for feed in self._feeds.joined:
+            until = self._unsent.get(feed.network)
+            if until is None:
+                continue
+            self._unsent = {name: at for name, at in self._unsent.items() if name != feed.network}
+            if self._model.clock() < until:
+                self._button(feed, EVERY_ROBOT).press()
 
     def close(self) -> None:
         """Give up a stop that waits for the link."""
-        for button in (*self._buttons.values(), *self._some.values()):
+        for button in self._buttons.values():
             button.close()
 
     @property
     def running(self) -> bool:
         """True while a stop waits for answers."""
-        return any(button.running for button in (*self._buttons.values(), *self._some.values()))
+        return any(button.running for button in self._buttons.values())
 
     def refresh(self) -> None:
         """Put the answers that came since into the model; called repeatedly."""
-        everything = {(network, EVERY_ROBOT): button for network, button in self._buttons.items()}
-        for (network, scope), button in {**everything, **self._some}.items():
+        self._press_unsent()
+        for (network, scope), button in self._buttons.items():
             button.review()
             running, progress, report = button.running, button.progress, button.report
             outcome = button.outcome
@@ -117,14 +155,19 @@ class FleetStop:
         now = self._model.clock()
         heard = [row.heard for row in self._model.rows() if row.heard is not None]
         silent_s = round(now - max(heard), 2) if heard else None
-        links = {feed.network: feed.controller.link_up for feed in self._feeds}
+        links = {feed.network: feed.controller.link_up for feed in self._feeds.joined}
+        all_of_them = {name: each for (name, scope), each in self._buttons.items() if scope.everything}
+        rosters = {name: _roster(each.outcome) for name, each in all_of_them.items() if each.outcome is not None}
+        not_left = {name: each for name, each in self._not_left.items() if name not in links}
+        rosters |= {name: {"ok": False, "sentence": each.sentence, "notes": []} for name, each in not_left.items()}
         return {
             "type": "link",
             "links": links,
+            "missing": self._feeds.missing,
             "silent_s": silent_s,
-            "can_stop": all(links.values()) and (silent_s is None or silent_s <= SILENT_S),
+            "can_stop": bool(links) and all(links.values()) and (silent_s is None or silent_s <= SILENT_S),
             "running": self.running,
-            "roster": {name: _roster(each.outcome) for name, each in self._buttons.items() if each.outcome is not None},
+            "roster": rosters,
             "pressed_at": self._pressed_at,
             "pressed_by": self._by,
             "pressed_for": self._pressed_for(),
