@@ -227,6 +227,15 @@ def test_forgotten_robot_is_met_anew_with_its_verbs(page: Page) -> None:
     eventually(lambda: row.forms, what="its verbs")
 
 
+def test_device_of_others_says_what_it_lacks(page: Page) -> None:
+    page.there.robots["kettle"] = (function("boil"),)
+    page.there.of_kind = (function("boil"),)
+    row = page.shown("kettle")
+    eventually(lambda: row.lacking == "no lockout, no lease, no stop", what="what it lacks")
+    ours = page.shown("arm-1")
+    eventually(lambda: ours.forms and not ours.lacking, what="one of ours lacks nothing")
+
+
 def test_call_that_is_refused_is_an_answer_and_a_stop_is_graded(page: Page) -> None:
     page.there.answers["moveTo"] = lambda arguments: error("busy")
     moved = asyncio.run(page.feed.call("arm-1", "moveTo", {"x": 1.0}, 3.0))

@@ -238,6 +238,26 @@ def test_page_whose_state_cannot_be_sent_any_more_loses_its_connection(
         assert closed.value.code == 1011
 
 
+def test_verbs_that_a_robot_describes_later_are_told_to_the_page_that_looks_at_it(make: Make) -> None:
+    site = make()
+    with site.open("/state") as socket:
+        hello(socket)
+        socket.send_json({"type": "watch", "key": "dc:arm-1"})
+        while not received(socket, "robot")["looked"]:
+            pass
+        site.model.update("dc", "arm-1", forms=FORMS[:1])
+        assert [form["name"] for form in received(socket, "robot")["forms"]] == ["execute"]
+
+
+def test_networks_that_are_missing_are_told_with_the_reason(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    site = make()
+    monkeypatch.setattr(type(site.page.feeds), "missing", {"mesh": "no mesh answers"})
+    with site.open("/stop") as stop:
+        stop.send_json({"type": "hello"})
+        told = received(stop, "link")
+    assert (told["missing"], told["can_stop"]) == ({"mesh": "no mesh answers"}, True)
+
+
 def test_verb_that_the_robot_does_not_describe_is_not_called(make: Make) -> None:
     site = make()
     with site.open("/state") as socket:

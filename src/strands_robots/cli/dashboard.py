@@ -17,11 +17,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from strands_robots import settings
+from strands_robots._mesh_switch import mesh_env_request
 from strands_robots.cli.command import command
 from strands_robots.cli.keys import PassphraseFile, signing_key
 from strands_robots.cli.network import Network
 from strands_robots.cli.output import CliError, Exit, Screen
-from strands_robots.errors import UnreachableError
 from strands_robots.safety.ed25519 import keygen
 from strands_robots.utils import device_id, missing_extra
 
@@ -75,6 +75,8 @@ def dashboard(
         raise CliError(f"--operator-key {operator_key} is no file.", Exit.USAGE)
     if demo and (operator_key is not None or meet is not None or with_mesh or network != Network()):
         raise CliError("--demo has robots, a network and an operator's key of its own.", Exit.USAGE)
+    if with_mesh and mesh_env_request() is False:
+        raise CliError("--mesh: STRANDS_MESH switches the mesh off.", Exit.USAGE)
     signer = None if key is None else signing_key(key, passphrase_file)
     try:
         from strands_robots.dashboard.feeds import Feeds  # noqa: PLC0415 - loaded when it is used
@@ -97,7 +99,7 @@ def dashboard(
         model = FleetModel()
         networks = replace(network, port=meet).networks(source=source, stays=True, with_mesh=with_mesh)
         if not networks.stated:
-            raise UnreachableError(networks.absences)
+            raise CliError(f"No network is there: {networks.absences}.", Exit.SILENT)
         stack.callback(networks.close)
         page = Dashboard(
             model,

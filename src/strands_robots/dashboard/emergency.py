@@ -156,9 +156,8 @@ class FleetStop:
         heard = [row.heard for row in self._model.rows() if row.heard is not None]
         silent_s = round(now - max(heard), 2) if heard else None
         links = {feed.network: feed.controller.link_up for feed in self._feeds.joined}
-        all_of_them = {name: each for (name, scope), each in self._buttons.items() if scope.everything}
-        rosters = {name: _roster(each.outcome) for name, each in all_of_them.items() if each.outcome is not None}
         not_left = {name: each for name, each in self._not_left.items() if name not in links}
+        rosters = {name: _roster(each) for name, each in self._measured().items()}
         rosters |= {name: {"ok": False, "sentence": each.sentence, "notes": []} for name, each in not_left.items()}
         return {
             "type": "link",
@@ -172,6 +171,12 @@ class FleetStop:
             "pressed_by": self._by,
             "pressed_for": self._pressed_for(),
         }
+
+    def _measured(self) -> dict[str, StopOutcome]:
+        """Return the outcomes of the latest stop of all, where there are robots."""
+        found = {name: each.outcome for (name, scope), each in self._buttons.items() if scope.everything}
+        outcomes = {name: each for name, each in found.items() if each is not None}
+        return {name: each for name, each in outcomes.items() if each.size or each.problems} or outcomes
 
     def _pressed_for(self) -> str:
         """Return the scope of the latest press; empty for every robot.

@@ -238,7 +238,8 @@ class FleetFeed:
             self._functions[name] = functions
             description = RobotDescription.of(functions)
             forms, known = forms_of_verbs(description.verbs.values()), isinstance(functions, list | tuple)
-            self._model.update(self.network, name, forms=forms, lacking=description.absent if known else "")
+            lacking = ", ".join(f"no {each}" for each in description.lacking) if known else ""
+            self._model.update(self.network, name, forms=forms, lacking=lacking)
 
     async def _ask_verbs(self, name: str) -> None:
         loop = asyncio.get_running_loop()

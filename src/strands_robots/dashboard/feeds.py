@@ -68,7 +68,7 @@ class Feeds:
 
     @property
     def absent(self) -> dict[str, Callable[[], NetworkVerdict]]:
-        """The networks without a feed, and what returns the verdict of a stop that does not leave there."""
+        """Networks without a feed, each with the verdict of a stop, once called."""
         absences = {**self._networks.absent, **self._failed}
         keys = self._networks.keys | {each.name: partial(_key, each) for each in self._networks.stated}
         without = {page_name(name): (name, key) for name, key in keys.items() if page_name(name) not in self._feeds}

@@ -59,7 +59,7 @@ class RobotRow:
         messages: signs of life since the last sample of the history, and ``gap_s`` the longest time between two.
         units: unit of each joint's position, as its features name it; ``limits`` are in the same.
         forms: its verbs, as :func:`~strands_robots.dashboard.verb_forms.forms_of` describes them.
-        lacking: a sentence on what a device that is none of ours does not have: a lockout, a lease, a stop.
+        lacking: what a device that is none of ours does not have: a lockout, a lease, a stop.
         hidden: another row shows the same robot.
         namesake: another robot of this id has a row, too.
         changed: number of the model's last change of something that the page shows at once.

@@ -197,7 +197,7 @@ class PageRobots:
         return row is not None and not self._model.silent(row)
 
     def _lasting(self, rows: Sequence[RobotRow]) -> RobotRow:
-        """Return the row of a robot that is shown: the first, or one that was heard since that fell silent."""
+        """Return the row to show: the first, or one heard since that fell silent."""
         first = rows[0]
         heard, since = first.heard or 0.0, self._model.history.silent_s / 2
         alive = (each for each in rows if not self._model.silent(each) and (each.heard or 0.0) > heard + since)

@@ -92,6 +92,7 @@ class PageSession:
         self._control = HandControl(self.tell)
         self._waiting: asyncio.Queue[dict[str, Any]] = asyncio.Queue(WAITING_MAX)
         self._watched, self._joints_at = "", 0.0
+        self._forms: list[Any] | None = None
         self._looking: asyncio.Task[None] | None = None
         self._calls: set[asyncio.Task[None]] = set()
         self._thumbnails: dict[str, asyncio.Task[None]] = {}
@@ -171,6 +172,7 @@ class PageSession:
                 await self._send(self._waiting.get_nowait())
             if self._watched and tick % JOINTS_TICKS == 0:
                 await self._send_joints()
+                self._tell_new_forms()
             await asyncio.sleep(TICK_S)
 
     async def _send_joints(self) -> None:
@@ -235,7 +237,7 @@ class PageSession:
     # What a page asks for.
 
     def _watch(self, key: str) -> None:
-        self._watched, self._joints_at = key, 0.0
+        self._watched, self._joints_at, self._forms = key, 0.0, None
         if self._looking is not None:
             self._looking.cancel()
         self._looking = asyncio.create_task(self._look(key)) if key else None
@@ -275,7 +277,14 @@ class PageSession:
         """Tell what is known; ``looked`` once the robot itself was asked."""
         details = self._server.model.details(key)
         if details is not None:
+            self._forms = details["forms"]
             self.tell({**details, "looked": looked})
+
+    def _tell_new_forms(self) -> None:
+        """Tell the details again of a robot that has described its verbs since."""
+        row = self._server.model.row(self._watched)
+        if row is not None and self._forms is not None and [*row.forms] != self._forms:
+            self._tell_details(self._watched)
 
     def _jog(self, key: str, message: Message) -> None:
         row = self._server.model.row(key)

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from fixtures.nats_server import NatsServer
 from fixtures.page_driving import answer, card, hold_until, moving, open_robot, take, verb_form
-from fixtures.page_site import picture, shows
+from fixtures.page_site import picture
 from fixtures.waiting import accepts, eventually
 
 from strands_robots.device_connect.backends import LinkConfig
@@ -36,6 +36,14 @@ def start(page: Any, verb: str) -> Any:
     return form.locator(".said")
 
 
+def halt(page: Any, *arms: Any) -> None:
+    """Halt the robot that is open, and wait until the arms stand."""
+    page.locator("#robot .halt").click()
+    page.locator("#robot .halt-said[data-tone='good']").wait_for(timeout=30_000)
+    for each in arms:
+        eventually(lambda each=each: not moving(each), what="the arm stands")  # type: ignore[misc]
+
+
 @pytest.mark.parametrize("network", [DEVICE_CONNECT, MESH])
 def test_robot_of_each_network_is_called_driven_stopped_and_freed(cell: Any, tmp_path: Path, network: str) -> None:
     key, name = tmp_path / "operator.pem", PAGE_NAMES[network]
@@ -50,11 +58,9 @@ def test_robot_of_each_network_is_called_driven_stopped_and_freed(cell: Any, tmp
     hold_until(page, button, lambda: moving(arms), "the arm moves")
     page.mouse.up()
     page.locator(".drive .said", has_text="Stopped (").wait_for(timeout=30_000)
-    assert not moving(arms)
+    eventually(lambda: not moving(arms), what="the arm stands")
     arms.ask("move")
-    page.locator("#robot .halt").click()
-    page.locator("#robot .halt-said[data-tone='good']").wait_for(timeout=30_000)
-    assert not moving(arms)
+    halt(page, arms)
     form.locator("#p-wipe-strokes").fill("9")
     form.get_by_role("button", name="Run").click()
     eventually(lambda: arms.ask("facts")["arm-1"]["wiped"] > 2, what="it wipes")
@@ -76,15 +82,13 @@ def test_robot_on_both_networks_has_one_row_and_a_second_one_where_the_first_is_
     cell.link = LinkConfig(transport="nats", connect=(server.url,))
     arms = cell.serve_arms("arm-1", networks=[DEVICE_CONNECT, MESH])
     page = cell.open(cell.serve_page("--nats", server.url), robots=1)
-    shows(page, "document.querySelectorAll('.card').length === 1", 30.0)
     eventually(lambda: keys(page) == ["dc:arm-1"], 30.0, "one row")
     open_robot(page)
     start(page, "execute")
     eventually(lambda: moving(arms), what="the arm moves")
-    page.locator("#robot .halt").click()
-    page.locator("#robot .halt-said[data-tone='good']").wait_for(timeout=30_000)
-    assert not moving(arms)
+    halt(page, arms)
     page.locator("a", has_text="All robots").click()
+    eventually(lambda: keys(page) == ["dc:arm-1"], 30.0, "one row")
     server.kill()
     eventually(lambda: keys(page) == ["dc:arm-1", "mesh:arm-1"], 60.0, "its row of the mesh")
     assert card(page, "arm-1", "mesh").locator(".name").inner_text() == "arm-1 (mesh)"
@@ -92,9 +96,7 @@ def test_robot_on_both_networks_has_one_row_and_a_second_one_where_the_first_is_
     open_robot(page, network="mesh")
     said = start(page, "start")
     eventually(lambda: moving(arms), 30.0, f"the arm moves: {said.inner_text()}")
-    page.locator("#robot .halt").click()
-    page.locator("#robot .halt-said[data-tone='good']").wait_for(timeout=30_000)
-    assert not moving(arms)
+    halt(page, arms)
     page.locator("a", has_text="All robots").click()
     server.start()
     eventually(lambda: keys(page) == ["dc:arm-1"], 60.0, "one row")
@@ -118,15 +120,39 @@ def test_two_robots_of_one_id_have_two_rows_are_moved_by_none_and_stopped_by_eit
     assert not moving(first) and not moving(second)
     for arms in (first, second):
         arms.ask("move")
-    page.locator("#robot .halt").click()
-    page.locator("#robot .halt-said[data-tone='good']").wait_for(timeout=30_000)
-    assert not moving(first) and not moving(second)
+    halt(page, first, second)
     for arms in (first, second):
         arms.ask("move")
     page.get_by_role("button", name="STOP this one").click()
     for network in ("dc", "mesh"):
         answer(page, "arm-1", "stopped", network)
-    assert not moving(first) and not moving(second)
+    eventually(lambda: not moving(first) and not moving(second), what="both arms stand")
+
+
+LINKS = """() => new Promise((tell) => {
+  const socket = new WebSocket(`ws://${location.host}/stop`);
+  socket.onopen = () => socket.send('{"type": "hello"}');
+  socket.onmessage = (event) => {
+    const message = JSON.parse(event.data);
+    if (message.type === "link") { socket.close(); tell(Object.keys(message.links)); }
+  };
+})"""
+"""The networks that a stop would leave on."""
+
+
+@pytest.mark.parametrize("network", [DEVICE_CONNECT, MESH])
+def test_network_without_a_robot_spoils_no_verdict(cell: Any, network: str) -> None:
+    # By default both networks of a machine meet at one port.
+    environment = cell.machine.environment
+    environment["STRANDS_MESH_PORT"] = cell.settings["STRANDS_MESH_PORT"] = environment["STRANDS_DC_PORT"]
+    arms = cell.serve_arms("arm-1", networks=[network])
+    page = cell.open(cell.serve_page(), robots=1)
+    eventually(lambda: page.evaluate(LINKS) == ["dc", "mesh"], 30.0, "both networks")
+    arms.ask("move")
+    page.keyboard.press("Space")
+    answer(page, "arm-1", "stopped", PAGE_NAMES[network])
+    page.locator(".stop-head[data-tone='good']", has_text="The robot stopped.").wait_for(timeout=30_000)
+    assert "The roster has no robot" not in page.locator("#stop-said").inner_text()
 
 
 def test_page_starts_without_its_broker_and_a_press_leaves_there_once_it_comes(cell: Any) -> None:
@@ -142,11 +168,12 @@ def test_page_starts_without_its_broker_and_a_press_leaves_there_once_it_comes(c
         each.ask("move")
     page.keyboard.press("Space")
     answer(page, "sim-1", "stopped", "mesh")
-    assert not moving(sim, "sim-1") and moving(arms)
+    eventually(lambda: not moving(sim, "sim-1"), what="the arm of the mesh stands")
+    assert moving(arms)
     server.start()
     answer(page, "arm-1", "stopped")
-    assert not moving(arms)
-    assert page.locator("#missing").is_hidden()
+    eventually(lambda: not moving(arms), what="the other arm stands")
+    page.locator("#missing").wait_for(state="hidden")
 
 
 def test_robots_of_the_roster_on_a_network_that_is_gone_are_named_by_a_stop(cell: Any) -> None:
