@@ -11,10 +11,10 @@ from fixtures.page_feed import page_feeds
 from fixtures.waiting import eventually
 from tests.fleet.scripted import OURS, ScriptedNetwork
 
-from strands_robots.dashboard import emergency
 from strands_robots.dashboard.emergency import FleetStop, verdict_of
 from strands_robots.dashboard.feeds import Feeds
 from strands_robots.dashboard.fleet_model import FleetModel
+from strands_robots.fleet import stop_button
 from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
 from strands_robots.fleet.networks import Networks
 from strands_robots.safety.answers import Answer
@@ -82,9 +82,10 @@ def stopped_by(report: StopReport, *names: str) -> tuple[FleetModel, FleetStop, 
     model, controller = FleetModel(), Controller(report)
     for name in names:
         model.update("dc", name, expected=True)
-    stop = FleetStop(model, page_feeds(model, Fed(controller)))
+    feeds = page_feeds(model, Fed(controller))
+    stop = FleetStop(model, feeds)
     stop.press()
-    stop.close()
+    feeds.buttons.close()
     eventually(lambda: not stop.running, what="the stop's end")
     stop.refresh()
     return model, stop, controller
@@ -290,7 +291,6 @@ def networked() -> Iterator[Callable[..., Networked]]:
 
     yield make
     for each in made:
-        each.stop.close()
         each.feeds.close()
         each.networks.close()
 
@@ -327,24 +327,63 @@ def test_press_leaves_on_a_network_once_it_is_joined(networked: Callable[..., Ne
     page.stop.press()
     eventually(lambda: "mesh" in page.refreshed()["roster"], what="the network that was missed")
     page.comes()
-    page.refreshed()
     assert page.gone.controller.presses == 1
     eventually(lambda: page.refreshed() and states(page.model).get("sim-1") == "stopped", what="its answer")
     assert "mesh" not in page.refreshed()["roster"]
-    page.refreshed()
-    assert page.gone.controller.presses == 1, "once"
 
 
-def test_press_of_long_ago_does_not_leave_on_a_network_that_no_one_asked_for(
-    networked: Callable[..., Networked],
+def test_press_of_long_ago_does_not_leave_on_a_network_that_comes_later(
+    networked: Callable[..., Networked], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     page = networked(MESH)
     page.stop.press()
-    now = page.model.clock()
-    page.model.clock = lambda: now + emergency.UNASKED_S + 1.0
+    eventually(lambda: not page.stop.running, what="the stop's end")
+    monkeypatch.setattr(stop_button, "LATE_S", 0.0)
     page.comes()
-    page.refreshed()
     assert page.gone.controller.presses == 0
+
+
+def test_press_leaves_on_a_stop_link_of_its_own_before_the_network_is_joined() -> None:
+    there = ScriptedNetwork(DEVICE_CONNECT)
+    there.has_stop_link, there.unreachable, there.controller = True, "nothing listens there", Scripted("arm-1")
+    networks, model = Networks([there], stays=True), FleetModel()
+    feeds = Feeds(model, networks)
+    stop = FleetStop(model, feeds)
+    try:
+        feeds.begin()
+        stop.press()
+        assert there.controller.presses == 1
+        eventually(lambda: networks.absent, what="the first attempt")
+        assert stop.state()["missing"] == {"dc": "nothing listens there"}
+        there.unreachable = ""
+        eventually(lambda: feeds.joined, what="the network")
+        assert (len(there.standing_for), there.controller.presses) == (1, 1)
+    finally:
+        feeds.close()
+        networks.close()
+    assert there.standing_for == []
+
+
+def test_network_without_link_and_robot_is_waited_for_by_no_stop_and_alarms_no_one() -> None:
+    model = FleetModel()
+    near, far = (ScopedController(StopReport("e" * 32, {}, {}, {}, (), up, 9.0)) for up in (True, False))
+    far.link_up = False
+    feeds = [Fed(near), Fed(far)]
+    feeds[1].network = "mesh"
+    made = page_feeds(model, *feeds)
+    stop = FleetStop(model, made)
+    model.update("dc", "arm-1", expected=True)
+    model.sign_of_life("dc", "arm-1")
+    stop.press()
+    eventually(lambda: made.buttons.every["mesh", EVERY_ROBOT].report is not None, what="a stop that does not leave")
+    assert made.buttons.every["mesh", EVERY_ROBOT].running
+    assert (stop.state()["links"], stop.state()["can_stop"]) == ({"dc": True}, True)
+    eventually(lambda: not made.buttons.every["dc", EVERY_ROBOT].running, what="the other's end")
+    assert not stop.running
+    model.update("mesh", "sim-1", expected=True)
+    assert (stop.state()["links"], stop.state()["can_stop"]) == ({"dc": True, "mesh": False}, False)
+    assert stop.running
+    made.buttons.close()
 
 
 def test_network_that_is_joined_without_a_press_gets_none(networked: Callable[..., Networked]) -> None:

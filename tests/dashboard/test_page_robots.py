@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fixtures.page_feed import page_feeds
 from fixtures.waiting import until
 from tests.fleet.scripted import OURS, ScriptedNetwork
 
@@ -28,6 +27,14 @@ FIRST, SECOND = "dc:both", "mesh:both"
 SILENT_S = 0.6
 
 
+def fed(model: FleetModel, *networks: ScriptedNetwork) -> Feeds:
+    """Return the feeds of networks that are joined."""
+    feeds = Feeds(model, Networks(networks))
+    for each in networks:
+        feeds.add(FleetFeed(model, each))
+    return feeds
+
+
 class Page:
     """A page of two networks that both have a robot of one id, which is looked at all the time."""
 
@@ -41,7 +48,7 @@ class Page:
         self.in_use: set[str] = set()
 
     async def begin(self) -> None:
-        self.feeds = page_feeds(self.model, *(FleetFeed(self.model, each) for each in self.networks))
+        self.feeds = fed(self.model, *self.networks)
         self.robots = PageRobots(self.model, self.feeds)
         self._looking = asyncio.create_task(self._look())
         await until(lambda: all(self.row(key) and self.row(key).locked is not None for key in (FIRST, SECOND)))
@@ -179,7 +186,7 @@ async def test_enrolled_robot_is_moved_by_its_own_row_alone(page: Page, keys: li
 
 async def test_robot_of_one_network_is_moved_without_a_question(page: Page) -> None:
     page.mesh.robots = {"sim-1": OURS}
-    page.feeds = page_feeds(page.model, *(FleetFeed(page.model, each) for each in page.networks))
+    page.feeds = fed(page.model, *page.networks)
     page.robots = PageRobots(page.model, page.feeds)
     page._looking = asyncio.create_task(page._look())
     await until(lambda: page.row(FIRST) and page.row("mesh:sim-1"), what="the robots")

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import math
 import threading
 import time
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
-from strands_robots.dashboard.feed import FleetFeed
 from strands_robots.dashboard.feeds import Feeds
 from strands_robots.dashboard.fleet_model import FleetModel, key_of
 from strands_robots.fleet.fleet_verdict import NetworkVerdict
@@ -22,34 +20,26 @@ from strands_robots.safety.stop_notes import stop_notes
 from strands_robots.safety.stop_roster import StopOutcome
 from strands_robots.utils import plain_text
 
-REASON = "STOP on the operator's page"
 NOTES_MAX = 16
 SILENT_S = 0.9
 """A network whose robots were all silent for longer may be gone."""
-
-UNASKED_S = 60.0
-"""Seconds in which a press leaves on a network that no one asked for, and that is joined after it.
-
-On one that is missing it leaves whenever that is joined, as on one whose link is down.
-"""
 
 
 class FleetStop:
     """STOP on all networks at once; the answers go into the model.
 
     The networks' controllers send on connections and threads of their own. A press runs until every expected robot has
-    answered, and a further one meanwhile is part of it. On a network that is not joined a stop leaves once it is.
+    answered, and a further one meanwhile is part of it. On a network that comes later it leaves as
+    :class:`~strands_robots.fleet.stop_button.StopButtons` says.
     """
 
     def __init__(self, model: FleetModel, feeds: Feeds) -> None:
-        self._model, self._feeds = model, feeds
-        self._buttons: dict[tuple[str, Scope], StopButton] = {}
-        self._unsent: Mapping[str, float] = {}
+        self._model, self._feeds, self._buttons = model, feeds, feeds.buttons
         self._not_left: Mapping[str, NetworkVerdict] = {}
         self._seen: dict[tuple[str, Scope], tuple[object, bool, frozenset[str]]] = {}
         self._pressed_at: float | None = None
         self._by = ""
-        self._for: tuple[Scope, tuple[StopButton, ...]] = (EVERY_ROBOT, ())
+        self._for: tuple[Scope, Collection[StopButton]] = (EVERY_ROBOT, ())
 
     def press(self, who: str = "") -> None:
         """Stop every robot of every network; returns at once.
@@ -57,20 +47,19 @@ class FleetStop:
         Args:
             who: of whose robot the button was, for the timeline; a robot's own button stops all robots, too.
         """
-        self._press(self._feeds.joined, EVERY_ROBOT, who)
-        absent, missing, now = self._feeds.absent, self._feeds.missing, self._model.clock()
-        self._unsent = {name: math.inf if name in missing else now + UNASKED_S for name in absent}
-        if absent:
-            threading.Thread(target=self._name_missed, args=(absent,), name="missed robots", daemon=True).start()
+        self._press(EVERY_ROBOT, (), who)
+        unsent = self._feeds.unsent
+        if unsent:
+            threading.Thread(target=self._name_missed, args=(unsent,), name="missed robots", daemon=True).start()
 
     def press_one(self, robot: str) -> None:
         """Stop and lock every robot of an id, or all where there is none."""
         scope = Scope.named([robot])
-        feeds = [each for each in self._feeds.joined if self._model.row(key_of(each.network, robot)) is not None]
-        if not feeds or scope.everything:
+        having = [name for name in self._feeds.senders if self._model.row(key_of(name, robot)) is not None]
+        if not having or scope.everything:
             self.press(robot)
         else:
-            self._press(feeds, scope, robot)
+            self._press(scope, having, robot)
 
     def press_cell(self, cell: str) -> None:
         """Stop and lock the robots of a cell and those without one; returns at once.
@@ -80,68 +69,42 @@ class FleetStop:
         scope = Scope.read({"cell": cell})
         if scope.everything or all(row.cell != scope.cell for row in self._model.rows()):
             self.press(cell)
-            return
-        feeds = [each for each in self._feeds.joined if self._model.expected(each.network, scope)]
-        self._press(feeds or self._feeds.joined, scope, cell)
+        else:
+            self._press(scope, [name for name in self._feeds.senders if self._model.expected(name, scope)], cell)
 
-    def _press(self, feeds: Iterable[FleetFeed], scope: Scope, who: str) -> None:
-        pressed = [self._button(each, scope) for each in feeds]
-        for button in pressed:
-            button.press()
-        self._pressed_at, self._by, self._for = time.time(), who, (scope, tuple(pressed))
+    def _press(self, scope: Scope, networks: Collection[str], who: str) -> None:
+        self._buttons.press(scope, networks)
+        self._pressed_at, self._by, self._for = time.time(), who, (scope, self._buttons.latest.values())
         self._not_left = {}
 
-    def _button(self, feed: FleetFeed, scope: Scope) -> StopButton:
-        button = self._buttons.get((feed.network, scope))
-        if button is None:
-            button = StopButton(feed.controller, _expected(self._model, feed.network, scope), REASON, scope)
-            self._buttons = {**self._buttons, (feed.network, scope): button}
-        return button
-
-    def _name_missed(self, absent: Mapping[str, Callable[[], NetworkVerdict]]) -> None:
+    def _name_missed(self, unsent: Mapping[str, Callable[[], NetworkVerdict]]) -> None:
         """Show the robots of the roster on networks on which a stop of all did not leave."""
         about = {"id": new_epoch(), "at": self._pressed_at, "state": "silent", "ms": None, "signed": False}
-        for name, not_left in absent.items():
+        for name, not_left in unsent.items():
             verdict = not_left()
-            outcome = verdict.outcome
-            told = name in self._feeds.missing and not self._feeds.joined
             # Of a network whose roster cannot be read it is not known whether a robot is there.
-            if outcome is not None and not outcome.size and not told:
+            if verdict.outcome is not None and not verdict.outcome.size:
                 continue
             self._not_left = {**self._not_left, name: verdict}
-            for robot in () if outcome is None else outcome.report.silent:
+            for robot in () if verdict.outcome is None else verdict.outcome.report.silent:
                 self._model.verdict(name, robot, {**about, "why": f"the stop did not leave: {verdict.absent}"[:300]})
-
-    def _press_unsent(self) -> None:
-        """Send a stop of all on networks that were joined after its press."""
-        for feed in self._feeds.joined:
-            until = self._unsent.get(feed.network)
-            if until is None:
-                continue
-            self._unsent = {name: at for name, at in self._unsent.items() if name != feed.network}
-            if self._model.clock() < until:
-                self._button(feed, EVERY_ROBOT).press()
-
-    def close(self) -> None:
-        """Give up a stop that waits for the link."""
-        for button in self._buttons.values():
-            button.close()
 
     @property
     def running(self) -> bool:
         """True while a stop waits for answers."""
-        return any(button.running for button in self._buttons.values())
+        running = {network for (network, _), each in self._buttons.every.items() if each.running}
+        # Without a link, and without a robot of it, there is nothing to wait for.
+        return bool(running) and not running.isdisjoint(self._links())
 
     def refresh(self) -> None:
         """Put the answers that came since into the model; called repeatedly."""
-        self._press_unsent()
-        for (network, scope), button in self._buttons.items():
-            button.review()
+        self._buttons.review()
+        for (network, scope), button in self._buttons.every.items():
             running, progress, report = button.running, button.progress, button.report
             outcome = button.outcome
             latest = report if report is not None and not running else progress
             wider = EVERY_ROBOT if latest is not None and latest.widened else scope
-            expected = frozenset(_expected(self._model, network, wider)())
+            expected = frozenset(wider.only or self._model.expected(network, wider))
             seen = (latest, running, expected)
             if latest is None or self._seen.get((network, scope)) == seen:
                 continue
@@ -152,11 +115,10 @@ class FleetStop:
 
     def state(self) -> dict[str, Any]:
         """Return whether a stop would leave now, and how the latest one goes on."""
-        now = self._model.clock()
+        now, links = self._model.clock(), self._links()
         heard = [row.heard for row in self._model.rows() if row.heard is not None]
         silent_s = round(now - max(heard), 2) if heard else None
-        links = {feed.network: feed.controller.link_up for feed in self._feeds.joined}
-        not_left = {name: each for name, each in self._not_left.items() if name not in links}
+        not_left = {name: each for name, each in self._not_left.items() if name not in self._feeds.senders}
         rosters = {name: _roster(each) for name, each in self._measured().items()}
         rosters |= {name: {"ok": False, "sentence": each.sentence, "notes": []} for name, each in not_left.items()}
         return {
@@ -172,9 +134,20 @@ class FleetStop:
             "pressed_for": self._pressed_for(),
         }
 
+    def _links(self) -> dict[str, bool]:
+        """Return by network whether a stop would leave.
+
+        A network without a link and without a robot is left out.
+        """
+        up = {name: each.link_up for name, each in self._feeds.senders.items()}
+        if all(up.values()):
+            return up
+        having = self._model.networks()
+        return {name: is_up for name, is_up in up.items() if is_up or name in having}
+
     def _measured(self) -> dict[str, StopOutcome]:
         """Return the outcomes of the latest stop of all, where there are robots."""
-        found = {name: each.outcome for (name, scope), each in self._buttons.items() if scope.everything}
+        found = {name: each.outcome for (name, scope), each in self._buttons.every.items() if scope.everything}
         outcomes = {name: each for name, each in found.items() if each is not None}
         return {name: each for name, each in outcomes.items() if each.size or each.problems} or outcomes
 
@@ -243,7 +216,3 @@ def _roster(outcome: StopOutcome) -> dict[str, Any]:
         "sentence": outcome.sentence,
         "notes": [plain_text(each, 300) for each in stop_notes(outcome)[:NOTES_MAX]],
     }
-
-
-def _expected(model: FleetModel, network: str, scope: Scope = EVERY_ROBOT) -> Callable[[], Collection[str]]:
-    return lambda: scope.only or model.expected(network, scope)

@@ -59,22 +59,20 @@ CAMERAS_MAX, CAMERA_NAME_MAX = 32, 128
 
 
 class FleetFeed:
-    """Robots of one network, and the sender of its emergency stops.
+    """Robots of one network.
 
     ``call`` and ``stop`` run on the caller's event loop, everything else on a loop of the feed's own.
 
     Args:
         model: takes what the robots say.
         there: a joined network.
-        signing_key: signs emergency stops; then only enrolled robots can confirm one.
 
     Attributes:
         network: the name of the network in the page's messages.
         there: as given.
-        controller: sends its emergency stops.
     """
 
-    def __init__(self, model: FleetModel, there: NetworkAdapter, signing_key: Any = None) -> None:
+    def __init__(self, model: FleetModel, there: NetworkAdapter) -> None:
         self.network = page_name(there.name)
         self._model, self.there = model, there
         self._names: set[str] = set()
@@ -95,9 +93,6 @@ class FleetFeed:
         for pool in (self._searcher, self._describers):
             self._stack.callback(pool.shutdown, wait=False, cancel_futures=True)
         try:
-            self.controller = self._stack.enter_context(
-                there.standing(signing_key, lambda: model.expected(self.network))
-            )
             thread = LoopThread(f"dashboard-{self.network}")
             self._stack.callback(thread.close)
             self._stack.callback(there.subscribe(EVERY, self._take))

@@ -389,6 +389,11 @@ class FleetModel:
         rows = self._expected.get(network, ())
         return tuple(name for name, cell in rows if cell is None or scope.covers(name, {cell} - {""}))
 
+    def networks(self) -> Collection[str]:
+        """Return the networks that have a row."""
+        with self._lock:
+            return {row.network for row in self._rows.values()}
+
     def row(self, key: str) -> RobotRow | None:
         """Return the row of a robot, or None."""
         with self._lock:

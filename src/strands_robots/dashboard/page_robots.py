@@ -20,6 +20,7 @@ from strands_robots.dashboard.fleet_model import FleetModel, RobotRow, key_of
 from strands_robots.envelope import Envelope, error
 from strands_robots.errors import AmbiguousRobotError
 from strands_robots.fleet.shared_id import SharedId, decided
+from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.stopping import grade
 from strands_robots.utils import ValidationError, shown
 
@@ -163,6 +164,11 @@ class PageRobots:
         self._model.arrange(hidden, namesakes)
         for name in self._shared.keys() - several.keys():
             del self._shared[name]
+
+    def network_key(self, feed: FleetFeed) -> NetworkKey | None:
+        """Return the name under which the robots of a network are remembered, or None."""
+        sender = self._feeds.senders.get(feed.network)
+        return None if sender is None else sender.network
 
     def close(self) -> None:
         """Ask for no more keys."""

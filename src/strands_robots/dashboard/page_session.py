@@ -387,7 +387,7 @@ class PageSession:
 
     def _unheard(self, feed: FleetFeed) -> Unheard:
         """Return the robots of the roster not heard lately; it reads the disk."""
-        model, network = self._server.model, feed.controller.network
+        model, network = self._server.model, self._server.robots.network_key(feed)
         since = model.clock() - FORGET_S
         heard = {row.id for row in model.rows() if row.network == feed.network and (row.heard or since) > since}
         return Unheard() if network is None else unheard_now(network, heard)

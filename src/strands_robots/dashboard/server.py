@@ -105,7 +105,6 @@ class Dashboard:
 
     def close(self) -> None:
         """Give up a running stop and leave the networks."""
-        self.stop.close()
         self.robots.close()
         self.feeds.close()
 
