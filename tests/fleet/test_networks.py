@@ -598,7 +598,7 @@ class TestBusy:
         self, tries: list[int], near: ScriptedNetwork, far: SlowNetwork, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr(module, "BUSY_S", 0.0)
-        with Networks([near, far]) as networks:
+        with Networks([near, far], unasked={MESH}) as networks:
             assert stop_all(networks).ok
             assert (len(tries), networks.absent) == (2, {MESH: "it hangs"})
             # The next stop tries it once more.
