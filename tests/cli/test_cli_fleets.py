@@ -242,6 +242,13 @@ class TestMesh:
             Network(profile="lab").link()
         assert refused.value.code is Exit.USAGE
 
+    def test_doctor_looks_for_no_device_connect_beside_a_mesh_alone(self, run: Run, write: Write) -> None:
+        write(f"[mesh]\nport = {free_port()}")
+        checks = json.loads(run("doctor", "--fleet", "lab", "--json").output)["checks"]
+        found = {each["name"]: (each["mark"], each["said"]) for each in checks}
+        assert found["network"] == ("ok", "the connection profile has a mesh and no Device Connect")
+        assert found["mesh"][0] == "warn"
+
     def test_mesh_of_the_environment_is_left_out_beside_a_profile_without(self, write: Write) -> None:
         write("port = 7633")
         Network(profile="lab").link()

@@ -168,6 +168,8 @@ def _packages() -> Iterator[Finding]:
 def _link_of(network: Network) -> tuple[LinkConfig | None, list[Finding]]:
     """Return the link that every command would use, and what is found of it."""
     try:
+        if network.on_mesh_alone:
+            return None, [Finding("network", Mark.OK, "the connection profile has a mesh and no Device Connect")]
         link = network.link()
     except (CliError, ValidationError, MissingExtraError) as exc:
         said = "no usable network in the flags and the environment"
