@@ -25,13 +25,14 @@ from mcp import MCPError
 from mcp.client.client import Client
 
 from benchmarks.table import Row
-from strands_robots.device_connect import FleetClient, init_device_connect_sync, loopback_config
-from strands_robots.device_connect.discovery import Peer
+from strands_robots.device_connect import FleetClient, loopback_config
+from strands_robots.fleet.adapter import FoundRobot
 from strands_robots.mcp.access import ClientAccess
 from strands_robots.mcp.approval import Approvals
 from strands_robots.mcp.caller import SILENCE_S, Caller
 from strands_robots.mcp.resources import RobotResources
 from strands_robots.mcp.server import build
+from strands_robots.mcp.standing import StandingController
 
 HZ = 200.0
 TIMES, TIMES_QUICK = 100, 5
@@ -132,15 +133,12 @@ class Site(McpSite):
 
     def __init__(self, state: Path) -> None:
         super().__init__(state, simulated=False)
-        link = loopback_config(self.port)
-        self.fleet = FleetClient(link, "bench")
+        self.fleet = FleetClient(loopback_config(self.port), "bench")
         self.fleet.__enter__()
         worlds = {MOVERS[0]: self.world, **{name: ToyWorld(name) for name in (*MOVERS[1:], *OTHERS)}}
-        self.runtimes += [
-            init_device_connect_sync(world, peer_id=name, link=link)
-            for name, world in worlds.items()
-            if world is not self.world
-        ]
+        for name, world in worlds.items():
+            if world is not self.world:
+                self.serve(name, world)
         self.movers = [Mover(name, worlds[name]) for name in MOVERS]
         for mover in self.movers:
             # Often enough that a halt does not hide between two writes.
@@ -353,11 +351,12 @@ async def killed_server(mover: Mover, site: Site) -> float:
 async def pages() -> Row:
     """Measure every page of a list of robots whose fields are as long as they may be."""
     name, model = "r" * 120, 'a "model" ' * 6
-    status = {"availability": "available"}
-    peers = [Peer(f"{name}{number:03}", "strands_robot" * 3, model, status) for number in range(ROBOTS)]
-    fleet: Any = SimpleNamespace(peers=lambda: peers, source="bench", known=lambda: ())
-    access = ClientAccess(Caller(fleet), approves=False, show_picture=lambda jpeg: "")
-    server = build(lambda context: access, RobotResources(fleet), Approvals())
+    ids = [f"{name}{number:03}" for number in range(ROBOTS)]
+    found = {each: (FoundRobot(each, "strands_robot" * 3, model, status="available"), None) for each in ids}
+    networks: Any = SimpleNamespace(find=lambda: found, announced=tuple)
+    access = ClientAccess(Caller(networks), approves=False, show_picture=lambda jpeg: "")
+    standing = StandingController("bench", networks)
+    server = build(lambda context: access, RobotResources(networks), Approvals(), standing)
     sizes, seen, start = [], 0, 0
     async with Client(server) as client:
         while True:

@@ -7,6 +7,7 @@ import os
 import signal
 import tempfile
 import threading
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
@@ -136,11 +137,15 @@ def no_thread_of_ours_left(state_directory: Path) -> Iterator[None]:
 
 @contextmanager
 def threads_ended() -> Iterator[None]:
-    """Wait at the end of a block for the threads of the package that it started."""
-    before = set(threading.enumerate())
+    """Wait at the end of a block for the threads of the package that it started.
+
+    A pool that the robots of a file use may have replaced one.
+    """
+    before = Counter(thread.name for thread in threading.enumerate())
     yield
 
     def left() -> list[str]:
-        return [t.name for t in threading.enumerate() if t not in before and t.name.startswith(OURS)]
+        now = Counter(thread.name for thread in threading.enumerate() if thread.name.startswith(OURS))
+        return sorted((now - before).elements())
 
     eventually(lambda: not left(), what=f"the end of {left()}")

@@ -136,14 +136,25 @@ def test_stop_from_a_loop_waits_for_no_joining_once_the_robot_has_stopped(
     assert asyncio.run(stop()) == {DEVICE_CONNECT: near.stops}
 
 
-def test_network_that_is_gone_and_has_no_remembered_robot_fails_no_stop(near: ScriptedNetwork) -> None:
+def test_stated_network_that_is_gone_fails_a_stop_though_no_robot_of_it_is_remembered(near: ScriptedNetwork) -> None:
     far = ScriptedNetwork(MESH, {})
     far.unreachable = "no route"
     with Networks([near, far]) as networks:
-        verdict = stop_all(networks)
-        assert networks.absent == {MESH: "no route"}
-    assert verdict.ok
-    assert near.stopped == ["arm-1", "both"]
+        for verdict in (stop_all(networks), estop_all(networks, "test")):
+            assert not verdict.ok
+            assert verdict.missing == ("the robots on mesh",)
+            assert "It did not leave on mesh: no route." in str(verdict)
+            assert verdict["arm-1"].stopped
+            assert networks.missing == {MESH: "no route"}
+
+
+def test_mesh_that_no_one_asked_for_fails_no_stop(near: ScriptedNetwork) -> None:
+    far = ScriptedNetwork(MESH, {})
+    far.unreachable = "no hub"
+    with Networks([near, far], unasked={MESH}) as networks:
+        assert stop_all(networks).ok
+        assert near.stopped == ["arm-1", "both"]
+        assert (networks.absent, networks.missing) == ({MESH: "no hub"}, {})
 
 
 def test_none_in_reach_is_refused_with_each_reason(near: ScriptedNetwork) -> None:
@@ -326,6 +337,19 @@ class TestStays:
             assert networks.absent == {}
             assert sorted(networks.find()) == ["arm-1", "arm-2", "both"]
         assert told == [near, far]
+
+    def test_only_networks_that_someone_asked_for_are_missing(self, near: ScriptedNetwork, far: SlowNetwork) -> None:
+        near.unreachable = "the broker is down"
+        networks = Networks([near, far], stays=True, unasked=[MESH])
+        networks.begin()
+        try:
+            assert networks.joined == (), "nothing is waited for"
+            far.unreachable = "no mesh answers"
+            far.may_open.set()
+            eventually(lambda: len(networks.absent) == 2, what="both reasons")
+            assert networks.missing == {DEVICE_CONNECT: "the broker is down"}
+        finally:
+            networks.close()
 
     def test_none_in_reach_is_no_error(self, near: ScriptedNetwork) -> None:
         near.unreachable = "no broker"
@@ -574,7 +598,7 @@ class TestBusy:
         self, tries: list[int], near: ScriptedNetwork, far: SlowNetwork, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr(module, "BUSY_S", 0.0)
-        with Networks([near, far]) as networks:
+        with Networks([near, far], unasked={MESH}) as networks:
             assert stop_all(networks).ok
             assert (len(tries), networks.absent) == (2, {MESH: "it hangs"})
             # The next stop tries it once more.
@@ -634,7 +658,7 @@ class TestStopLink:
             return replace(outcome, report=report, problems=("the broker is gone",))
 
         monkeypatch.setattr(far, "emergency_stop", unsent)
-        networks = Networks([near, far])
+        networks = Networks([near, far], unasked={MESH})
         verdict = estop_all(networks, "test")
         assert verdict.ok
         assert [each.network for each in verdict.unreached] == [MESH]

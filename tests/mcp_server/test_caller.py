@@ -99,7 +99,7 @@ LOST: list[RefusalError] = [
 @pytest.mark.parametrize("lost", LOST)
 async def test_motion_that_is_out_of_sight_is_halted(lost: Exception) -> None:
     fleet = FakeNetwork(moveTo=RUNNING, wait=lost)
-    answer = await client_of(fleet).move("arm-1", "moveTo", {"x": 0.1}, wait=True)
+    answer = await client_of(fleet).move("arm-1", "moveTo", {"x": 0.1, "wait": True})
     assert is_error(answer) and "told to stop." in text_of(answer)
     assert fleet.stop_count == 1
 
@@ -117,7 +117,7 @@ async def test_policy_that_is_out_of_sight_is_halted(name: str, lost: Exception)
 async def test_stop_of_a_lost_motion_is_repeated_until_it_is_confirmed() -> None:
     fleet = FakeNetwork(moveTo=RUNNING, wait=UnreachableError("the connection is lost"))
     fleet.stop_answers = [error("no link", stopped=None), success("Stopped.", stopped=True)]
-    answer = await client_of(fleet).move("arm-1", "moveTo", {"x": 0.1}, wait=True)
+    answer = await client_of(fleet).move("arm-1", "moveTo", {"x": 0.1, "wait": True})
     assert fleet.stop_count == 2
     assert "not confirmed" not in text_of(answer)
 
@@ -125,14 +125,14 @@ async def test_stop_of_a_lost_motion_is_repeated_until_it_is_confirmed() -> None
 async def test_stop_that_is_not_confirmed_is_told() -> None:
     fleet = FakeNetwork(moveTo=RUNNING, wait=UnreachableError("the connection is lost"))
     fleet.stop_answers = [error("no link", stopped=None)]
-    answer = await client_of(fleet).move("arm-1", "moveTo", {"x": 0.1}, wait=True)
+    answer = await client_of(fleet).move("arm-1", "moveTo", {"x": 0.1, "wait": True})
     assert fleet.stop_count == module.STOPS_MAX
     assert "not confirmed: no link" in text_of(answer)
 
 
 async def test_motion_that_ended_by_itself_is_not_stopped() -> None:
     fleet = FakeNetwork(moveTo=RUNNING, wait=success("there", task_status="completed"))
-    assert not is_error(await client_of(fleet).move("arm-1", "moveTo", {"x": 0.1}, wait=True))
+    assert not is_error(await client_of(fleet).move("arm-1", "moveTo", {"x": 0.1, "wait": True}))
     await asyncio.sleep(0)
     assert fleet.stop_count == 0
 
@@ -140,7 +140,7 @@ async def test_motion_that_ended_by_itself_is_not_stopped() -> None:
 @pytest.mark.parametrize("refusal", [LockoutError("locked"), UnknownVerbError("no such verb"), LOST[0], LOST[1]])
 async def test_motion_that_was_refused_is_not_stopped(refusal: RefusalError) -> None:
     fleet = FakeNetwork(moveTo=refusal)
-    answer = await client_of(fleet).move("arm-1", "moveTo", {"x": 0.1}, wait=True)
+    answer = await client_of(fleet).move("arm-1", "moveTo", {"x": 0.1, "wait": True})
     assert is_error(answer)
     assert refusal.why in text_of(answer)
     assert fleet.stop_count == 0
@@ -148,7 +148,7 @@ async def test_motion_that_was_refused_is_not_stopped(refusal: RefusalError) -> 
 
 async def test_motion_that_may_have_begun_is_stopped() -> None:
     fleet = FakeNetwork(moveTo=NoAnswerError("arm-1 did not answer"))
-    assert "told to stop" in text_of(await client_of(fleet).move("arm-1", "moveTo", {"x": 0.1}, wait=True))
+    assert "told to stop" in text_of(await client_of(fleet).move("arm-1", "moveTo", {"x": 0.1, "wait": True}))
     assert fleet.stop_count == 1
 
 
@@ -156,7 +156,7 @@ async def test_motion_of_an_id_on_two_networks_goes_to_neither_and_its_stop_to_b
     near, far = (FakeNetwork(name, getStatus=success("idle")) for name in (DEVICE_CONNECT, MESH))
     client = client_of(near, far)
     for answer in (
-        await client.move("arm-1", "moveTo", {"x": 0.1}, wait=True),
+        await client.move("arm-1", "moveTo", {"x": 0.1, "wait": True}),
         await client.run_policy("arm-1", {}, wait=True),
         await client.acquire("arm-1", 60.0, ""),
     ):
@@ -189,7 +189,7 @@ async def test_motion_carries_a_lease_only_to_a_robot_that_publishes_it(
     fleet.given |= {"wait": success("there", task_status="completed"), fleet.starts: RUNNING}
     fleet.described = published
     client = client_of(fleet)
-    assert not is_error(await client.move("arm-1", "moveTo", {"x": 0.1}, wait=True))
+    assert not is_error(await client.move("arm-1", "moveTo", {"x": 0.1, "wait": True}))
     assert not is_error(await client.run_policy("arm-1", {"instruction": "wave"}, wait=True))
     for verb in ("moveTo", fleet.starts):
         assert [each in fleet.sent(verb) for each in ("lease_id", "lease_ttl_s")] == [bound, bound]
@@ -202,7 +202,7 @@ async def test_robot_is_asked_once_whether_it_takes_the_lease_of_a_motion() -> N
     fleet.described = description("lease_ttl_s")
     client = client_of(fleet)
     for _ in range(3):
-        await client.move("arm-1", "moveTo", {"x": 0.1}, wait=True)
+        await client.move("arm-1", "moveTo", {"x": 0.1, "wait": True})
     assert fleet.descriptions == 1
 
 
@@ -215,7 +215,7 @@ async def test_held_lease_goes_to_any_robot_that_gave_it() -> None:
     client = client_of(fleet)
     assert not is_error(await client.acquire("arm-1", 60.0, ""))
     assert "lease_id" not in fleet.sent("acquireControl")
-    await client.move("arm-1", "moveTo", {"x": 0.1}, wait=True)
+    await client.move("arm-1", "moveTo", {"x": 0.1, "wait": True})
     assert fleet.sent("moveTo")["lease_id"] == "a" * 32
     assert "lease_ttl_s" not in fleet.sent("moveTo")
     client._forget(("arm-1", ""))
@@ -237,7 +237,7 @@ async def test_client_that_moves_a_robot_acquires_it_by_the_secret_of_its_motion
     fleet.call_async = waits  # type: ignore[method-assign]
     fleet.described = description("lease_id", "lease_ttl_s")
     client = client_of(fleet)
-    motion = asyncio.ensure_future(client.move("arm-1", "moveTo", {"x": 0.1}, wait=True))
+    motion = asyncio.ensure_future(client.move("arm-1", "moveTo", {"x": 0.1, "wait": True}))
     await asyncio.wait_for(asked.wait(), 20.0)
     await client.acquire("arm-1", 60.0, "")
     assert fleet.sent("acquireControl")["lease_id"] == fleet.sent("moveTo")["lease_id"]

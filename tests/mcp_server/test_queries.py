@@ -66,7 +66,7 @@ async def test_robot_that_hangs_keeps_no_other_one_from_being_read(monkeypatch: 
     other = asyncio.ensure_future(client.query("arm-2", "getPose"))
     await until_waiting(robots, AT_ONCE + 1)
     # What a motion and a lease ask goes the direct way.
-    direct = asyncio.ensure_future(client.read("arm-1", "getStatus"))
+    direct = asyncio.ensure_future(client.call("arm-1", "getStatus"))
     await until_waiting(robots, AT_ONCE + 2)
     robots.may_answer.set()
     assert not any(is_error(each) for each in await asyncio.gather(*hung, other, direct))

@@ -435,6 +435,11 @@ class TestOfBothNetworks:
         assert (answer["stopped"], answer["not_stopped"]) == (False, ["both on mesh"])
         assert (near.stopped, far.stopped) == (["both"], ["both"])
 
+    @pytest.mark.parametrize("verb", ["stop", "stopMotion"])
+    def test_call_of_a_stop_goes_to_all_bearers(self, near: ScriptedNetwork, far: ScriptedNetwork, verb: str) -> None:
+        assert robot_mesh(action="call", target="both", verb=verb)["stopped"] is True
+        assert (near.stopped, far.stopped) == (["both"], ["both"])
+
     def test_stop_of_all_is_one_answer_that_names_robots_of_both(
         self, near: ScriptedNetwork, far: ScriptedNetwork
     ) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -43,41 +42,29 @@ def mcp(
     name = device_id("--as", source)
     try:
         from strands_robots.mcp.server import serve_stdio  # noqa: PLC0415 - loaded when it is used
-        from strands_robots.mcp.standing import StandingController  # noqa: PLC0415 - as above
     except ModuleNotFoundError as missing:
         raise CliError(f"The MCP server needs the extra mcp ({install_line('mcp')}): {missing}.") from missing
 
     def networks_of(caller: str) -> Networks:
         return network.networks(source=caller, stays=True)
 
-    with networks_of(name) as networks, closing(StandingController(name, networks)) as standing:
-        if http is None:
-            standing.open()
-            asyncio.run(serve_stdio(networks, read_only=read_only, standing=lambda: standing.problem))
-            return
-        from strands_robots.mcp.http import Address, serve_http  # noqa: PLC0415 - as above
-        from strands_robots.mcp.tokens import Token  # noqa: PLC0415 - as above
+    if http is None:
+        with networks_of(name) as networks:
+            asyncio.run(serve_stdio(networks, name, read_only=read_only))
+        return
+    from strands_robots.mcp.http import Address, serve_http  # noqa: PLC0415 - as above
+    from strands_robots.mcp.tokens import Token  # noqa: PLC0415 - as above
 
-        host, _, number = http.rpartition(":")
-        try:
-            at = port("--http", int(number))
-        except ValueError:
-            raise CliError(f"--http takes a port or HOST:PORT, not {http!r}.", Exit.USAGE) from None
-        address = Address(host.strip("[]") or "127.0.0.1", at, http_cert, http_key, tuple(http_name or ()))
-
-        def ready(url: str) -> None:
-            screen.say(url)
-            standing.open()
-
-        serving = serve_http(
-            networks,
-            networks_of,
-            address,
-            default=Token(name, read_only=read_only),
-            ready=ready,
-            standing=lambda: standing.problem,
-        )
-        try:
-            asyncio.run(serving)
-        except (StrandsRobotsError, OSError) as problem:
-            raise CliError(str(problem), Exit.USAGE) from problem
+    host, _, number = http.rpartition(":")
+    try:
+        at = port("--http", int(number))
+    except ValueError:
+        raise CliError(f"--http takes a port or HOST:PORT, not {http!r}.", Exit.USAGE) from None
+    address = Address(host.strip("[]") or "127.0.0.1", at, http_cert, http_key, tuple(http_name or ()))
+    default = Token(name, read_only=read_only)
+    try:
+        asyncio.run(serve_http(networks_of, address, default=default, ready=screen.say))
+    except CliError:
+        raise
+    except (StrandsRobotsError, OSError) as problem:
+        raise CliError(str(problem), Exit.USAGE) from problem

@@ -54,7 +54,10 @@ def peers(
     timeout: Timeout = FIND_S,
     on_mesh: OnMesh = False,
 ) -> None:
-    """List the robots in reach, or what one of them can do. With --mesh also peers without a robot."""
+    """List the robots in reach, or what one of them can do.
+
+    With --mesh these are all peers of the mesh, also those without a robot.
+    """
     seconds = number("--timeout", timeout, above=0, high=60)
     wanted = None if device is None else identifier("DEVICE", device)
     with network.joined(on_mesh=on_mesh) as there:
@@ -161,9 +164,9 @@ def call(
                     return
                 send: Send = partial(there.call, moves=function not in STILL)
                 verb: AdvertisedVerb | None = None
-                if function in STOPS and len(there.stated) > 1:
-                    send = partial(_stop, there)
-                elif _needs_description(function, given, params):
+                # A stop of several networks waits for no description.
+                several = function in STOPS and len(there.stated) > 1
+                if not several and _needs_description(function, given, params):
                     place, verb = there.described(device, function)
                     send = place.call
                 params = _typed(verb, given, params)
@@ -195,18 +198,6 @@ def _interruptible(stop: str, moving: Callable[[], bool]) -> Iterator[None]:
         if not moving():
             raise
         raise CliError(f"The robot may still move. Stop it: {stop}", Exit.INTERRUPTED, stop=stop) from None
-
-
-def _stop(there: Networks, device: str, _function: str, params: Mapping[str, Any], seconds: float) -> Envelope:
-    """Stop every robot of an id, on each network as soon as that is joined."""
-    from strands_robots.fleet.stop_answers import combined_verdict  # noqa: PLC0415 - loaded when robots are stopped
-    from strands_robots.serving.stop_arguments import noted, robot_of_world  # noqa: PLC0415 - as above
-
-    name, unread = robot_of_world(params)
-    answers = there.stop(device, seconds, name)
-    first, *others = answers.values()
-    several = {f"{device} on {network}": said for network, said in answers.items()}
-    return noted(combined_verdict(several) if others else first, unread)
 
 
 def _moves(function: str, verb: AdvertisedVerb | None) -> bool:

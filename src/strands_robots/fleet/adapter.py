@@ -126,6 +126,7 @@ class NetworkAdapter(Protocol):
     Attributes:
         name: :data:`DEVICE_CONNECT` or :data:`MESH`.
         has_stop_link: emergency stops leave on a connection of their own, so that they need no :meth:`open`.
+        tells_absence: a stop of a robot that is not there is answered at once, so that silence is that of a robot.
         announces_verbs: robots announce their verbs, so that :meth:`describe` asks no one.
         reads: the names on this network of the reads ``status``, ``state`` and ``features``.
         starts: the name on this network of the verb that starts a task.
@@ -133,6 +134,7 @@ class NetworkAdapter(Protocol):
 
     name: str
     has_stop_link: bool
+    tells_absence: bool
     announces_verbs: bool
     reads: Mapping[str, str]
     starts: str
@@ -217,14 +219,14 @@ class NetworkAdapter(Protocol):
     ) -> Envelope | None:
         """Stop a robot and return its answer, None where it is not on this network.
 
-        No answer in time is an envelope with ``stopped`` None.
+        It is sent whether or not the robot is known. No answer in time is an envelope with ``stopped`` None, whose
+        ``in_reach`` is False where no robot took the stop.
 
         Args:
             robot: its id.
             timeout: seconds in which it has to answer.
             robot_name: stops one robot of a world alone.
-            insist: the robot is on no other network. The stop is sent though it was not found, its answer is waited for
-                all the time, and None is never returned.
+            insist: the robot is on no other network. Its answer is waited for all the time, and None is never returned.
         """
 
     def received(self, robot: str, verb: str, arguments: Mapping[str, Any]) -> ReceivedCall:
@@ -249,7 +251,8 @@ class NetworkAdapter(Protocol):
 
         It waits for no other call.
 
-        It is sent whether or not the robot is known. ``stopped`` is None without an answer.
+        It is sent whether or not the robot is known. Without an answer ``stopped`` is None, and ``in_reach`` False
+        where no robot took it.
         """
 
     @property

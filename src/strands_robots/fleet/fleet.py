@@ -156,7 +156,7 @@ class Fleet:
         for name, (each, network) in found.items():
             known = self._robots.get(name)
             if known is None:
-                self._robots[name] = RemoteRobot(each, network, lambda: self._networks.joined)
+                self._robots[name] = RemoteRobot(each, network, self._networks)
             else:
                 known.rediscovered(each, network)
         return [self._robots[name] for name in sorted(found)]

@@ -81,10 +81,6 @@ class Wish:
     sent: Mapping[str, Any]
     run: Callable[[], Awaitable[Envelope]]
 
-    async def received(self, access: ClientAccess) -> ReceivedCall:
-        """Return the motion as its robot receives it; raises as :meth:`Networks.of`."""
-        return await access.caller.received(self.robot, self.verb, self.sent)
-
 
 class Approve(BaseModel):
     """The form that a user fills in."""
@@ -108,7 +104,7 @@ class Approvals:
         if answered is not None:
             return result(await self._granted(access, wish) if answered else _declined(robot, verb))
         answer = await wish.run()
-        if not is_error(answer) or not _unapproved(answer, robot, await wish.received(access)):
+        if not (is_error(answer) and _unapproved(answer, robot, await access.caller.received(robot, verb, wish.sent))):
             return result(answer)
         question, encoded = await _question(access, robot, verb, params)
         image = [ImageContent(type="image", data=encoded, mime_type="image/jpeg")] if encoded else []
@@ -145,7 +141,7 @@ class Approvals:
         return (reply.content or {}).get("approve") is True
 
     async def _granted(self, access: ClientAccess, wish: Wish) -> Envelope:
-        robot, received = wish.robot, await wish.received(access)
+        robot, received = wish.robot, await access.caller.received(wish.robot, wish.verb, wish.sent)
         try:
             bound = {"caller": received.caller, "arguments_digest": digest(received.arguments)}
             grant = self._grants().grant(received.verb, robot, GRANT_S, **bound)
@@ -191,8 +187,8 @@ def _declined(robot: str, verb: str) -> Envelope:
 async def _question(access: ClientAccess, robot: str, verb: str, params: Mapping[str, Any]) -> tuple[str, str]:
     """Return the question and a picture as base64, empty where the robot gives none."""
     named = {name: params[name] for name in ("robot_name",) if name in params}
-    pose = await access.caller.read(robot, "getPose", named)
-    seen = await access.caller.read(robot, "getPicture", {"width": 640, "height": 480})
+    pose = await access.caller.call(robot, "getPose", named)
+    seen = await access.caller.call(robot, "getPicture", {"width": 640, "height": 480})
     # Of a verb of the robot's own nothing is known, so that all of it is shown.
     told = {"speed", "wait"} if verb in KNOWN else set[str]()
     asked = json.dumps({name: value for name, value in params.items() if name not in told}, default=str)

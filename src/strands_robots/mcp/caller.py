@@ -23,7 +23,7 @@ from strands_robots.fleet.fleet_verdict import FleetVerdict
 from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.refusals import LEASE_CODES, said
 from strands_robots.fleet.robot_task import runs
-from strands_robots.fleet.stop_answers import combined_verdict
+from strands_robots.fleet.stop_answers import answer_of_bearers
 from strands_robots.mcp.queries import NoTurnError, Queries
 from strands_robots.mcp.results import refused
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
@@ -55,6 +55,8 @@ URGENT_MAX = 8
 
 RUN_POLICY = "execute"
 """Verb that runs a policy and answers at its start; some networks call it otherwise."""
+
+NEEDS_LEASE = "wait=false needs acquire_control first: without a lease nothing would halt the robot of a lost client."
 
 OUT_OF_SIGHT = (NoAnswerError, NoSuchRobotError, UnreachableError)
 """Refusals after which nobody knows what the robot does."""
@@ -101,19 +103,32 @@ class Caller:
         """Note a call of the client; it is there, so its leases are renewed."""
         self._used_at = time.monotonic()
 
-    async def read(
-        self, robot: str, verb: str, params: Mapping[str, Any] | None = None, lasts_s: float = 0.0
+    async def call(
+        self,
+        robot: str,
+        verb: str,
+        params: Mapping[str, Any] | None = None,
+        seconds: float = ANSWER_S,
+        *,
+        moves: bool = False,
+        lost: tuple[type[RefusalError], ...] = (),
     ) -> Envelope:
-        """Call a verb that moves nothing, and may last so long."""
-        return await self._call(robot, verb, params or {}, ANSWER_S + lasts_s)
+        """Call a verb; a refusal is an answer, one of ``lost`` is raised."""
+        try:
+            network = await self.networks.of_async(robot, verb, moves=moves)
+            return await network.call_async(robot, _named_on(network, verb), params or {}, seconds)
+        except lost:
+            raise
+        except RefusalError as refusal:
+            return refused(refusal)
 
     async def query(
         self, robot: str, verb: str, params: Mapping[str, Any] | None = None, lasts_s: float = 0.0
     ) -> Envelope:
-        """Do as :meth:`read`, in the client's turn: no burst of reads fills the robot."""
+        """Call a read that may last so long, in the client's turn: no burst of reads fills the robot."""
         try:
             async with self._queries.turn(robot, ANSWER_S):
-                return await self.read(robot, verb, params, lasts_s)
+                return await self.call(robot, verb, params, ANSWER_S + lasts_s)
         except NoTurnError as refused:
             return error(str(refused))
 
@@ -130,21 +145,20 @@ class Caller:
         network = await self.networks.of_async(robot, verb, moves=True)
         return network.received(robot, _named_on(network, verb), params)
 
-    async def move(self, robot: str, verb: str, params: Mapping[str, Any], *, wait: bool) -> Envelope:
-        """Carry out a motion of an arm; a call that is given up halts it.
+    async def move(self, robot: str, verb: str, params: Mapping[str, Any]) -> Envelope:
+        """Carry out a motion of an arm, to its end with ``wait``; a call that is given up halts it.
 
         Without ``wait`` the lease has to be held, whose end halts the robot of a client that went away.
         """
+        named = {name: value for name, value in params.items() if name == "robot_name"}
 
         async def ended(answer: Envelope) -> Envelope:
             while str(answer.get("task_status", "")).lower() in RUNNING:
-                task = {"task_id": answer.get("task_id", ""), **_named(params)}
-                answer = await self._followed(robot, "wait", task, ANSWER_S + WAIT_S)
+                task = {"task_id": answer.get("task_id", ""), **named}
+                answer = await self.call(robot, "wait", task, ANSWER_S + WAIT_S, lost=OUT_OF_SIGHT)
             return answer
 
-        return await self._carried_out(
-            robot, verb, move_arguments(params, wait=wait), ANSWER_S + WAIT_S, ended if wait else None
-        )
+        return await self._carried_out(robot, verb, params, ANSWER_S + WAIT_S, ended if params["wait"] else None)
 
     async def run_policy(self, robot: str, params: Mapping[str, Any], *, wait: bool) -> Envelope:
         """Run a policy, to its end with ``wait``; halted and refused as :meth:`move`."""
@@ -153,7 +167,7 @@ class Caller:
             one = str(answer.get("robot_name") or params.get("robot_name") or "")
             while not is_error(answer):
                 await asyncio.sleep(POLL_S)
-                answer = await self._followed(robot, "getStatus", {}, ANSWER_S)
+                answer = await self.call(robot, "getStatus", lost=OUT_OF_SIGHT)
                 if not runs(answer, one):
                     break
             return answer
@@ -168,7 +182,7 @@ class Caller:
             # Where its answer says that it goes on, as that of a drive does, the end is waited for.
             while verb.leases and not is_error(status) and runs(status):
                 await asyncio.sleep(POLL_S)
-                status = await self._followed(robot, "getStatus", {}, ANSWER_S)
+                status = await self.call(robot, "getStatus", lost=OUT_OF_SIGHT)
             return status if is_error(status) else answer
 
         return await self._carried_out(robot, verb.name, params, ANSWER_S + verb.lasts_s, ended, takes=verb.leases)
@@ -189,7 +203,7 @@ class Caller:
         # While a motion of its own runs, the secret of that motion says that the robot is this client's.
         moves = any(each == robot for each, _ in self._moving.values())
         own = self._lease(target) or ({LEASE_ID: self._secret(robot)} if moves else {})
-        answer = await self._call(robot, "acquireControl", {**params, **own}, ANSWER_S, moves=True)
+        answer = await self.call(robot, "acquireControl", {**params, **own}, moves=True)
         lease_id = answer.get(LEASE_ID)
         # The secret stays here: a model has no use for it.
         told = {name: value for name, value in answer.items() if name != LEASE_ID}
@@ -208,7 +222,7 @@ class Caller:
         target = await self._target(robot, {"robot_name": robot_name})
         if target not in self._leases:
             return error(f"This client holds no lease of {robot}.")
-        answer = await self.read(robot, "releaseControl", {**self._lease(target), **_world(target)})
+        answer = await self.call(robot, "releaseControl", {**self._lease(target), **_world(target)})
         self._forget(target)
         return answer
 
@@ -217,11 +231,7 @@ class Caller:
         if not robot:
             return await self._urgently(lambda: stop_all(self.networks))
         answers = await self.networks.stop_async(robot, robot_name=robot_name)
-        if len(answers) == 1:
-            return next(iter(answers.values()))
-        return combined_verdict(
-            {f"{robot} on {each}": answer for each, answer in answers.items()}, self.networks.absences
-        )
+        return answer_of_bearers(robot, answers, self.networks.absences)
 
     async def emergency_stop(self, reason: str, scope: Scope = EVERY_ROBOT) -> Envelope:
         """Stop and lock every robot, or those of ``scope``."""
@@ -261,9 +271,9 @@ class Caller:
         """
         target = await self._target(robot, params)
         if ended is None and not self._holds(target):
-            return _needs_lease()
+            return error(NEEDS_LEASE)
         lease = await self._for_motion(target, verb) if takes is None else self._lease_of(target, takes)
-        call = self._call(robot, verb, {**params, **lease}, seconds, moves=True, lost=(NoAnswerError,))
+        call = self.call(robot, verb, {**params, **lease}, seconds, moves=True, lost=(NoAnswerError,))
         begun = asyncio.ensure_future(call)
         renewing = asyncio.ensure_future(self._renew_motion(target)) if LEASE_TTL_S in lease else None
         self._moving[begun] = target
@@ -317,7 +327,7 @@ class Caller:
     async def _renewed(self, target: Target, lease_id: str) -> str:
         """Renew a lease at the robot; return the code of its refusal, or nothing."""
         params = {LEASE_ID: lease_id, **_world(target)}
-        return str((await self._call(target[0], "renewControl", params, RENEWED_S)).get("code", ""))
+        return str((await self.call(target[0], "renewControl", params, RENEWED_S)).get("code", ""))
 
     async def _target(self, robot: str, params: Mapping[str, Any], *, leased: bool = False) -> Target:
         """Return the robot that is meant, of a world the first where none is named."""
@@ -326,34 +336,11 @@ class Caller:
         if name or not (leased or any(each == robot for each, _ in self._leases)):
             return robot, name
         if robot not in self._first:
-            status = await self.read(robot, "getStatus")
+            status = await self.call(robot, "getStatus")
             names = status.get("robots")
             if not is_error(status):
                 self._first[robot] = str(next(iter(names), "")) if isinstance(names, Mapping | list) else ""
         return robot, self._first.get(robot, "")
-
-    async def _call(
-        self,
-        robot: str,
-        verb: str,
-        params: Mapping[str, Any],
-        seconds: float,
-        *,
-        moves: bool = False,
-        lost: tuple[type[RefusalError], ...] = (),
-    ) -> Envelope:
-        """Call a verb; a refusal is an answer, one of ``lost`` is raised."""
-        try:
-            network = await self.networks.of_async(robot, verb, moves=moves)
-            return await network.call_async(robot, _named_on(network, verb), params, seconds)
-        except lost:
-            raise
-        except RefusalError as refusal:
-            return refused(refusal)
-
-    async def _followed(self, robot: str, verb: str, params: Mapping[str, Any], seconds: float) -> Envelope:
-        """Ask about a motion that was begun; no answer ends its block, which halts it."""
-        return await self._call(robot, verb, params, seconds, lost=OUT_OF_SIGHT)
 
     def _holds(self, target: Target) -> bool:
         held = self._leases.get(target)
@@ -394,25 +381,10 @@ def _named_on(network: NetworkAdapter, verb: str) -> str:
     return network.starts if verb == RUN_POLICY else verb
 
 
-def move_arguments(params: Mapping[str, Any], *, wait: bool) -> dict[str, Any]:
-    """Return the arguments of an arm's motion, as a robot gets them."""
-    return {**params, "wait": wait}
-
-
 def acquire_arguments(ttl_s: float, robot_name: str) -> dict[str, Any]:
     """Return the arguments of ``acquireControl``, as a robot gets them."""
     return {"kind": "agent", "ttl_s": min(ttl_s, SILENCE_S), **({"robot_name": robot_name} if robot_name else {})}
 
 
-def _named(params: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in params.items() if name == "robot_name"}
-
-
 def _world(target: Target) -> dict[str, str]:
     return {"robot_name": target[1]} if target[1] else {}
-
-
-def _needs_lease() -> Envelope:
-    return error(
-        "wait=false needs acquire_control first: without a lease nothing would halt the robot of a lost client."
-    )

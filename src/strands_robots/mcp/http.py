@@ -33,6 +33,7 @@ from strands_robots.mcp.connections import CONNECTION, IDLE_S, BoundedServer, Ca
 from strands_robots.mcp.resources import RobotResources
 from strands_robots.mcp.server import GONE, MESSAGE_MAX, STOPS, build
 from strands_robots.mcp.sessions import Sessions
+from strands_robots.mcp.standing import StandingController
 from strands_robots.mcp.tokens import Token, TokenFile
 from strands_robots.utils import is_loopback_host
 
@@ -132,23 +133,15 @@ class HttpServer:
     """ASGI application that checks tokens, over a server for each permission.
 
     Args:
-        networks: of the server itself, opened.
         networks_of: returns the networks of a caller's name, not opened yet.
-        default: the client without a token, while there is no token; None requires one.
-        standing: returns why this process does not answer the stops of others, or "".
+        default: the client without a token, while there is no token and no other machine reaches the server. Its name
+            is the server's.
     """
 
-    def __init__(  # noqa: PLR0917 - its parts
-        self,
-        networks: Networks,
-        networks_of: Callable[[str], Networks],
-        tokens: TokenFile,
-        address: Address,
-        default: Token | None,
-        standing: Callable[[], str] = str,
+    def __init__(
+        self, networks_of: Callable[[str], Networks], tokens: TokenFile, address: Address, default: Token
     ) -> None:
-        self._networks, self._networks_of, self._standing = networks, networks_of, standing
-        self._tokens, self._address, self._default = tokens, address, default
+        self._networks_of, self._tokens, self._address, self._default = networks_of, tokens, address, default
         self._clients: dict[Token, asyncio.Task[_Client]] = {}
         self._pictures: dict[str, bytes] = {}
         # Of its own: the other threads may all be reading lists of robots when a new client wants to stop one.
@@ -164,15 +157,19 @@ class HttpServer:
         """Serve for the length of the block; clients leave at its end."""
         async with AsyncExitStack() as stack:
             self._running = stack
-            resources, approvals = RobotResources(self._networks), Approvals()
+            networks = await self._connected(self._default.name)
+            resources, approvals = RobotResources(networks), Approvals()
+            standing = StandingController(self._default.name, networks)
             for read_only in (False, True):
-                server = build(_access_of, resources, approvals, read_only=read_only, standing=self._standing)
+                server = build(_access_of, resources, approvals, standing, read_only=read_only)
                 server.streamable_http_app(
                     streamable_http_path=PATH, transport_security=self._address.security(), host=self._address.host
                 )
                 self._sessions[read_only] = Sessions(server.session_manager)
                 await stack.enter_async_context(server.session_manager.run())
             await stack.enter_async_context(resources.published())
+            stack.push_async_callback(asyncio.to_thread, standing.close)
+            standing.open()
             looking = asyncio.ensure_future(self._close_idle())
             try:
                 yield
@@ -273,7 +270,7 @@ class HttpServer:
         scheme, _, text = header.partition(" ")
         if scheme.lower() == "bearer" and text:
             return self._tokens.find(text.strip())
-        return None if header or self._tokens.names() else self._default
+        return self._default if self._address.loopback and not (header or self._tokens.names()) else None
 
     async def _client(self, token: Token) -> _Client:
         client = self._clients.get(token)
@@ -334,25 +331,17 @@ def require_secure(address: Address, tokens: TokenFile) -> None:
 
 
 async def serve_http(
-    networks: Networks,
-    networks_of: Callable[[str], Networks],
-    address: Address,
-    *,
-    default: Token,
-    ready: Callable[[str], object],
-    standing: Callable[[], str] = str,
+    networks_of: Callable[[str], Networks], address: Address, *, default: Token, ready: Callable[[str], object]
 ) -> None:
     """Serve clients over HTTP until the process is told to end.
 
     Args:
-        networks, networks_of: as of :class:`HttpServer`.
-        default: the client without a token, while this machine has no token and no other reaches the server.
+        networks_of, default: as of :class:`HttpServer`.
         ready: called with the URL once it listens.
-        standing: as of :class:`HttpServer`.
     """
     tokens = TokenFile()
     require_secure(address, tokens)
-    app = HttpServer(networks, networks_of, tokens, address, default if address.loopback else None, standing)
+    app = HttpServer(networks_of, tokens, address, default)
     config = uvicorn.Config(
         app,
         lifespan="off",

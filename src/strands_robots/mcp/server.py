@@ -8,7 +8,7 @@ import logging
 import os
 import signal
 import sys
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable
 from typing import Any, BinaryIO, TypeVar, cast
 
 import anyio
@@ -28,6 +28,7 @@ from strands_robots.mcp.approval import Approvals
 from strands_robots.mcp.caller import Caller
 from strands_robots.mcp.resources import RobotResources
 from strands_robots.mcp.results import refused, refused_arguments, result, unknown_arguments, with_note
+from strands_robots.mcp.standing import StandingController
 from strands_robots.mcp.tools import add_calls, add_control, add_motions, add_reads, add_stops
 from strands_robots.safety.sightings import flush_sightings
 from strands_robots.serving import robot_verbs  # noqa: F401 - so that the first stop of a client loads nothing
@@ -107,14 +108,11 @@ def build(
     access: AccessOf,
     resources: RobotResources,
     approvals: Approvals,
+    standing: StandingController,
     *,
     read_only: bool = False,
-    standing: Callable[[], str] = str,
 ) -> MCPServer[Any]:
-    """Return a server; ``read_only`` leaves out what moves robots or holds them.
-
-    ``standing`` returns why the server does not answer the stops of others, or "".
-    """
+    """Return a server; ``read_only`` leaves out what moves robots or holds them."""
     server = RobotServer(
         "strands-robots",
         instructions=INSTRUCTIONS,
@@ -155,12 +153,12 @@ class _Lines:
         return await anyio.to_thread.run_sync(self._stream.readline, MESSAGE_MAX)
 
 
-async def serve_stdio(networks: Networks, *, read_only: bool = False, standing: Callable[[], str] = str) -> None:
-    """Serve one client on stdio; at its end halt what it moves and holds."""
-    pictures, caller = PictureFiles(), Caller(networks)
+async def serve_stdio(networks: Networks, source: str, *, read_only: bool = False) -> None:
+    """Serve one client of this name on stdio; at its end halt what it moves and holds."""
+    pictures, caller, standing = PictureFiles(), Caller(networks), StandingController(source, networks)
     access = ClientAccess(caller, approves=True, show_picture=pictures.show)
     resources = RobotResources(networks)
-    server = build(lambda _context: access, resources, Approvals(), read_only=read_only, standing=standing)
+    server = build(lambda _: access, resources, Approvals(), standing, read_only=read_only)
     ending: list[asyncio.Task[None]] = []
 
     async def end() -> None:
@@ -175,6 +173,7 @@ async def serve_stdio(networks: Networks, *, read_only: bool = False, standing: 
     asyncio.get_running_loop().add_signal_handler(
         signal.SIGTERM, lambda: ending.append(asyncio.ensure_future(end())) if not ending else None
     )
+    standing.open()
     try:
         async with resources.published():
             below = lowlevel(server)
@@ -186,3 +185,4 @@ async def serve_stdio(networks: Networks, *, read_only: bool = False, standing: 
         await caller.leave()
         caller.close()
         pictures.close()
+        standing.close()

@@ -10,7 +10,7 @@ import asyncio
 import contextlib
 import json
 import time
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Mapping
 from functools import partial
 from typing import Annotated, Any, Literal, TypeAlias
 
@@ -22,8 +22,9 @@ from strands_robots.envelope import Envelope, error, is_error, success
 from strands_robots.fleet.all_lockouts import ask_lockouts, by_robot
 from strands_robots.mcp.access import AccessOf
 from strands_robots.mcp.approval import Approvals, Wish
-from strands_robots.mcp.caller import acquire_arguments, move_arguments
+from strands_robots.mcp.caller import acquire_arguments
 from strands_robots.mcp.results import Result, facts, picture, quoted, result, row
+from strands_robots.mcp.standing import StandingController
 from strands_robots.mcp.verbs import INSTEAD, described, wanted
 from strands_robots.serving.advertised import AdvertisedVerb
 from strands_robots.serving.stop_arguments import stop_scope
@@ -54,14 +55,8 @@ Speed = Annotated[Number, Field(description="Share of full speed, above 0 and at
 Answer: TypeAlias = Result | InputRequiredResult
 
 
-def add_reads(server: MCPServer[Any], access: AccessOf, standing: Callable[[], str] = str) -> None:
-    """Add the tools that read.
-
-    Args:
-        server: that gets them.
-        access: of a call's client.
-        standing: returns why this server does not report whom it misses when others stop robots, or "".
-    """
+def add_reads(server: MCPServer[Any], access: AccessOf, standing: StandingController) -> None:
+    """Add the tools that read."""
 
     @server.tool(annotations=READ)
     async def list_robots(
@@ -126,7 +121,7 @@ def add_reads(server: MCPServer[Any], access: AccessOf, standing: Callable[[], s
     ) -> Result:
         """Wait at most 9 s for the end of an arm's motion, and read its result."""
         params = {"task_id": task_id, "seconds": min(seconds, 9.0), **_given(robot_name=robot_name)}
-        return result(await access(context).caller.read(robot, "wait", params))
+        return result(await access(context).caller.call(robot, "wait", params))
 
     @server.tool(annotations=READ)
     async def lockouts(context: Context[Any, Any]) -> Result:
@@ -137,7 +132,7 @@ def add_reads(server: MCPServer[Any], access: AccessOf, standing: Callable[[], s
             for name, each in reports.items()
         }
         locked = sum(bool(each.lockouts) for each in reports.values())
-        problem = standing()
+        problem = standing.problem
         absent = f" This server does not answer the stops of others: {problem}." if problem else ""
         return result(success(f"{locked} of {len(rows)} robots are locked.{absent}", robots=rows, stands=not problem))
 
@@ -312,14 +307,14 @@ async def _carried_out(  # noqa: PLR0917 - who asks, and what of which robot
     client = access(context)
 
     async def run() -> Envelope:
-        async with _progress(context, partial(client.caller.read, robot, "getStatus")):
+        async with _progress(context, partial(client.caller.call, robot, "getStatus")):
             if own is not None:
                 return await client.caller.act(robot, own, params)
             if verb == "execute":
                 return await client.caller.run_policy(robot, params, wait=wait)
-            return await client.caller.move(robot, verb, params, wait=wait)
+            return await client.caller.move(robot, verb, sent)
 
-    sent = params if own is not None or verb == "execute" else move_arguments(params, wait=wait)
+    sent = params if own is not None or verb == "execute" else {**params, "wait": wait}
     return await approvals.carry_out(context, client, Wish(robot, verb, params, sent, run))
 
 

@@ -28,7 +28,8 @@ from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.profiles import profile_for
 from strands_robots.fleet.refusals import said
 from strands_robots.fleet.stated_networks import networks_for_stop, networks_of
-from strands_robots.fleet.stop_answers import combined_verdict
+from strands_robots.fleet.stop_answers import by_bearer, combined_verdict
+from strands_robots.serving import known_verbs
 from strands_robots.serving.advertised import RobotDescription, fitting
 from strands_robots.serving.robot_verbs import ARM_VERBS, WORLD_VERBS
 from strands_robots.serving.stop_arguments import noted, stop_reason, stop_robot, stop_scope
@@ -152,6 +153,8 @@ def _started(there: Networks, robot: str, task: Mapping[str, Any]) -> Envelope:
 
 def _called(there: Networks, robot: str, verb: str, arguments: Mapping[str, Any]) -> Envelope:
     """Call any verb of the robot, and wait as long as it lasts by its description."""
+    if verb in known_verbs.STOPS:
+        return there.call(robot, verb, arguments, STOP_S)
     network, described = there.described(robot, verb)
     return network.call(robot, verb, arguments, CALL_S + (described.lasts_s if described is not None else 0.0))
 
@@ -165,9 +168,7 @@ def _stop(target: object, arguments: object) -> dict[str, Any]:
         unread = "arguments is no object"
 
     def stopped(there: Networks) -> Envelope:
-        answers = there.stop(robot, STOP_S, of_world.get("robot_name", ""))
-        names = [robot] if len(answers) == 1 else [f"{robot} on {network}" for network in answers]
-        return combined_verdict(dict(zip(names, answers.values(), strict=True)))
+        return combined_verdict(by_bearer(robot, there.stop(robot, STOP_S, of_world.get("robot_name", ""))))
 
     answer = _answer(stopped, stops=True) if robot else _all_stopped(stop_all)
     return noted(answer, unknown, unread)

@@ -26,7 +26,8 @@ class Followed:
 
     def __init__(self, peers: Fleet) -> None:
         self.peers = peers
-        peers.join(Arm("arm-1"), "arm-1")
+        self.arm = Arm("arm-1")
+        peers.join(self.arm, "arm-1")
         self.there = MeshNetwork.joined(peers.join(None, "console"))
         self.events: list[RobotEvent] = []
         self.end = self.there.subscribe(EVERY, self.events.append)
@@ -173,6 +174,27 @@ def test_no_event_arrives_after_the_end(followed: Followed) -> None:
     followed.say("arm-1/safety/event", {"event": "later"})
     eventually(lambda: seen, what="the event at another subscription")
     assert len(followed.events) == count
+    end()
+
+
+def test_heartbeat_of_one_robot_is_told_when_its_task_is_another_one(followed: Followed) -> None:
+    followed.arrived("presence")
+    seen: list[RobotEvent] = []
+    end = followed.there.subscribe("arm-1", seen.append)
+
+    def heartbeats() -> int:
+        return sum(each.name == "presence" for each in list(followed.events))
+
+    def told(state: str) -> bool:
+        return bool(seen) and seen[-1].task is not None and seen[-1].task["state"] == state
+
+    followed.arm.moving = True
+    eventually(lambda: told("running"), what="the task")
+    before = heartbeats()
+    eventually(lambda: heartbeats() >= before + 3, what="further heartbeats")
+    followed.arm.moving = False
+    eventually(lambda: told("idle"), what="its end")
+    assert [each.name for each in seen] == ["presence", "presence"]
     end()
 
 

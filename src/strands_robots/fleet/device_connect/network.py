@@ -55,9 +55,6 @@ DESCRIBE = "requestRegistration"
 DESCRIBE_S = 2.0
 """Seconds in which a device has to describe itself."""
 
-UNKNOWN_STOP_S = 1.0
-"""Seconds in which a device that was not found has to answer a stop."""
-
 
 class DeviceConnectNetwork:
     """One tenant of Device Connect.
@@ -70,6 +67,7 @@ class DeviceConnectNetwork:
 
     name = DEVICE_CONNECT
     has_stop_link = True
+    tells_absence = True
     announces_verbs = True
     reads: Mapping[str, str] = {"status": "getStatus", "state": "getState", "features": "getFeatures"}
     starts = "execute"
@@ -202,10 +200,12 @@ class DeviceConnectNetwork:
         self, robot: str, timeout: float = STOP_S, robot_name: str = "", *, insist: bool = False
     ) -> Envelope | None:
         """Stop the device by ``stop``, else by ``stopMotion``."""
-        within = timeout if insist or self.bears(robot) else min(timeout, UNKNOWN_STOP_S)
-        answer = self._connected.stop(robot, within, robot_name)
-        unknown = answer.get("status") == "error" and answer.get("stopped") is None
-        return None if unknown and not insist and not self.bears(robot) else answer
+        answer = self._connected.stop(robot, timeout, robot_name)
+        if answer.get("in_reach") is False:
+            # Its presence says whether it is still there.
+            self._peers.pop(robot, None)
+            return answer if insist or self.bears(robot) else None
+        return answer
 
     def received(self, robot: str, verb: str, arguments: Mapping[str, Any]) -> ReceivedCall:
         """Return the call as it is: a device receives what was sent."""

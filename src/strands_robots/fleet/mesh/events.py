@@ -31,7 +31,8 @@ def follow(
 
     Args:
         mesh: a joined peer.
-        robot: an id, whose policy steps and safety events are received, or :data:`EVERY`.
+        robot: an id, whose policy steps, safety events, and heartbeats that tell of another task or lockout are
+            received, or :data:`EVERY`.
         on_event: takes each event.
         number: tells this subscription from the others of the peer.
         detail: the messages that are received besides.
@@ -41,7 +42,7 @@ def follow(
     elif robot == EVERY:
         receivers = _of_all(mesh, on_event)
     else:
-        receivers = _of_one(robot, on_event, states=detail is Detail.STATES)
+        receivers = _of_one(mesh, robot, on_event, states=detail is Detail.STATES)
     names = []
     for key, (name, receive) in receivers.items():
         # Those of the fleet arrive once, however many robots are recorded.
@@ -55,16 +56,25 @@ def follow(
     return end
 
 
-def _of_one(robot: str, on_event: OnEvent, *, states: bool) -> dict[str, tuple[str, OnMessage]]:
+def _of_one(mesh: Mesh, robot: str, on_event: OnEvent, *, states: bool) -> dict[str, tuple[str, OnMessage]]:
     from strands_robots.mesh import topics  # noqa: PLC0415 - the network is loaded when it is used
+
+    last = [_condition(mesh.get_peer(robot))]
 
     def state(_key: str, message: Mapping[str, Any]) -> None:
         if message.get("peer_id") == robot:
             on_event(RobotEvent(robot, "state", message, joints=_positions(message), task=_task(message)))
 
+    def presence(_key: str, message: Mapping[str, Any]) -> None:
+        row = mesh.get_peer(robot) if message.get("robot_id") == robot else None
+        if row is not None and last[0] != (now := _condition(row)):
+            last[0] = now
+            on_event(RobotEvent(robot, "presence", message, task=task_of(row)))
+
     receivers = {
         topics.stream(robot): (STREAM, _named(STREAM, on_event)),
         topics.safety_event(robot): ("safety_event", _named("safety_event", on_event)),
+        topics.presence(robot): ("presence", presence),
     }
     return {**receivers, topics.state(robot): ("state", state)} if states else receivers
 
@@ -111,6 +121,11 @@ def _task(message: Mapping[str, Any]) -> dict[str, Any] | None:
     if not isinstance(task, Mapping) or (isinstance(degraded, Mapping) and "task" in degraded):
         return None
     return task_of({**task, "task_status": task.get("status"), "step_count": task.get("steps")})
+
+
+def _condition(row: Mapping[str, Any] | None) -> object:
+    """Return the task and the lockouts that a heartbeat tells, without the step."""
+    return None if row is None else ({**task_of(row), "step": None}, row.get("locked"), row.get("epochs"))
 
 
 def _of_all(mesh: Mesh, on_event: OnEvent) -> dict[str, tuple[str, OnMessage]]:

@@ -41,7 +41,7 @@ from strands_robots.fleet.mesh.events import follow
 from strands_robots.fleet.mesh.lockouts import ask_peers, lockable_peers, resume_peers
 from strands_robots.fleet.mesh.requests import PeerRequests
 from strands_robots.fleet.mesh.standing import mesh_network, stand_on_mesh
-from strands_robots.fleet.mesh.stops import lock_peers, stop_answer, stop_peers
+from strands_robots.fleet.mesh.stops import lock_peers, stop_peer, stop_peers
 from strands_robots.fleet.mesh_settings import MeshSettings, no_hub
 from strands_robots.fleet.refusals import refusal_of_text, with_meaning
 from strands_robots.fleet.stop_answers import roster_verdict
@@ -64,6 +64,9 @@ DESCRIBE_S = 5.0
 VERB_S = 2.0
 """Seconds in which a peer has to describe a verb of its own before that is called."""
 
+UNSEEN_S = 0.2
+"""Seconds in which an unseen peer has to answer a stop, once peers are known."""
+
 ALWAYS_SENT = ("stop", "releaseTorque")
 """Actions that take energy away: they are sent to a peer that was not seen, too."""
 
@@ -82,6 +85,7 @@ class MeshNetwork:
 
     name = MESH
     has_stop_link = False
+    tells_absence = False
     announces_verbs = False
     reads: Mapping[str, str] = {"status": "status", "state": "state", "features": "features"}
     starts = "start"
@@ -255,12 +259,16 @@ class MeshNetwork:
         """Stop the peer; *stopped* counts only where an enrolled robot has signed it."""
         from strands_robots.mesh.transport.zenoh_config import DISCOVERY_S, discovery_timeout  # noqa: PLC0415 - loaded when it is used
 
-        longest = discovery_timeout(DISCOVERY_S)
-        if not self._waited_for(robot, longest if insist else min(longest, FIND_S)) and not insist:
-            return None
-        one = {"robot_name": robot_name} if robot_name else {}
-        reply = self._joined_mesh.send(robot, {"action": "stop", **one}, timeout)
-        return stop_answer(robot, reply, enrolled_peers())
+        # It leaves at once, and again until the peers in reach are known: a hub may not have linked it yet.
+        mesh, longest = self._joined_mesh, discovery_timeout(DISCOVERY_S)
+        if not is_in_reach(mesh, robot):
+            known_in = max(UNSEEN_S, self._joined + (longest if insist else min(longest, FIND_S)) - time.monotonic())
+            answer = stop_peer(mesh, robot, known_in, robot_name)
+            if "in_reach" not in answer:
+                return answer
+            if not insist and not answer["in_reach"]:
+                return None
+        return stop_peer(mesh, robot, timeout, robot_name)
 
     def received(self, robot: str, verb: str, arguments: Mapping[str, Any]) -> ReceivedCall:
         """Return the call with the defaults of an action of ours."""

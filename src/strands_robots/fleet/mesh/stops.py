@@ -100,6 +100,16 @@ def lock_peers(
     return outcome
 
 
+def stop_peer(mesh: Mesh, robot: str, seconds: float, robot_name: str = "") -> Envelope:
+    """Stop one peer, or one robot of its world; return the answer.
+
+    *Stopped* counts only where an enrolled robot has signed it. Of a silent peer ``in_reach`` says whether it was seen.
+    """
+    one = {"robot_name": robot_name} if robot_name else {}
+    answer = stop_answer(robot, mesh.send(robot, {"action": "stop", **one}, seconds), enrolled_peers())
+    return {**answer, "in_reach": mesh.get_peer(robot) is not None} if answer == unanswered(robot) else answer
+
+
 def stop_answer(
     target: str, reply: Mapping[str, Any], keys: Mapping[str, bytes] | None, *, locks: Collection[str] = ()
 ) -> Envelope:
