@@ -28,7 +28,7 @@ def exit_code(outcome: StopReport | StopOutcome) -> Exit:
     A robot that stopped and is not locked gave no answer to the emergency stop.
     """
     report = outcome.report if isinstance(outcome, StopOutcome) else outcome
-    free = isinstance(outcome, StopOutcome) and outcome.not_locked
+    free = isinstance(outcome, StopOutcome) and {*outcome.not_locked} & report.stopped.keys()
     if report.not_stopped or report.refused or report.alarmed:
         return Exit.REFUSED
     return Exit.OK if outcome.ok and not free else Exit.SILENT

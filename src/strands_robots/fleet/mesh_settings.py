@@ -6,12 +6,16 @@ fleet of that profile is joined, and a fleet of another one is refused meanwhile
 
 from __future__ import annotations
 
+import socket
 import threading
 from collections.abc import Mapping
 from typing import ClassVar
 
 from strands_robots import settings
 from strands_robots.errors import UnreachableError
+
+CONNECT_S = 0.2
+"""Seconds in which the hub takes a connection."""
 
 
 class MeshSettings:
@@ -68,3 +72,12 @@ def put_settings(stated: Mapping[str, str]) -> None:
     """Put settings by variable, for this process and its children."""
     for name, value in stated.items():
         settings.put(name, value)
+
+
+def no_hub() -> str:
+    """Return why this machine has no mesh, or "" where it may have one."""
+    port = settings.integer("STRANDS_MESH_PORT")
+    # Not by create_connection, which loads the tables of international names.
+    with socket.socket() as probe:
+        probe.settimeout(CONNECT_S)
+        return f"no mesh answers on 127.0.0.1:{port}" if probe.connect_ex(("127.0.0.1", port)) else ""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections.abc import Callable, Collection
 from concurrent.futures import Future
@@ -19,6 +20,8 @@ from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope
 from strands_robots.safety.silence import Sending
 from strands_robots.safety.stop_roster import StopOutcome, StopRoster
 
+logger = logging.getLogger(__name__)
+
 if TYPE_CHECKING:
     from strands_robots.device_connect import FleetClient
     from strands_robots.device_connect.backends import LinkConfig
@@ -32,6 +35,9 @@ LINK_WAIT_S = 2.0
 
 SEARCH_SHARE = 2 / 3
 """Part of a deadline in which devices are looked for; the rest is for their answers."""
+
+PLAIN_STOPS_MAX = 512
+"""Devices that get a plain stop after an emergency stop on which they did not act."""
 
 Connect = Callable[[], AbstractContextManager["FleetClient"]]
 """Connects a client for the length of a block, or lends one that is connected."""
@@ -138,8 +144,11 @@ def stopped_and_locked(
     answers: dict[str, Envelope] = {}
     if rest:
         # What has not stopped yet waits for no disk.
-        with connect() as fleet:
-            answers = fleet.stop_each(rest, STOP_S if deadline_s is None else min(STOP_S, deadline_s))
+        try:
+            with connect() as fleet:
+                answers = fleet.stop_each(rest, STOP_S if deadline_s is None else min(STOP_S, deadline_s))
+        except Exception as exc:  # noqa: BLE001 - the answers to the emergency stop count all the same
+            logger.warning("A plain stop of %d devices failed: %s", len(rest), exc)
     outcome = _measured(search, report, sending)
     if rest:
         missed = {name: why for name, why in outcome.reasons.items() if name in rest}
@@ -219,11 +228,14 @@ def _unanswered(search: RosterSearch, lookup: _Lookup, report: StopReport, withi
     search.complete(found)
     answered = {*report.stopped, *report.not_stopped, *report.refused}
     scope = EVERY_ROBOT if report.widened else search.scope
-    return [
+    rest = [
         name
         for name, (stops, cell) in found.devices.items()
         if stops and name not in answered and scope.covers(name, {cell or ""} - {""})
     ]
+    # Names can be made up: those of the roster come first.
+    counted = search.roster.awaited(report.answered)
+    return sorted(rest, key=lambda name: name not in counted)[:PLAIN_STOPS_MAX]
 
 
 def _measured(search: RosterSearch, report: StopReport, sending: Sending) -> StopOutcome:

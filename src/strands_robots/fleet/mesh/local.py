@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from strands_robots import settings
 from strands_robots.errors import UnreachableError
 from strands_robots.fleet.adapter import MESH, NetworkBusyError
-from strands_robots.fleet.mesh.discovery import no_hub
+from strands_robots.fleet.mesh_settings import no_hub
 from strands_robots.safety import network_key
 from strands_robots.safety.network_key import NetworkKey
 
