@@ -9,6 +9,7 @@ import tempfile
 import threading
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -129,7 +130,14 @@ OURS = ("rollout-", "simulation", "device-connect", "fleet-client", "rosbridge",
 
 @pytest.fixture(autouse=True)
 def no_thread_of_ours_left(state_directory: Path) -> Iterator[None]:
-    """Every thread of the package that a test starts has ended when the test has, so that none meets the next one.
+    """Every thread of the package that a test starts has ended when the test has, so that none meets the next one."""
+    with threads_ended():
+        yield
+
+
+@contextmanager
+def threads_ended() -> Iterator[None]:
+    """Wait at the end of a block for the threads of the package that it started.
 
     A pool that the robots of a file use may have replaced one.
     """

@@ -40,7 +40,7 @@ def text_of(answer: Envelope) -> str:
     for block in content if isinstance(content, list) else ():
         if isinstance(block, dict) and isinstance(block.get("text"), str):
             return str(block["text"])
-    return str(answer.get("reason", ""))
+    return str(answer.get("reason", answer.get("error", "")))
 
 
 def fields_of(answer: object) -> dict[str, Any]:

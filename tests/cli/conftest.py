@@ -24,8 +24,8 @@ Run = Callable[..., Result]
 
 
 @pytest.fixture(autouse=True)
-def own_mesh(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A port of the mesh at which no robot of this machine is."""
+def no_mesh_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No command meets the mesh of the user."""
     monkeypatch.setenv("STRANDS_MESH_PORT", str(free_port()))
 
 
@@ -51,6 +51,9 @@ class FakeFleet:
         self.called: list[tuple[Any, ...]] = []
         self.stale = ""
 
+    def known(self) -> tuple[str, ...]:
+        return tuple(peer.id for peer in self.found)
+
     def peers(self, timeout: float = 2.0) -> list[Peer]:
         return self.found
 
@@ -72,8 +75,12 @@ class FakeFleet:
     def stop_all(self, timeout: float) -> dict[str, Envelope]:
         return self.stops
 
-    def known(self) -> tuple[str, ...]:
-        return tuple(peer.id for peer in self.found)
+
+class Given(DeviceConnectNetwork):
+    """Device Connect by a client that is connected already."""
+
+    def open(self) -> None:
+        """Do nothing."""
 
 
 def connect(monkeypatch: pytest.MonkeyPatch, fleet: Any) -> None:
@@ -87,7 +94,7 @@ def connect(monkeypatch: pytest.MonkeyPatch, fleet: Any) -> None:
         return Networks([DeviceConnectNetwork.joined(fleet)])
 
     monkeypatch.setattr(Network, "fleet", connected)
-    monkeypatch.setattr(Network, "networks", networks)
+    monkeypatch.setattr(Network, "networks", lambda *_, **__: Networks([Given.joined(fleet)]))
 
 
 @pytest.fixture

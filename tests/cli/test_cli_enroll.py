@@ -8,18 +8,19 @@ from typing import Any
 
 import pytest
 from tests.cli.conftest import Run, connect
-from tests.cli.test_cli_safety_controller import FakeController, drawn
+from tests.cli.test_cli_safety_controller import drawn
 
 from strands_robots.audit import read_audit_log
 from strands_robots.cli.output import Exit
-from strands_robots.cli.safety_controller import FleetScreen
 from strands_robots.cli.stop_report import exit_code, report_rows, style_of, summary
 from strands_robots.device_connect.backends import loopback_config
 from strands_robots.device_connect.client import Peer
 from strands_robots.device_connect.enrollment import network_of
 from strands_robots.envelope import Envelope, success
 from strands_robots.fleet.lockout_report import LockoutReport
-from strands_robots.fleet.stop_button import StopButton
+from strands_robots.fleet.networks import Networks
+from strands_robots.fleet.safety_console import SafetyConsole
+from strands_robots.fleet.watched_robots import WatchedRobots
 from strands_robots.safety import statements
 from strands_robots.safety.answers import Answer
 from strands_robots.safety.consoles import enrolled_consoles
@@ -271,10 +272,10 @@ def test_the_space_bar_goes_on_for_an_enrolled_robot_that_is_only_claimed() -> N
 
 
 def test_the_fleet_screen_names_a_robot_with_a_wrong_key() -> None:
-    fleet = FleetScreen(FakeController(), loopback_config(), None)  # type: ignore[arg-type]
-    button = StopButton(FakeController(), lambda: (), "")  # type: ignore[arg-type]
+    console, fleet = SafetyConsole(Networks([])), WatchedRobots()
+    console.watched = {"near": fleet}
     fleet.update([LockoutReport("arm-1"), LockoutReport("arm-2", problem="ALARM: a wrong key")])
-    assert "arm-2: ALARM: a wrong key." in drawn(fleet, button)
+    assert "arm-2: ALARM: a wrong key." in drawn(console)
 
 
 def test_key_of_a_console_elsewhere_is_trusted_for_motions(run: Run, stranger: SigningIdentity) -> None:

@@ -186,11 +186,11 @@ def test_caller_is_the_profiles_unless_another_is_given(
 ) -> None:
     named: list[str] = []
 
-    def client(link: object, source: str) -> None:
+    def client(link: object, source: str, **_: object) -> None:
         named.append(source)
         raise CliError("seen", Exit.SILENT)
 
-    monkeypatch.setattr("strands_robots.device_connect.FleetClient", client)
+    monkeypatch.setattr("strands_robots.fleet.device_connect.network.DeviceConnectNetwork", client)
     write('name = "bench"')
     call = ("call", "arm-1", "getStatus")
     for words in (call, ("peers",), (*call, "--as", "ada"), (*call, "--as", "strands-robots")):

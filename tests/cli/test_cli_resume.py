@@ -158,7 +158,7 @@ def test_robots_still_locked_are_named_with_exit_1(run: Run, fleet: FakeFleet, s
     assert "resume --local" in devices["full"]["said"]
 
 
-@pytest.mark.parametrize("arguments", [(), ("--local", "--key", "x"), ("--key", "nowhere"), ("--local", "a.b")])
+@pytest.mark.parametrize("arguments", [(), ("--local", "--key", "x"), ("--key", "nowhere"), ("--local", "a b")])
 def test_resume_with_wrong_arguments_is_exit_2(run: Run, fleet: FakeFleet, arguments: tuple[str, ...]) -> None:
     assert run("resume", *arguments).exit_code == 2
 
@@ -207,10 +207,10 @@ def test_live_robot_outranks_the_lockout_file(run: Run, fleet: FakeFleet) -> Non
 def test_lockout_file_is_printed_without_a_network(
     run: Run, monkeypatch: pytest.MonkeyPatch, state_directory: Path
 ) -> None:
-    def unreachable(network: Network, source: str = "") -> Any:
+    def unreachable(network: Network, **_: object) -> Any:
         raise CliError("The network is not there.", Exit.SILENT)
 
-    monkeypatch.setattr(Network, "fleet", unreachable)
+    monkeypatch.setattr(Network, "networks", unreachable)
     LockoutStore().save({"k": StoredLockout(LockoutState((Lockout(A, "desk", "", 0.0),)), name="arm-1")})
     result = run("lockout")
     assert result.exit_code == 0

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from typing import Any
-
 import pytest
 from fixtures.waiting import eventually
 from tests.cli.conftest import Run
+from tests.fleet.scripted_sender import ScriptedSender
 
 from strands_robots.cli.output import Exit
-from strands_robots.cli.safety_controller import FleetScreen
+from strands_robots.cli.safety_controller import ConsoleScreen
 from strands_robots.cli.stop_report import exit_code
 from strands_robots.fleet.lockout_report import LockoutReport
-from strands_robots.fleet.stop_button import StopButton, StopButtons
+from strands_robots.fleet.networks import Networks
+from strands_robots.fleet.safety_console import SafetyConsole
+from strands_robots.fleet.stop_button import StopButtons
+from strands_robots.fleet.watched_robots import WatchedRobots
 from strands_robots.safety.answers import Answer
-from strands_robots.safety.controller import Progress, StopReport
+from strands_robots.safety.controller import StopReport
 from strands_robots.safety.identity import EnrolledKeys
 from strands_robots.safety.lockout import Lockout, LockoutState
 from strands_robots.safety.network_key import MESH, NetworkKey
@@ -60,58 +61,39 @@ def test_scope_that_cannot_be_read_stops_every_robot_and_says_so(
     assert (stop_scope(arguments["only"], arguments["cell"])[0], ignored) == (scope, note)
 
 
-class Controller:
-    """Answers a stop as the test says, once it may."""
-
-    controller_id, link_up, network = "safety-1", True, None
-
-    def __init__(self) -> None:
-        self.stops: list[tuple[Collection[str], Scope]] = []
-
-    def press(self, estop_id: str) -> None:
-        """Nothing to note."""
-
-    def stop(
-        self, expected: Collection[str], reason: str, *, estop_id: str, on_progress: Any, scope: Scope = EVERY_ROBOT
-    ) -> StopReport:
-        self.stops.append((expected, scope))
-        on_progress(Progress(estop_id, {}, (), True, 1.0, scope=scope))
-        return StopReport(estop_id, {}, {}, {}, (), True, 1.0, scope=scope)
-
-    def review(self, report: StopReport) -> StopReport:
-        return report
-
-
 def row(name: str, cell: str | None = "") -> LockoutReport:
     return LockoutReport(name, facts={} if cell is None else {"cell": cell}, round_trip_ms=1.0)
 
 
 def test_space_bar_stops_every_robot_whatever_was_pressed_before() -> None:
-    controller = Controller()
-    buttons = StopButtons(lambda scope: StopButton(controller, tuple, "test", scope))  # type: ignore[arg-type]
+    sender, buttons = ScriptedSender(), StopButtons("test")
+    buttons.add("near", sender, lambda scope: ())  # type: ignore[arg-type]
     buttons.press(ONLY)
     buttons.press(Scope(cell="cell-1"))
     buttons.press()
-    eventually(lambda: len(controller.stops) == 3 and not buttons.running)
-    assert {scope for _, scope in controller.stops} == {ONLY, Scope(cell="cell-1"), EVERY_ROBOT}
-    assert buttons.latest.report is not None and buttons.latest.report.scope == EVERY_ROBOT
+    eventually(lambda: len(sender.scopes) == 3 and not buttons.running)
+    assert set(sender.scopes) == {ONLY, Scope(cell="cell-1"), EVERY_ROBOT}
+    (latest,) = buttons.latest.values()
+    assert latest.report is not None and latest.report.scope == EVERY_ROBOT
     buttons.review()
     buttons.close()
 
 
 def test_chosen_robot_and_its_cell_are_stopped_and_without_one_every_robot() -> None:
-    screen = FleetScreen(Controller(), lambda known, seconds: [], None)  # type: ignore[arg-type]
+    console, watched = SafetyConsole(Networks([])), WatchedRobots()
+    console.watched = {"near": watched}
+    screen = ConsoleScreen(console, "safety-1", None)
     assert screen.chosen_scope(cell=False) == EVERY_ROBOT
-    screen.update([row("arm-1", "cell-1"), row("arm-2", "cell-2"), row("nowhere"), row("older", None)])
+    watched.update([row("arm-1", "cell-1"), row("arm-2", "cell-2"), row("nowhere"), row("older", None)])
     screen.choose(1)
     assert screen.chosen_scope(cell=False) == ONLY
     assert screen.chosen_scope(cell=True) == Scope(cell="cell-1")
     screen.choose(-1)
     assert screen.chosen_scope(cell=True) == EVERY_ROBOT
     # What states no cell reads no scope, and has to answer as well.
-    assert set(screen.expected(ONLY)) == {"arm-1", "older"}
-    assert set(screen.expected(Scope(cell="cell-1"))) == {"arm-1", "nowhere", "older"}
-    assert set(screen.expected()) == {"arm-1", "arm-2", "nowhere", "older"}
+    assert set(watched.expected(ONLY)) == {"arm-1", "older"}
+    assert set(watched.expected(Scope(cell="cell-1"))) == {"arm-1", "nowhere", "older"}
+    assert set(watched.expected()) == {"arm-1", "arm-2", "nowhere", "older"}
 
 
 def answers(*names: str) -> dict[str, Answer]:

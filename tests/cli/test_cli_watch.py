@@ -1,10 +1,8 @@
 from __future__ import annotations
 
 import io
+import json
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -12,6 +10,7 @@ from rich.console import Console
 from tests.fleet.scripted import ScriptedNetwork
 
 from strands_robots.cli import watch
+from strands_robots.cli.network import Network
 from strands_robots.cli.output import CliError, Exit, Screen
 from strands_robots.cli.watch import (
     BAR_WIDTH,
@@ -22,14 +21,13 @@ from strands_robots.cli.watch import (
     joint_bar,
     joint_limits,
     joints_table,
-    motion_progress,
     print_changes,
 )
 from strands_robots.device_connect.client import DeviceEvent
-from strands_robots.envelope import success
+from strands_robots.envelope import error, success
 from strands_robots.fleet.adapter import RobotEvent
 from strands_robots.fleet.device_connect.events import robot_event
-from strands_robots.fleet.device_connect.network import DeviceConnectNetwork
+from strands_robots.fleet.networks import Networks
 
 
 def drawn(thing: object) -> str:
@@ -53,6 +51,13 @@ def event(name: str, **payload: Any) -> RobotEvent:
         (event("emergencyStop", reason="smoke"), "EMERGENCY STOP: smoke"),
         (event("stateUpdate", running_policies="nonsense"), ""),
         (event("observationUpdate", joints={}), ""),
+        (
+            RobotEvent("arm-1", "state", {}, task={"state": "running", "instruction": "wave", "step": 3}),
+            "running: 'wave', step 3",
+        ),
+        (RobotEvent("arm-1", "state", {}, task={"state": "idle"}), "idle"),
+        (RobotEvent("arm-1", "safety_event", {"event": "emergency_stop"}), "EMERGENCY STOP"),
+        (RobotEvent("arm-1", "stream", {"step": 3}), ""),
     ],
 )
 def test_event_is_described_as_the_device_task(seen: RobotEvent, task: str) -> None:
@@ -69,24 +74,37 @@ def test_the_view_keeps_the_last_joints_and_task() -> None:
     assert "wave" in text
 
 
+@pytest.fixture
+def there(monkeypatch: pytest.MonkeyPatch) -> ScriptedNetwork:
+    there = ScriptedNetwork()
+    monkeypatch.setattr(Network, "networks", lambda *_, **__: Networks([there]))
+    return there
+
+
 def test_watched_device_is_asked_and_followed_by_one_adapter(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    there: ScriptedNetwork, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    there, joined = ScriptedNetwork(), list[object]()
     there.answers["getStatus"] = lambda _: success("", task_status="running", instruction="wave")
-
-    class Linked:
-        @contextmanager
-        def fleet(self) -> Iterator[Any]:
-            yield SimpleNamespace(beats_every=lambda _: 5.0)
-
-    monkeypatch.setattr(DeviceConnectNetwork, "joined", lambda fleet: joined.append(fleet) or there)
-    linked: Any = Linked()
-    watch.watch(Screen(), linked, "arm-1", 0.01)
+    watch.watch(Screen(), Network(), "arm-1", 0.01)
     assert capsys.readouterr().out.startswith("arm-1: running: 'wave', step 0.")
-    assert len(joined) == 1
     assert [verb for _, verb, _, _ in there.calls] == ["getFeatures", "getState", "getStatus"]
     assert there.subscribers == []
+
+
+def test_read_that_fails_inside_the_robot_is_no_state(
+    there: ScriptedNetwork, capsys: pytest.CaptureFixture[str]
+) -> None:
+    there.robots["arm-1"] = "no list"
+    there.answers["getState"] = lambda _: error("no bus", joints={"pan": 1.0})
+    there.answers["getStatus"] = lambda _: success("", task_status="idle")
+    watch.watch(Screen(machine=True), Network(), "arm-1", 0.01)
+    assert [json.loads(line)["event"] for line in capsys.readouterr().out.splitlines()] == ["getStatus"]
+
+
+def test_device_that_is_not_there_is_exit_3(there: ScriptedNetwork) -> None:
+    with pytest.raises(CliError, match="Near it: arm-1") as failure:
+        watch.watch(Screen(), Network(), "arm-2", 0.01)
+    assert failure.value.code is Exit.SILENT
 
 
 def test_each_change_is_one_line_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
@@ -189,10 +207,6 @@ def test_joint_limits_are_read_from_simulation_and_robot() -> None:
     assert joint_limits(one) == {"pan": (-1.0, 1.0)}
     assert joint_limits({"robots": {"arm": one, "other": {}}}) == {"pan": (-1.0, 1.0)}
     assert joint_limits({"robots": "nonsense"}) == {}
-
-
-def test_progress_never_exceeds_its_total() -> None:
-    assert "4.0 / 4.0 s" in drawn(motion_progress("wave", 9.0, 4.0))
 
 
 def test_device_without_joints_says_so() -> None:

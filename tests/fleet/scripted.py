@@ -10,7 +10,16 @@ from typing import Any
 
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.errors import NoSuchRobotError, UnknownVerbError, UnreachableError
-from strands_robots.fleet.adapter import DEVICE_CONNECT, FIND_S, STOP_S, FoundRobot, OnEvent, ReceivedCall, RobotEvent
+from strands_robots.fleet.adapter import (
+    DEVICE_CONNECT,
+    FIND_S,
+    STOP_S,
+    Detail,
+    FoundRobot,
+    OnEvent,
+    ReceivedCall,
+    RobotEvent,
+)
 from strands_robots.fleet.lockout_report import LockoutReport, Resumed
 from strands_robots.fleet.refusals import answered
 from strands_robots.fleet.stop_answers import measured, roster_verdict, unanswered
@@ -64,6 +73,7 @@ class ScriptedNetwork:
     """Robots whose verbs, answers and stops a test sets; it notes what they were asked."""
 
     has_stop_link = False
+    tells_absence = False
     announces_verbs = True
     reads: Mapping[str, str] = {"status": "getStatus", "state": "getState", "features": "getFeatures"}
     starts = "execute"
@@ -143,6 +153,8 @@ class ScriptedNetwork:
         return self.robots[robot] if self.announces_verbs else self.of_kind
 
     def describe(self, robot: str, *, anew: bool = False) -> object:
+        if robot not in self.robots:
+            raise NoSuchRobotError("gone", robot=robot)
         return self.robots[robot]
 
     def describe_each(self, robots: Iterable[str]) -> Mapping[str, object]:
@@ -187,7 +199,7 @@ class ScriptedNetwork:
         return ReceivedCall("scripted", verb, arguments)
 
     async def stop_async(self, robot: str, within: float = STOP_S, robot_name: str = "") -> Envelope:
-        return self.stop(robot, within, robot_name) or error("none", stopped=None)
+        return self.stop(robot, within, robot_name) or error(f"No device {robot}.", stopped=None, in_reach=False)
 
     @property
     def key(self) -> NetworkKey:
@@ -262,7 +274,7 @@ class ScriptedNetwork:
 
     def lockouts(self, robots: Iterable[str], timeout: float, *, signed: bool = False) -> list[LockoutReport]:
         def report(name: str) -> LockoutReport:
-            lockouts = (Lockout(self.locked[name], "desk", 1.0, ""),) if name in self.locked else ()
+            lockouts = (Lockout(self.locked[name], "desk", "", 1.0),) if name in self.locked else ()
             key = self.keys.get(name)
             facts = {} if key is None else {"statement": signed_by(key, Purpose.LOCKOUT_STATE, name, {"nonce": "n"})}
             return LockoutReport(name, lockouts, facts=facts)
@@ -283,7 +295,10 @@ class ScriptedNetwork:
             self.locked.pop(each.name, None)
         return {each.name: (True, "free") for each in reports}
 
-    def subscribe(self, robot: str, on_event: OnEvent) -> Callable[[], None]:
+    def beats_every(self, robot: str) -> float:
+        return 5.0
+
+    def subscribe(self, robot: str, on_event: OnEvent, detail: Detail = Detail.EVENTS) -> Callable[[], None]:
         self.subscribers.append(on_event)
         return lambda: self.subscribers.remove(on_event)
 

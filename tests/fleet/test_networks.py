@@ -5,14 +5,16 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections.abc import Iterator
+from contextlib import closing
 from typing import Any
 
 import pytest
 from fixtures.waiting import eventually
-from tests.fleet.scripted import OURS, ScriptedNetwork
+from tests.fleet.scripted import OURS, ScriptedNetwork, function
 
 from strands_robots import errors
 from strands_robots.envelope import Envelope, error, success
+from strands_robots.fleet import joining
 from strands_robots.fleet import networks as module
 from strands_robots.fleet.adapter import DEVICE_CONNECT, FIND_S, MESH, STOP_S, FoundRobot, NetworkAdapter
 from strands_robots.fleet.all_stops import estop_all, stop_all
@@ -123,14 +125,25 @@ def test_stop_from_a_loop_waits_for_no_joining_once_the_robot_has_stopped(
     assert asyncio.run(stop()) == {DEVICE_CONNECT: near.stops}
 
 
-def test_network_that_is_gone_and_has_no_remembered_robot_fails_no_stop(near: ScriptedNetwork) -> None:
+def test_stated_network_that_is_gone_fails_a_stop_though_no_robot_of_it_is_remembered(near: ScriptedNetwork) -> None:
     far = ScriptedNetwork(MESH, {})
     far.unreachable = "no route"
     with Networks([near, far]) as networks:
-        verdict = stop_all(networks)
-        assert networks.absent == {MESH: "no route"}
-    assert verdict.ok
-    assert near.stopped == ["arm-1", "both"]
+        for verdict in (stop_all(networks), estop_all(networks, "test")):
+            assert not verdict.ok
+            assert verdict.missing == ("the robots on mesh",)
+            assert "It did not leave on mesh: no route." in str(verdict)
+            assert verdict["arm-1"].stopped
+            assert networks.missing == {MESH: "no route"}
+
+
+def test_mesh_that_no_one_asked_for_fails_no_stop(near: ScriptedNetwork) -> None:
+    far = ScriptedNetwork(MESH, {})
+    far.unreachable = "no hub"
+    with Networks([near, far], unasked={MESH}) as networks:
+        assert stop_all(networks).ok
+        assert near.stopped == ["arm-1", "both"]
+        assert (networks.absent, networks.missing) == ({MESH: "no hub"}, {})
 
 
 def test_none_in_reach_is_refused_with_each_reason(near: ScriptedNetwork) -> None:
@@ -156,12 +169,149 @@ def test_networks_that_are_left_while_one_is_being_joined_leave_it_too(near: Scr
     assert networks.joined == ()
 
 
+def test_absent_networks_that_no_one_asked_for_are_not_told(near: ScriptedNetwork) -> None:
+    far = ScriptedNetwork(MESH)
+    far.unreachable = "no hub"
+    with Networks([near, far], {"other": "left out"}, unasked=(MESH, "other")) as networks:
+        networks.settled()
+        assert networks.absent == {MESH: "no hub", "other": "left out"}
+        assert networks.missing == {}
+    near.unreachable = "no broker"
+    with pytest.raises(errors.UnreachableError) as refused, Networks([near, far], unasked=(MESH,)):
+        pytest.fail("joined")
+    assert refused.value.why == "no broker"
+
+
+class TestInTurn:
+    """The second network is joined only where the first one does not do."""
+
+    @pytest.fixture
+    def far(self) -> ScriptedNetwork:
+        return ScriptedNetwork(MESH, {"arm-2": OURS, "both": OURS})
+
+    @pytest.fixture
+    def networks(self, near: ScriptedNetwork, far: ScriptedNetwork) -> Iterator[Networks]:
+        with closing(Networks([near, far])) as networks:
+            networks.open(in_turn=True)
+            yield networks
+
+    def test_read_of_a_robot_of_the_first_joins_no_other(self, networks: Networks, far: ScriptedNetwork) -> None:
+        assert networks.call("both", "getStatus", {}, 5.0, moves=False)["status"] == "success"
+        assert not far.joined
+
+    def test_read_of_a_robot_of_the_second_joins_it(self, networks: Networks, far: ScriptedNetwork) -> None:
+        assert networks.call("arm-2", "getStatus", {}, 5.0, moves=False)["status"] == "success"
+        assert far.calls
+
+    def test_absent_robot_is_asked_for_once(
+        self, networks: Networks, near: ScriptedNetwork, far: ScriptedNetwork
+    ) -> None:
+        far.unreachable = "no hub"
+        with pytest.raises(errors.NoSuchRobotError):
+            networks.call("arm-9", "getStatus", {}, 5.0, moves=False)
+        assert len(near.calls) == 1
+
+    def test_motion_and_search_join_all(self, networks: Networks, far: ScriptedNetwork) -> None:
+        with pytest.raises(errors.AmbiguousRobotError):
+            networks.call("both", "moveTo", {"x": 1}, 5.0)
+        assert far.joined
+        assert sorted(networks.find()) == ["arm-1", "arm-2", "both"]
+
+    def test_second_is_joined_where_the_first_cannot_be(self, near: ScriptedNetwork, far: ScriptedNetwork) -> None:
+        near.unreachable = "no broker"
+        with closing(Networks([near, far])) as networks:
+            networks.open(in_turn=True)
+            assert networks.joined == (far,)
+            assert networks.missing == {DEVICE_CONNECT: "no broker"}
+
+    def test_stop_leaves_on_both(self, networks: Networks, near: ScriptedNetwork, far: ScriptedNetwork) -> None:
+        networks.stop("both")
+        assert (near.stopped, far.stopped) == (["both"], ["both"])
+
+
+def test_networks_are_joined_anew_only_once_the_attempt_before_has_ended(
+    near: ScriptedNetwork, far: SlowNetwork
+) -> None:
+    networks = Networks([near, far])
+    networks.open()
+    assert far.opening.wait(30)
+    networks.close()
+    networks.open()
+    far.may_open.set()
+    assert networks.settled() == (near, far)
+    assert far.joined
+    networks.close()
+    assert not far.joined
+
+
+class Panic(BaseException):
+    """What a binding raises."""
+
+
+def test_panic_while_joining_hangs_no_stop(near: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch) -> None:
+    far = ScriptedNetwork(MESH, {})
+
+    def panics() -> None:
+        raise Panic("poisoned")
+
+    monkeypatch.setattr(far, "open", panics)
+    with Networks([near, far]) as networks:
+        assert stop_all(networks)["arm-1"].stopped
+        assert networks.absent == {MESH: "Panic: poisoned"}
+    with pytest.raises(Panic), Networks([far]):
+        pytest.fail("joined")
+
+
+def test_refusal_without_a_reason_is_no_joining(near: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch) -> None:
+    far = ScriptedNetwork(MESH)
+
+    def refused() -> None:
+        raise errors.UnreachableError("")
+
+    monkeypatch.setattr(far, "open", refused)
+    with Networks([near, far]) as networks:
+        assert networks.settled() == (near,)
+        assert networks.absent[MESH]
+
+
+def test_interrupt_while_joining_leaves_every_network(near: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted() -> None:
+        raise KeyboardInterrupt
+
+    networks = Networks([near])
+    monkeypatch.setattr(near, "open", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        networks.open()
+    with pytest.raises(errors.UnreachableError, match="not joined"):
+        networks.settled()
+
+
+def test_listener_that_fails_keeps_no_other_from_hearing(
+    near: ScriptedNetwork, caplog: pytest.LogCaptureFixture
+) -> None:
+    heard: list[NetworkAdapter] = []
+    networks = Networks([near])
+    networks.on_joined(lambda _network: heard[5])  # type: ignore[arg-type,return-value]
+    networks.on_joined(heard.append)
+    with networks:
+        assert heard == [near]
+    assert "A listener failed for device_connect" in caplog.text
+
+
+def test_events_can_be_ended_twice(near: ScriptedNetwork) -> None:
+    with Networks([near]) as networks:
+        end = networks.subscribe("*", lambda event: None)
+        end()
+        end()
+        assert near.subscribers == []
+
+
 class TestStays:
     """Networks of a face that lasts: what is not there yet is joined when it comes."""
 
     @pytest.fixture(autouse=True)
     def often(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(module, "AGAIN_S", 0.01)
+        monkeypatch.setattr(joining, "AGAIN_S", 0.01)
 
     def test_network_that_comes_later_is_joined_and_told_once(self, near: ScriptedNetwork) -> None:
         far = ScriptedNetwork(MESH, {"arm-2": OURS})
@@ -244,6 +394,18 @@ class TestRouting:
             assert asyncio.run(networks.of_async(robot)) is there
             assert asyncio.run(networks.describe_async(robot, 5.0)).functions == OURS
         assert near.asked == far.asked == []
+
+    def test_own_verb_is_called_where_it_was_described(
+        self, networks: Networks, near: ScriptedNetwork, far: ScriptedNetwork
+    ) -> None:
+        assert networks.described("both", "getStatus")[0] is near
+        network, verb = networks.described("arm-2", "moveTo")
+        assert network is far
+        assert verb is not None
+        near.robots["both"] = far.robots["both"] = (function("brewCoffee"), function("beansLeft", "read"))
+        assert networks.described("both", "beansLeft")[0] is near
+        with pytest.raises(errors.AmbiguousRobotError):
+            networks.described("both", "brewCoffee")
 
     def test_motion_of_an_id_on_both_is_refused_naming_both(self, networks: Networks) -> None:
         with pytest.raises(errors.AmbiguousRobotError, match="device_connect and mesh"):

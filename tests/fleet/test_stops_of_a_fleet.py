@@ -9,16 +9,14 @@ from typing import Any, ClassVar
 
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
-from fixtures.waiting import eventually
 from tests.fleet.scripted import ScriptedNetwork, key_of
 
 from strands_robots import errors
 from strands_robots.envelope import error, success
 from strands_robots.fleet import Fleet
 from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
-from strands_robots.fleet.all_stops import stop_all
 from strands_robots.fleet.enrollment import Enrolled, enrolled_robots
-from strands_robots.fleet.networks import Networks
+from strands_robots.fleet.lockout_report import LockoutReport
 from strands_robots.safety.identity import ROBOTS, KeyFile
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.roster import Roster, RosterRow
@@ -146,6 +144,48 @@ def test_lockouts_are_read_and_resumed_by_robot(fleet: Fleet, near: ScriptedNetw
     assert {name: free for name, (free, _) in fleet.resume("key").items()} == dict.fromkeys(
         ("arm-1", "arm-2", "both"), True
     )
+
+
+def test_robot_that_is_locked_on_one_of_two_networks_is_locked(fleet: Fleet, far: ScriptedNetwork) -> None:
+    far.locked["both"] = "e" * 32
+    report = fleet.lockouts()["both"]
+    assert ([each.epoch for each in report.lockouts], report.problem) == (["e" * 32], "")
+
+
+def test_robot_that_reports_on_one_network_alone_has_the_problem_of_the_other(
+    fleet: Fleet, near: ScriptedNetwork, far: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    near.locked["both"] = "e" * 32
+    monkeypatch.setattr(far, "lockouts", lambda names, *_, **__: [LockoutReport(each, problem="cut") for each in names])
+    report = fleet.lockouts()["both"]
+    assert ([each.epoch for each in report.lockouts], report.problem) == (["e" * 32], "mesh: cut")
+
+
+def test_robot_that_no_search_finds_is_asked_by_its_id(
+    fleet: Fleet, near: ScriptedNetwork, far: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for network in (near, far):
+        monkeypatch.setattr(network, "lockable", lambda *_: [])
+    far.locked["arm-2"] = "e" * 32
+    assert fleet.resume("key", "arm-2") == {"arm-2": (True, "free")}
+    assert fleet.resume("key") == {}
+
+
+def test_resume_of_one_robot_asks_all_before_it_names_who_is_not_heard(
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from strands_robots.fleet import all_lockouts as module  # noqa: PLC0415 - this test alone
+    from strands_robots.safety.unheard import Unheard  # noqa: PLC0415 - as above
+
+    heard: list[set[str]] = []
+
+    def unheard(network: NetworkKey, names: set[str]) -> Unheard:
+        heard.append(names)
+        return Unheard()
+
+    monkeypatch.setattr(module, "unheard_now", unheard)
+    fleet.resume("key", "arm-1")
+    assert heard == [{"arm-1", "both"}, {"arm-2", "both"}]
 
 
 def test_robot_that_stays_locked_on_one_network_is_not_free(
@@ -311,16 +351,3 @@ def test_disk_that_hangs_hides_no_verdict_of_another_network(
         assert waited == []
     finally:
         released.set()
-
-
-def test_network_that_came_later_is_stopped_and_not_called_absent(near: ScriptedNetwork, far: ScriptedNetwork) -> None:
-    there = threading.Event()
-    absent, keys = {MESH: "no hub"}, {MESH: lambda: key_of(MESH)}
-    later = [lambda: far if there.is_set() else None]
-    with Networks([near], absent, keys, stays=True, later=later) as networks:
-        assert "arm-2" not in stop_all(networks)
-        there.set()
-        eventually(lambda: len(networks.joined) == 2, what="the mesh")
-        verdict = stop_all(networks)
-        assert verdict["arm-2"].stopped
-        assert [each.network for each in verdict.networks if each.absent] == []

@@ -106,14 +106,13 @@ def test_close_waits_for_no_further_try(
 
 
 def test_it_stands_on_a_network_that_comes_later_and_names_the_one_where_it_does_not(near: StandNetwork) -> None:
-    far, there = StandNetwork(MESH), threading.Event()
-    later = [lambda: far if there.is_set() else None]
-    with Networks([near], {MESH: "no hub"}, stays=True, later=later) as networks:
+    far = StandNetwork(MESH)
+    far.unreachable = "no hub"
+    with Networks([near, far], stays=True, unasked={MESH}) as networks:
         standing = StandingController("helper", networks)
         standing.open()
         eventually(lambda: standing.problem == "", what="its stand on the one network that is there")
-        far.fault = "refused"
-        there.set()
+        far.fault, far.unreachable = "refused", ""
         eventually(lambda: "refused" in standing.problem, what="the failure")
         assert standing.problem.startswith(f"{MESH}: ")
         assert near.standing_for

@@ -137,6 +137,22 @@ def test_init_mesh_names_joins_and_lists_the_robot(monkeypatch: pytest.MonkeyPat
     assert not mesh.alive
 
 
+def test_peer_of_this_process_that_left_is_out_of_reach_of_its_others_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STRANDS_MESH_BACKEND", "memory")
+    # No token is looked at meanwhile, as where the session is over with the peer.
+    monkeypatch.setattr(PresenceListener, "judge_tokens", lambda *_: None)
+    one, two = init_mesh(None, "one"), init_mesh(None, "two")
+    assert one is not None
+    assert two is not None
+    try:
+        eventually(lambda: (one.get_peer("two") or {}).get("reachable"))
+        two.close()
+        assert not (one.get_peer("two") or {}).get("reachable")
+    finally:
+        one.close()
+        two.close()
+
+
 def test_a_peer_that_cannot_join_is_not_alive(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("STRANDS_MESH_BACKEND", "pigeon")
     mesh = init_mesh(None, "console")

@@ -352,6 +352,12 @@ def test_own_verb_is_called_with_its_arguments_for_as_long_as_it_lasts(bar: Scri
     assert bar.calls == [("bar-1", "brewCoffee", {"cups": 2}, 125.0), ("bar-1", "ownUnknown", {}, 35.0)]
 
 
+def test_error_without_content_is_an_error_to_the_model(bar: ScriptedNetwork) -> None:
+    bar.answers["brewCoffee"] = lambda _: {"status": "error", "error": "resume rejected"}
+    answer = robot_mesh(action="call", target="bar-1", verb="brewCoffee", arguments={"cups": 2})
+    assert (answer["status"], answer["content"][0]) == ("error", {"text": "resume rejected"})
+
+
 def test_peers_name_own_verbs_with_their_parameters_and_devices_that_cannot_be_stopped(bar: ScriptedNetwork) -> None:
     ours, echo = robot_mesh(action="peers")["peers"]
     assert ours["functions"][:3] == ["brewCoffee", "resume", "acquireControl"]
@@ -427,6 +433,11 @@ class TestOfBothNetworks:
         far.stops = error("bus", stopped=False)
         answer = robot_mesh(action="stop", target="both")
         assert (answer["stopped"], answer["not_stopped"]) == (False, ["both on mesh"])
+        assert (near.stopped, far.stopped) == (["both"], ["both"])
+
+    @pytest.mark.parametrize("verb", ["stop", "stopMotion"])
+    def test_call_of_a_stop_goes_to_all_bearers(self, near: ScriptedNetwork, far: ScriptedNetwork, verb: str) -> None:
+        assert robot_mesh(action="call", target="both", verb=verb)["stopped"] is True
         assert (near.stopped, far.stopped) == (["both"], ["both"])
 
     def test_stop_of_all_is_one_answer_that_names_robots_of_both(

@@ -7,13 +7,13 @@ from typing import Annotated
 
 import typer
 
-from strands_robots.cli.command import Timeout, command
+from strands_robots.cli.command import OnMesh, Timeout, command
 from strands_robots.cli.keys import PassphraseFile, signing_key
-from strands_robots.cli.network import Network, call_robot
+from strands_robots.cli.network import Network, answering
 from strands_robots.cli.output import CliError, Exit, Screen, plain
 from strands_robots.envelope import is_error, text_of
 from strands_robots.serving.take_assertion import sign_take
-from strands_robots.utils import device_id, number
+from strands_robots.utils import identifier, number
 
 
 def register(app: typer.Typer) -> None:
@@ -33,19 +33,21 @@ def take(
         str, typer.Option("--reason", help="Told to the one who loses control.")
     ] = "an operator took over",
     timeout: Timeout = 5.0,
+    on_mesh: OnMesh = False,
 ) -> None:
     """Take control of a robot: its motion is halted, and only you may move it then."""
-    name, seconds = device_id("DEVICE", device), number("--timeout", timeout, above=0, high=60)
+    name, seconds = identifier("DEVICE", device), number("--timeout", timeout, above=0, high=60)
     signer = None if key is None else signing_key(key, passphrase_file)
     which: dict[str, object] = {"robot_name": robot} if robot else {}
-    with network.joined() as there:
-        before = call_robot(there, name, "getControl", which, seconds)
+    with network.joined(on_mesh=on_mesh) as there, answering(there, name, "takeControl"):
+        place = there.of(name, "takeControl", moves=True)
+        before = place.call(name, "getControl", which, seconds)
         if is_error(before):
             raise CliError(plain(text_of(before), 2000), Exit.REFUSED)
         asked = {"reason": reason, **which}
         if signer is not None:
             asked["assertion"] = sign_take(signer, f"{name}/{robot}" if robot else name, int(before["epoch"]))
-        answer = call_robot(there, name, "takeControl", asked, seconds)
+        answer = place.call(name, "takeControl", asked, seconds)
     if is_error(answer):
         raise CliError(plain(text_of(answer), 2000), Exit.REFUSED)
     screen.data(answer)

@@ -115,7 +115,7 @@ def _feeds(
     """Join the networks; they are left when the stack ends."""
     from strands_robots.dashboard.feed import FleetFeed  # noqa: PLC0415 - as above
 
-    networks = [stack.enter_context(network.joined(source=source))]
+    networks = [stack.enter_context(network.adapter(source=source))]
     if with_mesh:
         networks.append(stack.enter_context(joined_mesh(source, "controller")))
     return [FleetFeed(model, each, signer) for each in networks]

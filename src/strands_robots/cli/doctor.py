@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import closing, suppress
 from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from importlib import metadata
@@ -22,6 +23,8 @@ from strands_robots.cli.network import Network
 from strands_robots.cli.output import CliError, Screen, label, table
 from strands_robots.cli.owners import IMPORT_PACKAGE, other_owners, owner_remedy
 from strands_robots.cli.readiness import LOOPBACK, dial_problem, listen_problem, port_holder
+from strands_robots.errors import UnreachableError
+from strands_robots.fleet.adapter import MESH
 from strands_robots.fleet.link_flags import described
 from strands_robots.safety.identity import robots_here
 from strands_robots.safety.orders import ALLOW, REQUIRE_SIGNED, StopRules
@@ -128,6 +131,7 @@ def examine(network: Network) -> list[Finding]:
         *(finding for check in before for finding in check()),
         *found,
         *(finding for check in of_link if link is not None for finding in check(link)),
+        *_mesh(network),
         *(finding for check in after for finding in check()),
     ]
 
@@ -219,6 +223,21 @@ def _meeting_port(link: LinkConfig) -> Iterator[Finding]:
     else:
         remedy = "" if uid in (None, os.getuid()) else "choose another port with --port or STRANDS_DC_PORT"
         yield Finding("port", Mark.NOTE if remedy else Mark.OK, f"{where}: robots are served there{holder}", remedy)
+
+
+def _mesh(network: Network) -> Iterator[Finding]:
+    """Join the mesh that commands reach besides, where there is one."""
+    try:
+        networks = network.networks()
+    except (CliError, ValidationError, MissingExtraError):
+        return  # the check of the network has said so
+    with closing(networks), suppress(UnreachableError):
+        networks.open()
+        networks.settled()
+    if why := networks.missing.get(MESH):
+        yield Finding("mesh", Mark.WARN, why, "start a robot there with serve --mesh, or correct STRANDS_MESH_CONNECT")
+    else:
+        yield Finding("mesh", Mark.OK, networks.absent.get(MESH, "its peers are reached by every command"))
 
 
 def _multicast() -> Iterator[Finding]:

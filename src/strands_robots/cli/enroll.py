@@ -8,14 +8,14 @@ import typer
 
 from strands_robots.cli.command import OnMesh, Timeout, command
 from strands_robots.cli.enrolled import Forget, Listed, Off, Reason, Retire, apply, change_of, show_enrolled
-from strands_robots.cli.network import Network
+from strands_robots.cli.network import Network, say_missing
 from strands_robots.cli.output import CliError, Exit, Screen, label, plain, table
-from strands_robots.fleet import enrollment as fleet_enrollment
-from strands_robots.fleet.enrollment import Enrolled
+from strands_robots.fleet.all_lockouts import ask_lockouts, by_robot, enroll_all
+from strands_robots.fleet.enrollment import Enrolled, Enrolment
 from strands_robots.safety import ed25519
 from strands_robots.safety.consoles import enrolled_consoles
 from strands_robots.safety.identity import DEFAULT_TENANT, KeyFileError, fingerprint
-from strands_robots.utils import device_id, number, shown
+from strands_robots.utils import identifier, number, shown
 
 COMPARE = "Compare each with the fingerprint that `strands-robots doctor` shows at the robot's own machine."
 
@@ -53,7 +53,7 @@ def enroll(
     if console:
         _enroll_console(screen, console)
         return
-    wanted = [device_id("DEVICE", each) for each in devices or []]
+    wanted = [identifier("DEVICE", each) for each in devices or []]
     seconds = number("--timeout", timeout, above=0, high=60)
     _enroll_robots(screen, network, wanted, seconds, replace=replace, on_mesh=on_mesh)
 
@@ -62,14 +62,17 @@ def _enroll_robots(
     screen: Screen, network: Network, wanted: list[str], seconds: float, *, replace: bool, on_mesh: bool
 ) -> None:
     with network.joined(on_mesh=on_mesh) as there:
-        reports = there.lockouts(wanted or there.lockable(seconds), seconds, signed=True)
-        if not reports:
-            raise CliError(f"No robot answered. {there.reach}", Exit.SILENT, devices={})
+        reports = ask_lockouts(there, seconds, robots=wanted, look_s=seconds, signed=True)
+        if not by_robot(reports):
+            raise CliError(f"No robot answered. {there.reach}", Exit.SILENT, devices={}, absent=there.missing)
         try:
-            outcome = fleet_enrollment.enroll(reports, there.key, replace=replace)
+            outcome = enroll_all(reports, replace=replace)
         except (KeyFileError, OSError) as exc:
             raise CliError(f"Nothing was enrolled: {exc}") from exc
-    styles = {Enrolled.CHANGED_KEY: "bold red", Enrolled.NO_KEY: "yellow"}
+    absent = Enrolment(Enrolled.NO_KEY, said="no such robot is in reach")
+    outcome |= {name: absent for name in wanted if name not in outcome}
+    say_missing(screen, there)
+    styles = {Enrolled.CHANGED_KEY: "bold red", Enrolled.TWO_KEYS: "bold red", Enrolled.NO_KEY: "yellow"}
     rows = (
         (name, label(each.outcome.value, styles.get(each.outcome, "green")), each.fingerprint, each.said)
         for name, each in outcome.items()
@@ -79,6 +82,16 @@ def _enroll_robots(
         name: {"outcome": each.outcome.value, "fingerprint": each.fingerprint, "said": each.said}
         for name, each in outcome.items()
     }
+    several = [name for name, each in outcome.items() if each.outcome is Enrolled.TWO_KEYS]
+    if several:
+        raise CliError(
+            plain(
+                f"ALARM: {', '.join(several)} shows another key on each network: there are two robots of that id. Give "
+                "one of them another id; --mesh enrolls the one on the mesh.",
+                2000,
+            ),
+            devices=facts,
+        )
     changed = [name for name, each in outcome.items() if each.outcome is Enrolled.CHANGED_KEY]
     if changed:
         raise CliError(
@@ -91,7 +104,7 @@ def _enroll_robots(
         )
     if not any(each.outcome in (Enrolled.NEW, Enrolled.KNOWN) for each in outcome.values()):
         raise CliError("No robot showed a key.", Exit.SILENT, devices=facts)
-    screen.data({"status": "success", "devices": facts})
+    screen.data({"status": "success", "devices": facts, "absent": there.missing})
     screen.say(COMPARE)
 
 

@@ -15,9 +15,18 @@ import typer
 
 from strands_robots import settings
 from strands_robots._mesh_switch import mesh_env_request
-from strands_robots.cli.output import CliError, Exit, plain
+from strands_robots.cli.output import CliError, Exit, Screen, plain
+from strands_robots.cli.readiness import other_user
 from strands_robots.envelope import Envelope
-from strands_robots.errors import ArgumentsError, NoSuchRobotError, RefusalError, UnknownVerbError, UnreachableError
+from strands_robots.errors import (
+    AmbiguousRobotError,
+    ArgumentsError,
+    NoSuchRobotError,
+    RefusalError,
+    UnknownVerbError,
+    UnreachableError,
+)
+from strands_robots.fleet.adapter import DEVICE_CONNECT
 from strands_robots.fleet.callers import SOURCE
 from strands_robots.fleet.link_flags import LinkFlags, as_flag
 from strands_robots.fleet.mesh_settings import put_settings
@@ -130,13 +139,16 @@ class Network:
     def _stated(self) -> LinkFlags:
         return self._flags_over(self._profile)
 
-    def networks(self, *, on_mesh: bool = False, source: str | None = None, stays: bool = False) -> Networks:
+    def networks(
+        self, *, on_mesh: bool = False, source: str | None = None, stays: bool = False, console: bool = False
+    ) -> Networks:
         """Return the networks of the flags, not joined yet.
 
         Args:
             on_mesh: the native mesh alone.
             source: the caller's name; by default that of :meth:`caller`.
             stays: the command lasts, and goes on trying to join what is not there yet.
+            console: a safety controller, whose name is its whole id on the mesh.
 
         Raises:
             CliError: the flags contradict one another, or leave this machine without authentication.
@@ -149,9 +161,11 @@ class Network:
             self.use_mesh()
             if mesh_env_request() is False:
                 raise CliError("The native mesh is off: STRANDS_MESH switches it off.", Exit.SILENT)
-            return networks_of(None, {}, name, devices=False, mesh=True, stays=stays)
+            return networks_of(None, {}, name, devices=False, mesh=True, stays=stays, console=console)
         try:
-            networks = networks_of(self._profile, self._given, name, mesh=self._usable_mesh, stays=stays)
+            networks = networks_of(
+                self._profile, self._given, name, mesh=self._usable_mesh, stays=stays, console=console
+            )
         except ValidationError as exc:
             raise CliError(str(exc), Exit.USAGE) from exc
         if not networks.stated and not self.on_mesh_alone:
@@ -188,6 +202,28 @@ class Network:
 
     @contextmanager
     def joined(
+        self, *, on_mesh: bool = False, source: str | None = None, stays: bool = False, in_turn: bool = False
+    ) -> Iterator[Networks]:
+        """Join the networks of the flags, or those of them that are there.
+
+        Args:
+            on_mesh: the native mesh alone.
+            source: the caller's name, as in :meth:`networks`.
+            stays: as in :meth:`networks`.
+            in_turn: as in :meth:`Networks.open`.
+
+        Raises:
+            CliError: none can be reached, all fail in use, or the flags cannot be used.
+        """
+        try:
+            with closing(self.networks(on_mesh=on_mesh, source=source, stays=stays)) as networks:
+                networks.open(in_turn=in_turn)
+                yield networks
+        except UnreachableError as refusal:
+            raise CliError(plain(f"The network does not carry this: {refusal.why}", 2000), Exit.SILENT) from refusal
+
+    @contextmanager
+    def adapter(
         self, *, on_mesh: bool = False, source: str | None = None, peer: str = "console"
     ) -> Iterator[NetworkAdapter]:
         """Join Device Connect, or the native mesh, for the length of the block.
@@ -209,6 +245,11 @@ class Network:
 
         with self.fleet(source) as fleet:
             yield DeviceConnectNetwork.joined(fleet)
+
+    def other_user(self, networks: Networks) -> str:
+        """Return who else serves robots where those of this machine meet, or ""."""
+        devices = any(each.name == DEVICE_CONNECT for each in networks.stated)
+        return other_user(self._stated.link(as_flag)) if devices else ""
 
     @property
     def _usable_mesh(self) -> bool | None:
@@ -290,13 +331,19 @@ def joined_mesh(source: str, peer_type: str) -> Iterator[NetworkAdapter]:
         yield network
 
 
+def say_missing(screen: Screen, networks: Networks) -> None:
+    """Name the networks that were asked for and cannot be reached."""
+    for name, why in networks.missing.items():
+        screen.say(plain(f"Not reached: {name}, {why}", 2000), "yellow")
+
+
 @contextmanager
-def answering(there: NetworkAdapter, robot: str, verb: str) -> Iterator[None]:
+def answering(there: Networks, robot: str, verb: str) -> Iterator[None]:
     """Ask a robot while the block runs.
 
     Raises:
-        CliError: no such robot or no answer (exit code 3), the call was refused as such (exit code 1), or was not sent
-            for its arguments (exit code 2).
+        CliError: no such robot or no answer (exit code 3), the call was refused as such, or two robots have the id
+            (exit code 1), or was not sent for its arguments (exit code 2).
     """
     from strands_robots.fleet.refusals import said  # noqa: PLC0415 - only a call needs it
 
@@ -306,10 +353,14 @@ def answering(there: NetworkAdapter, robot: str, verb: str) -> Iterator[None]:
         answer = refusal.envelope
         if isinstance(refusal, UnreachableError) and not answer:
             raise
-        reason, code = said(refusal), Exit.REFUSED if answer else Exit.SILENT
+        several = isinstance(refusal, AmbiguousRobotError)
+        reason, code = said(refusal), Exit.REFUSED if answer or several else Exit.SILENT
         fields: dict[str, Any] = {"answer": answer} if answer else {}
-        if isinstance(refusal, NoSuchRobotError) and not refusal.remedy:
-            reason += near_robots(there, robot)
+        if several:
+            reason += " Give one of them another id; --mesh means the one on the mesh."
+        elif isinstance(refusal, NoSuchRobotError):
+            reason += "" if refusal.remedy else near_robots(there, robot)
+            reason += "".join(f" Not reached: {name}, {why.rstrip('.')}." for name, why in there.missing.items())
         elif isinstance(refusal, ArgumentsError) and not answer:
             code = Exit.USAGE
         elif "jsonrpc_code" in answer:
@@ -319,19 +370,24 @@ def answering(there: NetworkAdapter, robot: str, verb: str) -> Iterator[None]:
         raise CliError(plain(reason, 2000), code, **fields) from refusal
 
 
-def call_robot(there: NetworkAdapter, robot: str, verb: str, params: Mapping[str, Any], seconds: float) -> Envelope:
+def call_robot(
+    there: Networks, robot: str, verb: str, params: Mapping[str, Any], seconds: float, *, moves: bool = False
+) -> Envelope:
     """Call a verb of a robot and return its answer; raises as :func:`answering`."""
     with answering(there, robot, verb):
-        return there.call(robot, verb, params, seconds)
+        return there.call(robot, verb, params, seconds, moves=moves)
 
 
-def near_robots(there: NetworkAdapter, robot: str) -> str:
+def near_robots(there: Networks | NetworkAdapter, robot: str) -> str:
     """Return a sentence with the ids that resemble an absent one."""
-    names = [each.id for each in there.find(1.0)]
+    try:
+        names = [each if isinstance(each, str) else each.id for each in there.find(1.0)]
+    except RefusalError:
+        return ""
     return "" if robot in names else near(robot, names)
 
 
-def _near_verbs(there: NetworkAdapter, robot: str, verb: str) -> str:
+def _near_verbs(there: Networks, robot: str, verb: str) -> str:
     """Return a sentence with the verbs of a robot that resemble an absent one."""
     from strands_robots.serving.advertised import verb_names  # noqa: PLC0415 - only a refusal needs it
 

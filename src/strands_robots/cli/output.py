@@ -192,15 +192,6 @@ def table(title: str, columns: Sequence[str], rows: Iterable[Sequence[object]]) 
     return result
 
 
-def with_tags(
-    columns: Sequence[str], rows: Sequence[Sequence[object]], tags: Sequence[Sequence[str]]
-) -> tuple[Sequence[str], Sequence[Sequence[object]]]:
-    """Return a table's columns and rows with the robots' tags, where one has any."""
-    if not any(tags):
-        return columns, rows
-    return (*columns, "tags"), [(*row, ", ".join(each)) for row, each in zip(rows, tags, strict=True)]
-
-
 @contextmanager
 def progress_bar(screen: Screen, seconds: float | None, title: str = "playing") -> Iterator[Callable[[float], None]]:
     """Yield a function that moves a progress bar; without a terminal it does nothing."""

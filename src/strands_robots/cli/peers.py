@@ -4,27 +4,37 @@ from __future__ import annotations
 
 import json
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Annotated, Any
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import typer
 from rich.text import Text
 
 from strands_robots.cli.command import OnMesh, Timeout, assignments, command
-from strands_robots.cli.network import Network, answering
-from strands_robots.cli.output import LATE_S, CliError, Exit, Screen, label, plain, readable, table, with_tags
-from strands_robots.cli.readiness import other_user
+from strands_robots.cli.network import Network, answering, say_missing
+from strands_robots.cli.output import LATE_S, CliError, Exit, Screen, label, plain, readable, table
 from strands_robots.envelope import is_error, text_of
-from strands_robots.fleet.callers import SOURCE, TOOL
-from strands_robots.serving.known_verbs import QUICK, TEXTS, VERBS, WAITING
-from strands_robots.utils import WAIT_S, ValidationError, device_id, number
+from strands_robots.fleet.adapter import FIND_S
+from strands_robots.fleet.callers import SOURCE
+from strands_robots.fleet.networks import STILL
+from strands_robots.serving.known_verbs import QUICK, STOPS, TEXTS, VERBS, WAITING
+from strands_robots.utils import WAIT_S, ValidationError, identifier, number
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
+    from strands_robots.envelope import Envelope
     from strands_robots.fleet.adapter import FoundRobot, NetworkAdapter
+    from strands_robots.fleet.networks import Networks
     from strands_robots.serving.advertised import AdvertisedVerb
 
+    Send = Callable[[str, str, Mapping[str, Any], float], Envelope]
+
 LEASE_ID = "lease_id"
+
+GRAVE = ("estop_unheard", "distrusted", "locked")
+"""Facts of a peer that are shown before those of the same robot on another network."""
 
 CALL_S = 10.0
 MOTION_S = CALL_S + WAIT_S
@@ -41,35 +51,83 @@ def peers(
     screen: Screen,
     network: Network,
     device: Annotated[str | None, typer.Argument(help="List the functions of this one.")] = None,
-    timeout: Timeout = 2.0,
+    timeout: Timeout = FIND_S,
     on_mesh: OnMesh = False,
 ) -> None:
-    """List the robots on the network, or what one of them can do."""
+    """List the robots in reach, or what one of them can do. With --mesh also peers without a robot."""
     seconds = number("--timeout", timeout, above=0, high=60)
-    wanted = None if device is None else device_id("DEVICE", device)
+    wanted = None if device is None else identifier("DEVICE", device)
     with network.joined(on_mesh=on_mesh) as there:
-        found = [each for each in there.listed(seconds) if wanted in (None, each.id)]
-        functions = there.describe(wanted) if wanted is not None and found else None
-    whose = _whose(network, on_mesh=on_mesh)
-    if not found:
+        listed = there.listed(seconds) if on_mesh else there.find(seconds)
+        rows = [_Row.of(*listed[name], there.bearers(name)) for name in sorted(listed) if wanted in (None, name)]
+        functions = there.describe(wanted) if wanted is not None and rows else None
+        reach, stale, whose = there.reach, there.stale, network.other_user(there)
+    say_missing(screen, there)
+    facts = {"stale": stale, "absent": there.missing}
+    if not rows:
         who = "No robot" if device is None else f"No {device!r}"
         absent = "No peer is on the mesh of this machine." if on_mesh and device is None else f"{who} answered."
-        where = "" if on_mesh else f"{there.reach} {whose}"
-        raise CliError(f"{absent} {where}".rstrip(), Exit.SILENT, peers=[], stale=there.stale)
-    screen.data({"status": "success", "peers": [each.facts for each in found], "stale": there.stale, "whose": whose})
+        raise CliError(f"{absent} {'' if on_mesh else f'{reach} {whose}'}".rstrip(), Exit.SILENT, peers=[], **facts)
+    screen.data({"status": "success", "peers": [each.facts for each in rows], **facts, "whose": whose})
     if whose:
         screen.say(whose, "yellow")
     if device is not None:
-        _show_functions(screen, found[0], functions)
+        _show_functions(screen, rows[0].robot, functions)
         return
-    if on_mesh:
-        named, kind, shown = "peer", "host", [str(each.facts.get("hostname", "")) for each in found]
-    else:
-        named, kind, shown = "device", "model", [each.model for each in found]
-    rows = [(each.id, each.type, one, _status(each), _age(each)) for each, one in zip(found, shown, strict=True)]
-    heads = (named, "type", kind, "status", "last heard")
-    screen.show(table("", *with_tags(heads, rows, [each.tags for each in found])))
+    heads, cells = _columns(rows)
+    screen.show(table("", heads, cells))
     screen.say("peers DEVICE, with the same flags, lists what it can do.")
+
+
+@dataclass(frozen=True, slots=True)
+class _Row:
+    """One robot.
+
+    Attributes:
+        robot: as the network has it on which it is called.
+        gravest: as the network has it on which it is locked, or receives no stops.
+        networks: names of those that have it, the one that it is called on first.
+    """
+
+    robot: FoundRobot
+    gravest: FoundRobot
+    networks: Sequence[str]
+
+    @classmethod
+    def of(cls, robot: FoundRobot, network: NetworkAdapter, bearers: Sequence[NetworkAdapter]) -> Self:
+        others = [each for each in bearers if each is not network]
+        known = [robot, *(each.known(robot.id) for each in others)]
+        gravest = next((each for each in known if any(each.facts.get(name) for name in GRAVE)), robot)
+        return cls(robot, gravest, [network.name, *(each.name for each in others)])
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """Facts for programs."""
+        robot = self.robot
+        return {
+            **robot.facts,
+            **{"id": robot.id, "type": robot.type, "model": robot.model},
+            "age_s": None if robot.age_s is None else round(robot.age_s, 3),
+            **{"network": self.networks[0], "also_on": self.networks[1:]},
+        }
+
+
+def _columns(rows: Sequence[_Row]) -> tuple[Sequence[str], Sequence[Sequence[object]]]:
+    """Return heads and rows; a column that says nothing is left out."""
+    networks = {name for row in rows for name in row.networks}
+    shown: dict[str, list[Any]] = {
+        "peer": [row.robot.id for row in rows],
+        "type": [row.robot.type for row in rows],
+        "model": [row.robot.model for row in rows],
+        "host": [str(row.robot.facts.get("hostname", "")) for row in rows],
+        "status": [_status(row.gravest) for row in rows],
+        "last heard": [_age(row.robot) for row in rows],
+        "network": [", ".join(row.networks) for row in rows],
+        "tags": [", ".join(row.robot.tags) for row in rows],
+    }
+    told = {"host": any(shown["host"]), "network": len(networks) > 1, "tags": any(shown["tags"])}
+    heads = [name for name in shown if told.get(name, True)]
+    return heads, list(zip(*(shown[name] for name in heads), strict=True))
 
 
 def call(
@@ -88,34 +146,39 @@ def call(
 ) -> None:
     """Call a function of a device, or list its functions.
 
-    A value is read as the function's description has it; without one as JSON where that is possible, else as text.
+    A value is read as the function's description has it; without one as JSON where that is possible, else as text. Of
+    two robots of one id on both networks none is moved, unless one of them is enrolled: exit 1.
     """
     given = arguments or []
     params = assignments(given)
     stated = None if timeout is None else number("--timeout", timeout, above=0, high=3600)
-    if on_mesh and function is None:
-        raise CliError("call --mesh takes a function, such as status.", Exit.USAGE)
     flags = f"{' --mesh' if on_mesh else ''}{network.flags}"
-    with network.joined(on_mesh=on_mesh, source=source, peer=TOOL) as there:
+    with network.joined(on_mesh=on_mesh, source=source, in_turn=function in STILL - STOPS) as there:
         try:
             with answering(there, device, function or ""):
                 if function is None:
                     _list_functions(screen, there, device)
                     return
-                verb = there.verb(device, function) if _needs_description(function, given, params) else None
+                send: Send = partial(there.call, moves=function not in STILL)
+                verb: AdvertisedVerb | None = None
+                # A stop of several networks waits for no description.
+                several = function in STOPS and len(there.stated) > 1
+                if not several and _needs_description(function, given, params):
+                    place, verb = there.described(device, function)
+                    send = place.call
                 params = _typed(verb, given, params)
                 seconds = stated or _wait(function, verb)
                 with _interruptible(f"strands-robots stop {device}{flags}", lambda: _moves(function, verb)):
-                    answer = there.call(device, function, params, seconds)
+                    answer = send(device, function, params, seconds)
         except CliError as failure:
             if failure.code in (Exit.INTERRUPTED, Exit.USAGE):
                 raise
-            reason = f"{failure.reason} {_whose(network, on_mesh=on_mesh)}".rstrip()
+            reason = f"{failure.reason} {network.other_user(there)}".rstrip()
             raise CliError(reason, failure.code, **failure.fields) from failure
     if is_error(answer):
         reason = text_of(answer) or f"{device} refused {function}."
-        whose = _whose(network, on_mesh=on_mesh)
-        raise CliError(plain(f"{reason} {whose}".rstrip(), 2000), Exit.REFUSED, answer=answer)
+        code = Exit.SILENT if answer.get("stopped", ...) is None else Exit.REFUSED
+        raise CliError(plain(f"{reason} {network.other_user(there)}".rstrip(), 2000), code, answer=answer)
     screen.data(answer)
     screen.say(readable(text_of(answer)) or f"{device} answered {function}.", "green")
     for key, value in readable(answer).items():
@@ -179,15 +242,10 @@ def _typed(verb: AdvertisedVerb | None, given: Sequence[str], params: Mapping[st
     return {**params, **given_types, **leased}
 
 
-def _list_functions(screen: Screen, there: NetworkAdapter, device: str) -> None:
+def _list_functions(screen: Screen, there: Networks, device: str) -> None:
     functions = there.describe(device, anew=True)
     screen.data({"status": "success", "device": device, "functions": functions})
     _show_functions(screen, there.known(device), functions)
-
-
-def _whose(network: Network, *, on_mesh: bool) -> str:
-    """Return whose robots answer on Device Connect, where that is another user."""
-    return "" if on_mesh else other_user(network.link())
 
 
 def _status(robot: FoundRobot) -> str | Text:

@@ -2,29 +2,32 @@
 
 from __future__ import annotations
 
-import base64
 import contextlib
+import logging
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from strands_robots.cli.command import Seconds, command
-from strands_robots.cli.network import Network, mesh_peer, temporary_mesh_id
+from strands_robots.cli.network import Network, say_missing
 from strands_robots.cli.output import CliError, Exit, Screen, progress_bar, table
+from strands_robots.errors import RefusalError
+from strands_robots.fleet.adapter import EVERY, Detail
 from strands_robots.recording.cameras import chosen_frames
-from strands_robots.recording.file import STEP, Recorder
+from strands_robots.recording.file import Recorder
 from strands_robots.recording.sampling import RobotRecording
 from strands_robots.utils import identifier, number
 
 if TYPE_CHECKING:
-    from strands_robots.mesh import Mesh
+    from strands_robots.fleet.adapter import NetworkAdapter, RobotEvent
+    from strands_robots.fleet.networks import Networks
 
-EVERY_DEVICE = "*"
+logger = logging.getLogger(__name__)
+
 NO_CAMERAS = "none"
 _POLL_S = 0.2
 
@@ -42,32 +45,25 @@ def record(
     out: Annotated[Path, typer.Option("--out", help="A new .mcap file.")],
     seconds: Seconds = None,
     on_mesh: Annotated[
-        bool, typer.Option("--mesh", help="Peers of the native mesh instead: states, steps, pictures, stops.")
+        bool, typer.Option("--mesh", help="Peers of the native mesh alone: states, steps, pictures, stops.")
     ] = False,
 ) -> None:
     """Write every event of some devices into an MCAP file until Ctrl-C: joints, actions, tasks, stops."""
     longest = None if seconds is None else number("--for", seconds, above=0, high=24 * 3600)
+    wanted = [each if each == EVERY else identifier("DEVICE", each) for each in devices]
     recorder = Recorder(out)
     with ExitStack() as stack:
-        if on_mesh:
-            network.use_mesh()
-            mesh = stack.enter_context(mesh_peer(None, temporary_mesh_id("record"), "tool"))
-        else:
-            fleet = stack.enter_context(network.fleet())
+        there = stack.enter_context(network.joined(on_mesh=on_mesh, stays=True))
         stack.enter_context(recorder)
-        for device in devices:
-            if on_mesh:
-                _record_peer(mesh, device, recorder)
-            else:
-                stack.enter_context(
-                    fleet.subscription(device, lambda event: recorder.take(event.device, event.name, event.payload))
-                )
+        there.on_joined(lambda joined: _record_network(there, joined, wanted, recorder))
+        there.settled()
+        say_missing(screen, there)
         screen.say(f"Recording {', '.join(devices)} into {out}. Ctrl-C ends it.")
         with contextlib.suppress(KeyboardInterrupt):
             _wait(screen, recorder, longest)
     if not recorder.counts:
         out.unlink()
-        who = "any device" if EVERY_DEVICE in devices else ", ".join(devices)
+        who = "any device" if EVERY in devices else ", ".join(devices)
         raise CliError(f"No message of {who} arrived; nothing was recorded.", Exit.SILENT)
     _summarize(screen, recorder)
     _check_lossless(recorder)
@@ -107,28 +103,23 @@ def record_robot(
     _check_lossless(recorder)
 
 
-def _record_peer(mesh: Mesh, peer: str, recorder: Recorder) -> None:
-    """Record what a peer of the mesh publishes; ``*`` is every peer."""
-    who = peer if peer == EVERY_DEVICE else identifier("DEVICE", peer)
+def _record_network(there: Networks, network: NetworkAdapter, devices: Sequence[str], recorder: Recorder) -> None:
+    """Record what devices publish, each on the first network that has it."""
 
-    def take(key: str, body: dict[str, Any]) -> None:
-        _, name, topic, *rest = key.split("/")
-        if topic == "camera":
-            # A message that is no picture is recorded like any other.
-            with contextlib.suppress(TypeError, ValueError):
-                recorder.take_picture(name, rest[0], base64.b64decode(body.get("data", ""), validate=True))
-                return
-        recorder.take(name, STEP if topic == "stream" else "_".join([topic, *rest]), body)
+    def take(event: RobotEvent) -> None:
+        first, *_ = [*there.bearers(event.robot), network]
+        if first is not network:
+            return
+        if event.picture is not None:
+            recorder.take_picture(event.robot, event.part, event.picture)
+        else:
+            recorder.take(event.robot, event.name, event.payload)
 
-    for part in ("state", "stream", "camera/*", "safety/event"):
-        mesh.subscribe(f"strands/{who}/{part}", take, name=f"record {who} {part}")
-    for part in ("estop", "resume"):
-        mesh.subscribe(f"strands/safety/{part}", partial(_take_fleet_message, recorder, part), name=f"record {part}")
-
-
-def _take_fleet_message(recorder: Recorder, part: str, key: str, body: dict[str, Any]) -> None:
-    """Record a message to every peer under the name of its sender."""
-    recorder.take(str(body.get("peer_id") or "mesh"), "emergencyStop" if part == "estop" else part, body)
+    for device in devices:
+        try:
+            network.subscribe(device, take, Detail.ALL)
+        except RefusalError as exc:
+            logger.warning("%s is not recorded on %s: %s", device, network.name, exc)
 
 
 def _wait(screen: Screen, recorder: Recorder, seconds: float | None) -> None:

@@ -10,17 +10,18 @@ import typer
 
 from strands_robots.cli.command import OnMesh, Timeout, command
 from strands_robots.cli.keys import PassphraseFile, signing_key
-from strands_robots.cli.network import Network
+from strands_robots.cli.network import Network, say_missing
 from strands_robots.cli.output import CliError, Exit, Screen, label, plain, table
 from strands_robots.cli.readiness import state_problem
+from strands_robots.fleet.all_lockouts import ask_lockouts, by_robot, resume_all, unheard_in
 from strands_robots.fleet.lockout_report import LockoutReport
 from strands_robots.safety.approval import GRANT_S, Grants
 from strands_robots.safety.clearance import clear_here
 from strands_robots.safety.lockout import Lockout, utc
 from strands_robots.safety.persistence import LockoutStore, StoredLockout
-from strands_robots.safety.unheard import Unheard, unheard_now, unheard_since
+from strands_robots.safety.unheard import Unheard, unheard_since
 from strands_robots.state_files import state_dir
-from strands_robots.utils import device_id, number, operator
+from strands_robots.utils import identifier, number, operator
 
 THEN = "They move again when they get a new command."
 
@@ -54,21 +55,25 @@ def resume(
     if local == (key is not None):
         raise CliError("resume takes --key FILE, or --local at the robot's own machine.", Exit.USAGE)
     names = [part for each in (*(devices or []), *(targets or [])) for part in each.split(",") if part]
-    wanted = [device_id("DEVICE", each) for each in names]
+    wanted = [identifier("DEVICE", each) for each in names]
     if key is None:
         _clear_locally(screen, wanted)
         return
     seconds = number("--timeout", timeout, above=0, high=60)
     signer = signing_key(key, passphrase_file)
     with network.joined(on_mesh=on_mesh) as there:
-        asked = there.lockouts([*wanted, *there.lockable()], seconds)
-        if not asked:
-            raise CliError(f"No robot answered. {there.reach}", Exit.SILENT, devices={})
+        reports = ask_lockouts(there, seconds, besides=wanted)
+        found = by_robot(reports)
+        if not found:
+            raise CliError(f"No robot answered. {there.reach}", Exit.SILENT, devices={}, absent=there.missing)
         # They are named before others move again.
-        unheard = unheard_now(there.key, {each.name for each in asked if not each.problem})
+        unheard = unheard_in(reports)
         _warn(screen, unheard)
-        outcome = there.resume([each for each in asked if not wanted or each.name in wanted], signer, seconds)
-    _report(screen, outcome, unheard, THEN)
+        outcome = dict.fromkeys((name for name in wanted if name not in found), (False, "no such robot is in reach"))
+        if len(outcome) < len(wanted) or not wanted:
+            outcome |= resume_all(reports, signer, seconds, robots=[name for name in wanted if name in found])
+    say_missing(screen, there)
+    _report(screen, outcome, unheard, THEN, absent=there.missing)
 
 
 def lockout(
@@ -85,11 +90,14 @@ def lockout(
     """
     seconds = number("--timeout", timeout, above=0, high=60)
     stored, live, note, stale = _stored_lockouts(), list[LockoutReport](), "", ""
+    missing: dict[str, str] = {}
     if not local:
         try:
             with network.joined(on_mesh=on_mesh) as there:
-                live = there.lockouts(there.lockable(seconds), seconds)
+                live = list(by_robot(ask_lockouts(there, seconds, look_s=seconds)).values())
                 stale = there.stale
+            missing = there.missing
+            say_missing(screen, there)
             note = "" if live else "No robot answered on the network. "
         except CliError as failure:
             if failure.code is Exit.USAGE:
@@ -105,13 +113,14 @@ def lockout(
             "status": "success",
             "live": {
                 each.name: {
-                    "locked": None if each.problem else bool(each.lockouts),
+                    "locked": True if each.lockouts else None if each.problem else False,
                     "holds": [lockout.fields() for lockout in each.lockouts],
                 }
                 for each in live
             },
             "kept": {name: [lockout.fields() for lockout in lockouts] for name, lockouts in stored.items()},
             "stale": stale,
+            "absent": missing,
         }
     )
     if cells:
@@ -201,11 +210,11 @@ def _unheard_here(names: list[str]) -> Unheard:
         return Unheard(problem=unreadable.reason.rstrip("."))
 
 
-def _report(screen: Screen, outcome: dict[str, tuple[bool, str]], unheard: Unheard, then: str) -> None:
+def _report(screen: Screen, outcome: dict[str, tuple[bool, str]], unheard: Unheard, then: str, **more: object) -> None:
     marks = {True: label("free", "green"), False: label("LOCKED", "bold red")}
     screen.show(table("", ("robot", "", "what it said"), ((n, marks[ok], said) for n, (ok, said) in outcome.items())))
     devices = {name: {"free": ok, "said": said} for name, (ok, said) in outcome.items()}
-    facts = {"devices": devices, "unheard": list(unheard.names), "unheard_problem": unheard.problem}
+    facts = {"devices": devices, "unheard": list(unheard.names), "unheard_problem": unheard.problem, **more}
     locked = [name for name, (ok, _) in outcome.items() if not ok]
     if locked:
         raise CliError(plain(f"Not resumed: {', '.join(locked)}.", 2000), Exit.REFUSED, **facts)

@@ -20,21 +20,20 @@ from rich.text import Text
 
 from strands_robots.cli.command import OnMesh, command
 from strands_robots.cli.keys import PassphraseFile, signing_key
-from strands_robots.cli.network import Network, mesh_peer
+from strands_robots.cli.network import Network
 from strands_robots.cli.output import CliError, Exit, Screen, captured_log, label, table
 from strands_robots.cli.stop_report import LATE_MS, SLOW_MS, outcome_lines, style_of, summary
-from strands_robots.fleet.adapter import NetworkAdapter
-from strands_robots.fleet.device_connect.network import DeviceConnectNetwork
 from strands_robots.fleet.lockout_report import LockoutReport
-from strands_robots.fleet.mesh.network import MeshNetwork
-from strands_robots.fleet.stop_button import StopButton, StopButtons, StopSender
-from strands_robots.fleet.watched_robots import BEAT_FRESH_S, GONE_S, Join, WatchedRobots
+from strands_robots.fleet.safety_console import SafetyConsole
+from strands_robots.fleet.stop_button import StopButton
+from strands_robots.fleet.watched_robots import BEAT_FRESH_S, GONE_S
 from strands_robots.safety.answers import Answer
 from strands_robots.safety.lockout import utc
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.utils import device_id, number
 
 DRAW_S = 0.1
+COLUMNS = ("lockout", "since, by whom", "last stop", "status", "last seen", "check-in")
 
 
 def register(app: typer.Typer) -> None:
@@ -57,7 +56,10 @@ def safety_controller(
     passphrase_file: PassphraseFile = None,
     on_mesh: OnMesh = False,
 ) -> None:
-    """Stop every robot at once with the SPACE bar; show each robot, its lockout, answers and check-in."""
+    """Stop every robot on every network at once with the SPACE bar.
+
+    The screen shows each robot, its lockout, answers and check-in.
+    """
     if not (screen.live and sys.stdin.isatty()):
         raise CliError(
             "safety-controller needs a terminal, for its keys and its screen; in a script use strands-robots estop.",
@@ -65,57 +67,37 @@ def safety_controller(
         )
     source = device_id("--id", source)
     every = None if check_in is None else number("--check-in", check_in, low=0.02, high=60)
-    with contextlib.ExitStack() as stack:
-        if on_mesh:
-            network.use_mesh()
-            signer = None if key is None else signing_key(key, passphrase_file)
-            there: NetworkAdapter = MeshNetwork.joined(stack.enter_context(mesh_peer(None, source, "controller")))
-            join = lambda: there  # noqa: E731 - the one peer has this id
-        else:
-            link = network.link()
-            signer = None if key is None else signing_key(key, passphrase_file)
-            there, join = DeviceConnectNetwork(link, source), lambda: _opened(DeviceConnectNetwork(link, source))
-        watched: list[FleetScreen] = []
-        known = lambda: watched[0].known() if watched else ()  # noqa: E731 - asked later, on another thread
-        controller = stack.enter_context(there.standing(signer, known))
-        watched.append(FleetScreen(controller, join, every))
-        if every is not None:
-            controller.check_in_every(every)
-        _run(screen, controller, watched[0], reason)
+    networks = network.networks(on_mesh=on_mesh, source=source, stays=True, console=True)
+    signer = None if key is None else signing_key(key, passphrase_file)
+    with contextlib.closing(SafetyConsole(networks, signer, reason, every)) as console:
+        _run(console, ConsoleScreen(console, source, every), screen)
     screen.say(f"{source} is off. The robots it stopped stay locked.")
 
 
-def _opened(network: NetworkAdapter) -> NetworkAdapter:
-    network.open()
-    return network
-
-
-def _run(screen: Screen, controller: StopSender, fleet: FleetScreen, reason: str) -> None:
+def _run(console: SafetyConsole, robots: ConsoleScreen, screen: Screen) -> None:
     from rich.live import Live  # noqa: PLC0415 - loaded when a screen is redrawn
 
     done = threading.Event()
-    buttons = StopButtons(lambda scope: StopButton(controller, lambda: fleet.expected(scope), reason, scope))
 
     def pressed(key: str) -> None:
         if key == " ":
-            buttons.press()
+            console.press()
         elif key in "jk":
-            fleet.choose(1 if key == "j" else -1)
+            robots.choose(1 if key == "j" else -1)
         elif key in "oc":
-            buttons.press(fleet.chosen_scope(cell=key == "c"))
+            console.press(robots.chosen_scope(cell=key == "c"))
         elif key in "qQ":
             done.set()
         elif key in "fF":
-            fleet.forget()
+            console.forget()
 
-    with captured_log() as lines, fleet.polling(), _keys(pressed, done.set):
-        try:
-            with Live(fleet.draw(buttons.latest, lines), console=screen.out, screen=True, auto_refresh=False) as live:
-                while not done.wait(DRAW_S):
-                    buttons.review()
-                    live.update(fleet.draw(buttons.latest, lines), refresh=True)
-        finally:
-            buttons.close()
+    with captured_log() as lines, _keys(pressed, done.set):
+        # The keys count from now on, whatever the networks do.
+        console.open()
+        with Live(robots.draw(lines), console=screen.out, screen=True, auto_refresh=False) as live:
+            while not done.wait(DRAW_S):
+                console.buttons.review()
+                live.update(robots.draw(lines), refresh=True)
 
 
 @contextmanager
@@ -145,57 +127,79 @@ def _keys(pressed: Callable[[str], None], closed: Callable[[], None]) -> Iterato
             termios.tcsetattr(terminal, termios.TCSADRAIN, before)
 
 
-class FleetScreen(WatchedRobots):
-    """Table of the watched robots, with one that is chosen.
+class ConsoleScreen:
+    """Table of the robots that a console watches, with one that is chosen.
 
     Args:
-        controller: whose link and id are shown.
-        join: joins the network that is polled.
-        check_in_s: seconds between the controller's check-ins, or None.
+        console: whose robots and links are shown.
+        source: its name.
+        check_in_s: seconds between its check-ins, or None.
     """
 
-    def __init__(self, controller: StopSender, join: Join, check_in_s: float | None) -> None:
-        super().__init__(join)
-        self._controller, self._check_in_s = controller, check_in_s
-        self._chosen = ""
+    def __init__(self, console: SafetyConsole, source: str, check_in_s: float | None) -> None:
+        self._console, self._source, self._check_in_s = console, source, check_in_s
+        self._chosen = ("", "")
 
     def choose(self, step: int) -> None:
         """Choose the next robot of the table, or the one before."""
-        names = sorted(self.reports)
-        if names:
-            at = names.index(self._chosen) + step if self._chosen in names else min(step, 0)
-            self._chosen = names[at % len(names)]
+        robots = sorted(self._reports())
+        if robots:
+            at = robots.index(self._chosen) + step if self._chosen in robots else min(step, 0)
+            self._chosen = robots[at % len(robots)]
 
     def chosen_scope(self, *, cell: bool) -> Scope:
         """Return the scope of the chosen robot, or of its cell; every robot without one."""
-        last = self.reports.get(self._chosen)
+        last = self._reports().get(self._chosen)
         if last is None:
             return EVERY_ROBOT
         return Scope.read({"cell": last.facts.get("cell")}) if cell else Scope.named([last.name])
 
-    def draw(self, button: StopButton, log: Collection[str]) -> RenderableType:
+    def draw(self, log: Collection[str]) -> RenderableType:
         """Return the whole screen."""
-        up = self._controller.link_up
-        head = f"{self._controller.controller_id}: the stop link is {'up' if up else 'DOWN'}"
+        console, links = self._console, self._console.links
+        head = f"{self._source}: the stop link is {_link_state(links)}"
         if self._check_in_s is not None:
             head += f"; checks in every {self._check_in_s:g} s"
-        answers = button.progress.answered if button.progress is not None else {}
-        columns = ("robot", "lockout", "since, by whom", "last stop", "status", "last seen", "check-in")
-        robots = sorted(self.reports.items())
-        silent = self.unanswered
-        rows = (
-            _row(name, last, self.seen_at(last), name in silent, answers.get(name), chosen=name == self._chosen)
-            for name, last in robots
-        )
+        reports = self._reports()
+        several = len({network for _, network in reports}) > 1
+        columns = ("robot", *(["network"] if several else []), *COLUMNS)
+        rows = [
+            (first, *([network] if several else []), *others)
+            for (name, network), last in sorted(reports.items())
+            for first, *others in [self._row(name, network, last)]
+        ]
+        up = bool(links) and all(links.values())
+        said = [f"{name}: {why}" for name, why in console.absent.items() if name in links]
+        said += [each.problem for each in console.watched.values() if each.problem]
+        said += [] if rows or said else ["No robot is on the network yet."]
         return Group(
             label(head, "bold green" if up else "bold white on red"),
             label("SPACE stops everything    f forgets robots that are gone    q quits", "bold"),
             label("j k choose a robot    o stops that one alone    c stops its cell, and robots without one"),
             table("", columns, rows),
-            *([label(self.problem, "yellow")] if self.problem else []),
-            _outcome(button),
+            *(label(each, "yellow") for each in said),
+            *_outcomes(console.buttons.latest, links),
             *(label(line, "red") for line in log),
         )
+
+    def _reports(self) -> dict[tuple[str, str], LockoutReport]:
+        """Return the last report of each robot, by its name and its network."""
+        watched = self._console.watched.items()
+        return {(name, network): last for network, each in watched for name, last in each.reports.items()}
+
+    def _row(self, name: str, network: str, last: LockoutReport) -> tuple[Any, ...]:
+        watched, button = self._console.watched[network], self._console.buttons.latest.get(network)
+        answers = button.progress.answered if button is not None and button.progress is not None else {}
+        chosen = (name, network) == self._chosen
+        seen_at, silent = watched.seen_at(last), name in watched.unanswered
+        return _row(name, last, seen_at, silent, answers.get(name), chosen=chosen)
+
+
+def _link_state(links: Mapping[str, bool]) -> str:
+    states = {name: "up" if up else "DOWN" for name, up in links.items()}
+    if len(states) < 2:
+        return next(iter(states.values()), "DOWN")
+    return ", ".join(f"{state} on {name}" for name, state in states.items())
 
 
 def _row(
@@ -243,22 +247,33 @@ def _check_in_cell(state: object) -> Text | str:
     return label(f"{seconds:.1f} s left", "" if seconds > 0 else "bold red")
 
 
-def _outcome(button: StopButton) -> Text:
+def _outcomes(buttons: Mapping[str, StopButton], links: Mapping[str, bool]) -> list[Text]:
+    """Return what came of the latest press on each network that has a link or robots."""
+    shown = {
+        name: each
+        for name, each in buttons.items()
+        if name in links or (each.outcome is not None and each.outcome.size)
+    }
+    return [line for name, each in shown.items() for line in _outcome(each, f"On {name}: " if len(shown) > 1 else "")]
+
+
+def _outcome(button: StopButton, where: str) -> list[Text]:
     if button.running and button.progress is not None:
         silent = button.progress.unconfirmed
         waiting = f"; unconfirmed: {', '.join(silent)}" if silent else ""
         link = "" if button.progress.link_up else "; THE LINK IS DOWN, the stop leaves when it is back"
         elapsed = button.progress.elapsed_ms
         age = f", pressed {elapsed / 1000:.1f} s ago" if elapsed > LATE_MS else ""
-        return label(f"STOPPING{age}: {len(button.progress.answered)} answered{waiting}{link}", "bold red")
+        return [label(f"{where}STOPPING{age}: {len(button.progress.answered)} answered{waiting}{link}", "bold red")]
     if button.report is None:
-        return label("")
+        return []
     outcome = button.outcome
     report = button.report if outcome is None else outcome.report
     reasons = {} if outcome is None else outcome.reasons
     missing = [f"{name}{f' ({reasons[name]})' if name in reasons else ''}" for name in report.silent]
     silent_names = f" No answer: {', '.join(missing)}." if missing else ""
     alarms = " ".join(f" ALARM: {name}: {why}." for name, why in report.alarms.items())
-    told = "" if outcome is None else f"\n{' '.join([outcome.sentence, *outcome_lines(outcome)])}"
+    lines = [f"{where}{summary(report)}{silent_names}{alarms}"]
+    lines += [] if outcome is None else [" ".join([outcome.sentence, *outcome_lines(outcome)])]
     doubtful = alarms or (outcome is not None and outcome.problems)
-    return label(f"{summary(report)}{silent_names}{alarms}{told}", "bold red" if doubtful else style_of(report))
+    return [label(line, "bold red" if doubtful else style_of(report)) for line in lines]

@@ -6,7 +6,7 @@ import shlex
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, wait
-from contextlib import closing, contextmanager, nullcontext, suppress
+from contextlib import closing, contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,7 +15,7 @@ import typer
 
 from strands_robots.cli.command import OnMesh, Timeout, command
 from strands_robots.cli.keys import PassphraseFile, operator_key, signing_key
-from strands_robots.cli.network import Network
+from strands_robots.cli.network import Network, near_robots, say_missing
 from strands_robots.cli.output import POLL_S, CliError, Exit, Screen, captured_log, label, plain, table
 from strands_robots.cli.readiness import meeting_user
 from strands_robots.cli.stop_report import (
@@ -27,8 +27,9 @@ from strands_robots.cli.stop_report import (
     say_outcome,
     stop_table,
 )
-from strands_robots.envelope import Envelope
+from strands_robots.envelope import Envelope, error
 from strands_robots.errors import RefusalError
+from strands_robots.fleet.adapter import NetworkAdapter
 from strands_robots.fleet.all_stops import estop_all, stop_all
 from strands_robots.fleet.callers import SOURCE, TOOL
 from strands_robots.fleet.fleet_verdict import FleetVerdict, NetworkVerdict
@@ -37,7 +38,7 @@ from strands_robots.fleet.stop_answers import combined_verdict, not_reached, ros
 from strands_robots.safety.controller import DEADLINE_S, Progress
 from strands_robots.safety.stop_roster import StopOutcome
 from strands_robots.serving.stop_arguments import robot_of_world, stop_reason, stop_robot, stop_scope
-from strands_robots.utils import ValidationError, device_id, near, number
+from strands_robots.utils import ValidationError, device_id, number
 
 LOCKED = "They are locked until they are resumed:"
 LOCKED_THERE = "They are locked until they are resumed, at the machine of each robot:"
@@ -293,8 +294,9 @@ def _report(
     for each in verdict.reporting:
         if each is not first:
             known[each.network] = {name: every.stopped for name, every in each.verdicts().items()}
-    stated = {each.name for each in networks.stated}
-    known |= _say_absent(screen, {each.network: each.absent for each in verdict.unreached if each.network in stated})
+    known["absent"] = networks.missing
+    if len(networks.stated) > 1:
+        say_missing(screen, networks)
     if failed:
         worst = Exit.REFUSED if any(code is Exit.REFUSED for code, _ in failed) else Exit.SILENT
         raise CliError(plain(" ".join(said for _, said in failed), 2000), worst, **known)
@@ -307,18 +309,10 @@ def _why(networks: Networks, each: NetworkVerdict, outcome: StopOutcome) -> str:
     said = failure(outcome)
     if each.absent and not outcome.problems:
         said = f"The network does not carry this: {each.absent.rstrip('.')}. {said}"
-    there = next((network for network in networks.stated if network.name == each.network), None)
+    there = _usable(networks, each.network)
     if there is not None and not (outcome.size and outcome.report.link):
         said = f"{said} {there.reach}"
-    return said if there is networks.stated[0] else f"On {each.network}: {said}"
-
-
-def _say_absent(screen: Screen, absent: Mapping[str, str]) -> dict[str, Any]:
-    """Say which stated networks were not reached; return that for programs."""
-    reasons = {name: why for name, why in absent.items() if why}
-    for name, why in reasons.items():
-        screen.say(f"{name} was not reached: {plain(why, 300).rstrip('.')}.", "yellow")
-    return {"absent": reasons} if reasons else {}
+    return said if each.network == networks.stated[0].name else f"On {each.network}: {said}"
 
 
 def _warn(screen: Screen, outcome: StopOutcome) -> None:
@@ -345,50 +339,57 @@ def _report_one(screen: Screen, networks: Networks, device: str, robot: str, ans
         robot: its name in the report.
         answers: by network.
     """
-    absent = {each.name: networks.absent.get(each.name, "") for each in networks.stated}
     if not networks.joined:
-        why = next(iter(absent.values())) if len(absent) == 1 else networks.absences
-        raise CliError(plain(f"The network does not carry this: {why.rstrip('.')}.", 2000), Exit.SILENT, stopped=None)
-    graded, remembered = dict[str, tuple[bool | None, str]](), False
-    for each in networks.stated:
-        if each.name in answers:
-            stopped, said = stop_outcome(answers[each.name])
-            why = not_reached(each.key, left=True).reasons.get(device, "") if stopped is None else ""
-            remembered = remembered or bool(why)
-            graded[each.name] = stopped, f"{said.rstrip('.')}: {why}" if why and why not in said else said
-    several = len(graded) > 1
-    bearers = {f"{robot} on {name}" if several else robot: each for name, each in graded.items()}
-    _show_answers(screen, bearers)
-    outcomes = [stopped for stopped, _ in graded.values()]
-    stopped = False if False in outcomes else None if None in outcomes else True
-    each_said = (
-        {"on": {name: {"stopped": now, "said": said} for name, (now, said) in graded.items()}} if several else {}
-    )
-    said = "; ".join(f"{name}: {text}" if several else text for name, (_, text) in graded.items())
-    verdict = combined_verdict(dict(zip(bearers, (answers[name] for name in graded), strict=True)))
-    known = {"devices": {robot: {"stopped": stopped, "said": said, **each_said}}, **_facts(verdict)}
-    known |= _say_absent(screen, {name: why for name, why in absent.items() if name not in answers})
+        raise CliError(
+            plain(f"The network does not carry this: {networks.absences.rstrip('.')}.", 2000),
+            Exit.SILENT,
+            stopped=None,
+            absent=networks.missing,
+        )
+    said = {each.name: _explained(each, device, answers[each.name]) for each in networks.stated if each.name in answers}
+    verdict = combined_verdict({f"{robot} on {name}" if len(said) > 1 else robot: each for name, each in said.items()})
+    stopped, texts = verdict["stopped"], verdict["robots"]
+    marks = dict.fromkeys(verdict["not_stopped"], False) | dict.fromkeys(verdict["silent"])
+    _show_answers(screen, {name: (marks.get(name, True), text) for name, text in texts.items()})
+    known = {
+        "devices": {robot: {"stopped": stopped, "said": "; ".join(texts.values())}},
+        **_facts(verdict),
+        "absent": networks.missing,
+    }
+    say_missing(screen, networks)
     if stopped:
         screen.data({"status": "success", **known})
         return
-    moving = ", ".join(name for name, (now, _) in bearers.items() if now is False)
-    silent = ", ".join(name for name, (now, _) in bearers.items() if now is None)
-    failed = [f"{what}: {names}." for what, names in (("DID NOT STOP", moving), ("NO ANSWER", silent)) if names]
-    alike = "" if moving or remembered else _alike(networks, device)
-    raise CliError(f"{' '.join(failed)}{alike}", Exit.REFUSED if moving else Exit.SILENT, **known)
+    groups = {"DID NOT STOP": verdict["not_stopped"], "NO ANSWER": verdict["silent"]}
+    failed = [f"{what}: {', '.join(names)}." for what, names in groups.items() if names]
+    # One that this machine remembers is no other robot's name that was mistyped.
+    alike = near_robots(networks, device) if stopped is None and said == answers else ""
+    raise CliError(f"{' '.join(failed)}{alike}", Exit.REFUSED if stopped is False else Exit.SILENT, **known)
 
 
-def _alike(networks: Networks, device: str) -> str:
-    """Return a sentence with the ids in reach that resemble an absent one."""
-    with suppress(RefusalError):
-        names = networks.find(1.0)
-        return "" if device in names else near(device, names)
-    return ""
+def _explained(there: NetworkAdapter, device: str, answer: Envelope) -> Envelope:
+    """Return an answer of unknown outcome with what is remembered of the robot."""
+    stopped, said = stop_outcome(answer)
+    if stopped is not None:
+        return answer
+    try:
+        why = not_reached(there.key, left=True).reasons.get(device, "")
+    except RefusalError:
+        return answer
+    return error(f"{said.rstrip('.')}: {why}", stopped=None) if why and why not in said else answer
 
 
 def _estop_facts(networks: Networks, each: NetworkVerdict) -> Mapping[str, Any]:
-    there = next((network for network in networks.stated if network.name == each.network), networks.stated[0])
-    return {} if each.outcome is None else _facts(there.verdict(each.outcome))
+    if each.outcome is None:
+        return {}
+    there = _usable(networks, each.network)
+    return _facts(roster_verdict(each.outcome) if there is None else there.verdict(each.outcome))
+
+
+def _usable(networks: Networks, name: str) -> NetworkAdapter | None:
+    """Return a network on which a stop could leave, None for another one."""
+    there = [each for each in networks.stated if each.has_stop_link or each in networks.joined]
+    return next((each for each in there if each.name == name), None)
 
 
 def _plain_facts(networks: Networks, each: NetworkVerdict) -> Mapping[str, Any]:

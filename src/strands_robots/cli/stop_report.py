@@ -23,11 +23,15 @@ LATE_MS = 1000.0
 
 
 def exit_code(outcome: StopReport | StopOutcome) -> Exit:
-    """Return 0 when all stopped, 1 when one did not, 3 when one has not answered."""
+    """Return 0 when all stopped, 1 when one did not, 3 when one has not answered.
+
+    A robot that stopped and is not locked gave no answer to the emergency stop.
+    """
     report = outcome.report if isinstance(outcome, StopOutcome) else outcome
+    free = isinstance(outcome, StopOutcome) and outcome.not_locked
     if report.not_stopped or report.refused or report.alarmed:
         return Exit.REFUSED
-    return Exit.OK if outcome.ok else Exit.SILENT
+    return Exit.OK if outcome.ok and not free else Exit.SILENT
 
 
 def style_of(report: StopReport) -> str:
@@ -64,6 +68,7 @@ def failure(outcome: StopOutcome) -> str:
         (report.alarmed, "WRONG KEY"),
         (report.claimed, "CLAIMED, NOT SIGNED"),
         (report.silent, "NO ANSWER"),
+        ({*outcome.not_locked} & report.stopped.keys(), "STOPPED, NOT LOCKED"),
     )
     said = [f"{what}: {', '.join(sorted(robots))}." for robots, what in groups if robots]
     if not report.link:

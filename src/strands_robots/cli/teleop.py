@@ -260,11 +260,11 @@ def _lead_peer(
     options: TeleopOptions,
 ) -> None:
     """Let a leader drive a peer of the mesh until it ends, then stop the peer."""
-    from strands_robots.fleet.mesh.leading import DEVICE, LedPeer, RemoteFollower, publisher  # noqa: PLC0415 - as above
+    from strands_robots.fleet.mesh.leading import DEVICE, LedPeer, RemoteFollower, dialled, publisher  # noqa: PLC0415 - as above
 
     rate = number("hz", options.hz, low=1, high=1000)
     speed = number("max_speed", options.max_speed, above=0, high=20)
-    with mesh_peer(None, temporary_mesh_id("lead"), "tool") as mesh:
+    with dialled("lead", peer) as mesh:
         follower = RemoteFollower(mesh, peer)
         with connected(follower) as source:
             _check_keys(peer, source, follower.bounds)

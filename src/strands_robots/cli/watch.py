@@ -11,18 +11,23 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeGuard
 
 import typer
 from rich.console import Group, RenderableType
-from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from strands_robots.cli.command import Seconds, command
-from strands_robots.cli.network import Network, call_robot
+from strands_robots.cli.command import OnMesh, Seconds, command
+from strands_robots.cli.network import Network, answering
 from strands_robots.cli.output import LATE_S, CliError, Exit, Screen, label, plain
+from strands_robots.envelope import is_error
+from strands_robots.errors import NoSuchRobotError, RefusalError
+from strands_robots.fleet.adapter import Detail
 from strands_robots.fleet.joint_features import Range, joint_limits
 from strands_robots.utils import number
 
 if TYPE_CHECKING:
     from strands_robots.fleet.adapter import NetworkAdapter, RobotEvent
+
+READ_S = 3.0
+"""Seconds in which the device answers a read."""
 
 REDRAW_S = 0.07
 """Seconds between two redraws."""
@@ -60,23 +65,17 @@ def watch(
     network: Network,
     device: Annotated[str, typer.Argument(help="The device's id.")],
     seconds: Seconds = None,
+    on_mesh: OnMesh = False,
 ) -> None:
     """Show a device's joints and task as they change, until Ctrl-C. With --json: one event a line."""
     longest = None if seconds is None else number("--for", seconds, above=0, high=7 * 24 * 3600)
-    from strands_robots.fleet.device_connect.network import DeviceConnectNetwork  # noqa: PLC0415 - loaded when it is used
-
-    with network.fleet() as fleet:
-        there = DeviceConnectNetwork.joined(fleet)
-        limits: dict[str, Range] = {}
-        try:
-            limits = joint_limits(call_robot(there, device, "getFeatures", {}, 3.0))
-        except CliError as failure:
-            # A device without getFeatures is drawn without its limits.
-            if isinstance(failure.__cause__, LookupError):
-                raise
-        signs = SignsOfLife(lambda: there.beats([device])[device], lambda: fleet.beats_every(device))
+    with network.joined(on_mesh=on_mesh) as networks:
+        with answering(networks, device, ""):
+            there = networks.of(device)
+            limits = _limits(there, device)
+        signs = SignsOfLife(lambda: there.beats([device])[device], lambda: there.beats_every(device))
         with contextlib.ExitStack() as stack:
-            stack.callback(there.subscribe(device, signs.take))
+            stack.callback(there.subscribe(device, signs.take, Detail.STATES))
             frames = follow(signs, longest, device)
             if screen.machine:
                 for function, answer in _present_answers(there, device):
@@ -192,7 +191,12 @@ def describe_task(event: RobotEvent) -> str:
         return f"{state}: {facts.get('instruction', '')!r} after {steps} steps"
     if event.name == "emergencyStop":
         return f"EMERGENCY STOP: {facts.get('reason', '')}"
-    return describe_state(facts) if event.name == "stateUpdate" else ""
+    if facts.get("event") == "emergency_stop":
+        return "EMERGENCY STOP"
+    if event.task is None or event.name == "stateUpdate":
+        return describe_state(facts) if event.name == "stateUpdate" else ""
+    task = event.task
+    return describe_state({**task, "task_status": task["state"], "step_count": task.get("step", 0)})
 
 
 def describe_state(facts: Mapping[str, Any]) -> str:
@@ -251,7 +255,8 @@ def joint_bar(value: float, limits: Range = FULL_TURN) -> Text:
 
 def joints_table(joints: Mapping[str, object], limits: Mapping[str, Range]) -> Table:
     """Return every joint of a finite value with its bar and its value."""
-    grid = _grid()
+    grid = Table.grid(padding=(0, 2))
+    grid.add_column(width=NAME_WIDTH, no_wrap=True, overflow="ellipsis")
     grid.add_column(no_wrap=True)
     grid.add_column(justify="right", no_wrap=True)
     drawn = {str(name): float(value) for name, value in joints.items() if _finite(value)}
@@ -260,24 +265,6 @@ def joints_table(joints: Mapping[str, object], limits: Mapping[str, Range]) -> T
         grid.add_row(label(name), joint_bar(value, around), Text(f"{value:+.3f}"))
     if len(drawn) > JOINTS_MAX:
         grid.add_row(Text(f"and {len(drawn) - JOINTS_MAX} more", style="bright_black"), "", "")
-    return grid
-
-
-def motion_progress(title: str, done: float, total: float) -> Table:
-    """Return a titled progress bar in seconds."""
-    passed = min(max(done, 0.0), total)
-    grid = _grid()
-    grid.add_row(
-        Text(plain(title, 60), style="bold"),
-        ProgressBar(total=max(total, 1e-9), completed=passed, width=BAR_WIDTH),
-        Text(f"{passed:.1f} / {total:.1f} s"),
-    )
-    return grid
-
-
-def _grid() -> Table:
-    grid = Table.grid(padding=(0, 2))
-    grid.add_column(width=NAME_WIDTH, no_wrap=True, overflow="ellipsis")
     return grid
 
 
@@ -295,9 +282,25 @@ def _present_state(there: NetworkAdapter, device: str, limits: Mapping[str, Rang
 
 def _present_answers(there: NetworkAdapter, device: str) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield its present state by function; an idle one sends none for 10 s."""
-    for function in ("getState", "getStatus"):
-        with contextlib.suppress(CliError):  # a device answers one of the two
-            yield function, call_robot(there, device, function, {}, 3.0)
+    for function in (there.reads["state"], there.reads["status"]):
+        with contextlib.suppress(RefusalError):  # a device answers one of the two
+            answer = there.call(device, function, {}, READ_S)
+            if not is_error(answer):
+                yield function, answer
+
+
+def _limits(there: NetworkAdapter, device: str) -> dict[str, Range]:
+    """Return the limits of its joints; a device that states none is drawn without.
+
+    Raises:
+        NoSuchRobotError: it is not in reach.
+    """
+    try:
+        return joint_limits(there.call(device, there.reads["features"], {}, READ_S))
+    except NoSuchRobotError:
+        raise
+    except RefusalError:
+        return {}
 
 
 def _draw_live(screen: Screen, view: DeviceView, frames: Iterator[Frame]) -> None:

@@ -18,7 +18,7 @@ from concurrent.futures import CancelledError, Future
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
-from device_connect_edge.messaging.exceptions import MessagingError, RequestTimeoutError
+from device_connect_edge.messaging.exceptions import MessagingError, NotConnectedError, RequestTimeoutError
 
 from strands_robots.bounded_json import LONG_MAX, json_object
 from strands_robots.device_connect.backends import LinkConfig, open_client
@@ -290,7 +290,8 @@ class FleetClient:
     def stop(self, device: str, timeout: float = 5.0, robot_name: str = "") -> Envelope:
         """Stop a device by ``stop``, else ``stopMotion``; return its envelope.
 
-        ``stopped`` is true only for an affirmative answer. ``robot_name`` stops one robot of a world alone.
+        ``stopped`` is true only for an affirmative answer, and ``in_reach`` is false where no device took the stop.
+        ``robot_name`` stops one robot of a world alone.
         """
         return self.run(self._stop(device, timeout, robot_name), 2 * timeout + 4.0)
 
@@ -347,7 +348,15 @@ class FleetClient:
             raise
 
     async def _awaited(self, work: Coroutine[Any, Any, T]) -> T:
-        return await asyncio.wrap_future(self._submitted(work))
+        done = self._submitted(work)
+        try:
+            return await asyncio.wrap_future(done)
+        except asyncio.CancelledError:
+            # Of the client that is closed, not of the task that waits.
+            task = asyncio.current_task()
+            if task is not None and task.cancelling():
+                raise
+            raise ClientClosedError(CLOSED) from None
 
     def _submitted(self, work: Coroutine[Any, Any, T]) -> Future[T]:
         with self._lock:
@@ -430,7 +439,9 @@ class FleetClient:
                 answer = await self._call(device, "stopMotion", {}, within)
             except (LookupError, TimeoutError, RuntimeError, MessagingError) as other:
                 return error(str(other), stopped=None)
-        except (LookupError, TimeoutError, MessagingError) as exc:
+        except (LookupError, NotConnectedError) as exc:
+            return error(str(exc), stopped=None, in_reach=False)
+        except (TimeoutError, MessagingError) as exc:
             return error(str(exc), stopped=None)
         if grade(answer) is Outcome.STOPPED:
             return answer

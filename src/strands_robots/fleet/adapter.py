@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
+from enum import Enum
 from typing import TYPE_CHECKING, Any, Protocol
 
 from strands_robots.envelope import Envelope
@@ -83,6 +84,7 @@ class RobotEvent:
         load: of the robot's host, 1 for all of its cores.
         frequent: one of many of its kind, which report a state.
         alive: False where a broker may have kept it, so that it proves no life.
+        picture: a JPEG of the camera that ``part`` names.
     """
 
     robot: str
@@ -94,10 +96,20 @@ class RobotEvent:
     load: float | None = field(default=None, repr=False, compare=False)
     frequent: bool = field(default=False, repr=False, compare=False)
     alive: bool = field(default=True, repr=False, compare=False)
+    picture: bytes | None = field(default=None, repr=False, compare=False)
 
 
 EVERY = "*"
 """Every robot of a network, where one is followed."""
+
+
+class Detail(Enum):
+    """Messages of a robot that are followed, where its network tells them apart."""
+
+    EVENTS = "its events"
+    STATES = "its states besides"
+    ALL = "its pictures besides, and the stops and resumes of the fleet"
+
 
 OnEvent = Callable[[RobotEvent], None]
 """Takes an event on a thread of the network: it returns at once and does not raise."""
@@ -109,6 +121,7 @@ class NetworkAdapter(Protocol):
     Attributes:
         name: :data:`DEVICE_CONNECT` or :data:`MESH`.
         has_stop_link: emergency stops leave on a connection of their own, so that they need no :meth:`open`.
+        tells_absence: a stop of a robot that is not there is answered at once, so that silence is that of a robot.
         announces_verbs: robots announce their verbs, so that :meth:`describe` asks no one.
         reads: the names on this network of the reads ``status``, ``state`` and ``features``.
         starts: the name on this network of the verb that starts a task.
@@ -116,6 +129,7 @@ class NetworkAdapter(Protocol):
 
     name: str
     has_stop_link: bool
+    tells_absence: bool
     announces_verbs: bool
     reads: Mapping[str, str]
     starts: str
@@ -200,14 +214,14 @@ class NetworkAdapter(Protocol):
     ) -> Envelope | None:
         """Stop a robot and return its answer, None where it is not on this network.
 
-        No answer in time is an envelope with ``stopped`` None.
+        It is sent whether or not the robot is known. No answer in time is an envelope with ``stopped`` None, whose
+        ``in_reach`` is False where no robot took the stop.
 
         Args:
             robot: its id.
             timeout: seconds in which it has to answer.
             robot_name: stops one robot of a world alone.
-            insist: the robot is on no other network. The stop is sent though it was not found, its answer is waited for
-                all the time, and None is never returned.
+            insist: the robot is on no other network. Its answer is waited for all the time, and None is never returned.
         """
 
     def received(self, robot: str, verb: str, arguments: Mapping[str, Any]) -> ReceivedCall:
@@ -232,7 +246,8 @@ class NetworkAdapter(Protocol):
 
         It waits for no other call.
 
-        It is sent whether or not the robot is known. ``stopped`` is None without an answer.
+        It is sent whether or not the robot is known. Without an answer ``stopped`` is None, and ``in_reach`` False
+        where no robot took it.
         """
 
     @property
@@ -338,12 +353,16 @@ class NetworkAdapter(Protocol):
             timeout: seconds in which each robot has to answer.
         """
 
-    def subscribe(self, robot: str, on_event: OnEvent) -> Callable[[], None]:
+    def beats_every(self, robot: str) -> float:
+        """Return the seconds between two beats of a robot."""
+
+    def subscribe(self, robot: str, on_event: OnEvent, detail: Detail = Detail.EVENTS) -> Callable[[], None]:
         """Receive the robot's events; return what ends it, which never fails.
 
         Args:
             robot: an id, or :data:`EVERY` for all robots: then also their states and signs of life.
             on_event: takes each event.
+            detail: the messages that are events.
         """
 
     def close(self) -> None:

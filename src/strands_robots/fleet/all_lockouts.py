@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from strands_robots.errors import NoSuchRobotError
@@ -13,6 +14,8 @@ from strands_robots.fleet.networks import Networks
 from strands_robots.safety.identity import KeyFileError, fingerprint
 from strands_robots.safety.unheard import Unheard, unheard_now
 
+FAILED = "robots cannot be asked for their lockouts"
+
 Reports = list[tuple[NetworkAdapter, list[LockoutReport]]]
 """Reports of the lockable robots of each network."""
 
@@ -22,6 +25,7 @@ def ask_lockouts(
     seconds: float,
     *,
     robots: Sequence[str] = (),
+    besides: Sequence[str] = (),
     look_s: float = FIND_S,
     signed: bool = False,
 ) -> Reports:
@@ -33,6 +37,7 @@ def ask_lockouts(
         networks: joined ones.
         seconds: in which each robot has to answer.
         robots: ids; every robot in reach without any.
+        besides: ids that are asked, too. These and ``robots`` are asked though they are not found.
         look_s: seconds at most in which robots are looked for.
         signed: ask every robot to sign its answer, so that its key is known.
 
@@ -45,21 +50,45 @@ def ask_lockouts(
         wanted = [each for each in network.lockable(look_s) if not robots or each in robots]
         return network.lockouts(wanted, seconds, signed=signed)
 
-    return networks.on_each(asked, "robots cannot be asked for their lockouts", fatal=(KeyFileError,))
+    def insisted(network: NetworkAdapter) -> list[LockoutReport]:
+        return network.lockouts([each for each in missing if network.reaches(each)], seconds, signed=signed)
+
+    reports = networks.on_each(asked, FAILED, fatal=(KeyFileError,))
+    found = by_robot(reports)
+    missing = [each for each in dict.fromkeys([*robots, *besides]) if each not in found]
+    if missing:
+        late = dict(networks.on_each(insisted, FAILED, fatal=(KeyFileError,)))
+        reports = [(network, [*of_network, *late.get(network, ())]) for network, of_network in reports]
+    return reports
 
 
 def by_robot(reports: Reports) -> dict[str, LockoutReport]:
-    """Return one report for each robot: that of the first network which has it."""
-    return {each.name: each for _, of_network in reversed(reports) for each in of_network}
+    """Return one report for each robot, with its lockouts on all networks."""
+    several: dict[str, dict[str, LockoutReport]] = {}
+    for network, of_network in reports:
+        for each in of_network:
+            several.setdefault(each.name, {})[network.name] = each
+    return {name: _joined(of_robot) for name, of_robot in several.items()}
 
 
-def unheard_on_each(reports: Reports) -> dict[str, Unheard]:
-    """Return by network the robots that a stop locked, and that do not answer."""
-    unheard = {
-        network.name: unheard_now(network.key, {each.name for each in of_network if not each.problem})
+def _joined(reports: Mapping[str, LockoutReport]) -> LockoutReport:
+    """Return the reports of a robot as one; locked on one network is locked."""
+    first = next(iter(reports.values()))
+    if len(reports) == 1:
+        return first
+    lockouts = {lockout.epoch: lockout for each in reports.values() for lockout in each.lockouts}
+    problems = [f"{network}: {each.problem}" for network, each in reports.items() if each.problem]
+    return replace(first, lockouts=tuple(lockouts.values()), problem="; ".join(problems))
+
+
+def unheard_in(reports: Reports) -> Unheard:
+    """Return the robots of the rosters of these networks that do not answer."""
+    each = [
+        unheard_now(network.key, {report.name for report in of_network if not report.problem})
         for network, of_network in reports
-    }
-    return {name: each for name, each in unheard.items() if each}
+    ]
+    names = dict.fromkeys(name for unheard in each for name in unheard.names)
+    return Unheard(tuple(names), "; ".join(unheard.problem for unheard in each if unheard.problem))
 
 
 def resume_all(

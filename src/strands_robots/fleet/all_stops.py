@@ -40,7 +40,7 @@ def stop_all(networks: Networks, timeout: float = STOP_S, *, known: Sequence[str
         answers, outcome = network.stop_all(timeout)
         return NetworkVerdict(network.name, outcome, answers)
 
-    reached, unreached = _parted(_on_each(networks, stopped, apart=False))
+    reached, unreached = _parted(networks, _on_each(networks, stopped, apart=False))
     return FleetVerdict(reached, known=known, unreached=unreached)
 
 
@@ -94,10 +94,13 @@ def estop_all(
             on_progress=lambda progress: on_progress(network.name, progress),
         )
         # A link that is down where devices could be looked for is one to which no robot is connected.
-        return NetworkVerdict(network.name, outcome, absent="" if outcome.report.link else "; ".join(outcome.problems))
+        why = "" if outcome.report.link else "; ".join(outcome.problems)
+        if why:
+            networks.absent[network.name] = why
+        return NetworkVerdict(network.name, outcome, absent=why)
 
     verdicts = _told_once(_on_each(networks, stopped, apart=True), {*scope.only, *named})
-    reached, unreached = _parted(verdicts)
+    reached, unreached = _parted(networks, verdicts)
     meant = {**dict.fromkeys(known if scope.everything else scope.only), **dict.fromkeys(named)}
     return FleetVerdict(reached, epoch, tuple(meant), ignored, unreached)
 
@@ -119,7 +122,9 @@ def not_left(network: str, key: Callable[[], NetworkKey], why: object) -> Networ
 
 
 def answer_of(verdict: FleetVerdict, networks: Networks) -> Envelope:
-    """Return the verdict as one answer; that of one network alone as this network words it.
+    """Return the verdict as one answer.
+
+    That of one network alone is as this network words it.
 
     With several, ``stopped`` is True, False, or None where it is not known, ``not_stopped`` and ``silent`` list robots,
     ``robots`` has the answers by id and ``networks`` the facts of each network.
@@ -168,13 +173,10 @@ def _on_each(networks: Networks, stop: Callable[[NetworkAdapter], NetworkVerdict
             return not_left(network.name, lambda: network.key, exc), True
         return verdict, verdict.outcome is None or verdict.outcome.report.link
 
-    stated = networks.stated
-    stops = side_by_side(stopped, stated)
+    stops = side_by_side(stopped, networks.stated)
     stops += [
         (not_left(name, key, networks.absent.get(name, "it is not joined")), False)
         for name, key in networks.keys.items()
-        # One of them may have come since the stop left.
-        if all(name != each.name for each in stated)
     ]
     return stops
 
@@ -190,13 +192,15 @@ def _told_once(verdicts: Sequence[Stopped], named: Collection[str]) -> list[Stop
     return [(each.without(names), left) for (each, left), names in zip(verdicts, dropped, strict=True)]
 
 
-def _parted(verdicts: Sequence[Stopped]) -> tuple[list[NetworkVerdict], list[NetworkVerdict]]:
+def _parted(networks: Networks, verdicts: Sequence[Stopped]) -> tuple[list[NetworkVerdict], list[NetworkVerdict]]:
     """Return the verdicts that count, and those of gone networks without robots."""
+    # A caller that is new here remembers no robot of a broker that is gone.
+    elsewhere = {each.name for each in networks.stated if networks.asks_for(each.name) and not each.on_this_machine}
     reached = any(left for _, left in verdicts)
     counted, gone = list[NetworkVerdict](), list[NetworkVerdict]()
     for each, left in verdicts:
         # Of a network whose roster cannot be read it is not known whether a robot is there.
-        counts = left or not reached or each.outcome is None or each.outcome.size
+        counts = left or not reached or each.network in elsewhere or each.outcome is None or each.outcome.size
         (counted if counts else gone).append(each)
     return counted, gone
 

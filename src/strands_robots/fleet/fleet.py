@@ -9,7 +9,7 @@ from typing import Any, Self
 
 from strands_robots.errors import NoSuchRobotError
 from strands_robots.fleet.adapter import FIND_S, NetworkAdapter
-from strands_robots.fleet.all_lockouts import ask_lockouts, by_robot, enroll_all, resume_all, unheard_on_each
+from strands_robots.fleet.all_lockouts import ask_lockouts, by_robot, enroll_all, resume_all, unheard_in
 from strands_robots.fleet.all_stops import estop_all, stop_all
 from strands_robots.fleet.callers import SOURCE
 from strands_robots.fleet.enrollment import Enrolment
@@ -156,7 +156,7 @@ class Fleet:
         for name, (each, network) in found.items():
             known = self._robots.get(name)
             if known is None:
-                self._robots[name] = RemoteRobot(each, network, lambda: self._networks.joined)
+                self._robots[name] = RemoteRobot(each, network, self._networks)
             else:
                 known.rediscovered(each, network)
         return [self._robots[name] for name in sorted(found)]
@@ -231,7 +231,8 @@ class Fleet:
     def lockouts(self, timeout: float = FIND_S) -> dict[str, LockoutReport]:
         """Ask the robots in reach for their lockouts; return the reports by id.
 
-        A robot on both networks is asked on the first one. A network that does not answer is named in :attr:`absent`.
+        A robot that is locked on one of two networks is locked. A network that does not answer is named in
+        :attr:`absent`.
 
         Args:
             timeout: seconds in which each robot has to answer.
@@ -257,9 +258,9 @@ class Fleet:
         seconds = number("timeout", timeout, above=0, high=60)
         named = [robots] if isinstance(robots, str) else list(robots)
         wanted = [device_id("robots", each) for each in named]
-        reports = ask_lockouts(self._networks, seconds, robots=wanted, look_s=seconds)
-        for network, unheard in unheard_on_each(reports).items():
-            logger.warning("%s: %s", network, unheard)
+        reports = ask_lockouts(self._networks, seconds, besides=wanted, look_s=seconds)
+        if unheard := unheard_in(reports):
+            logger.warning("%s", unheard)
         return resume_all(reports, signing_key, seconds, robots=wanted)
 
     def enroll(self, *, replace: bool = False, timeout: float = FIND_S) -> dict[str, Enrolment]:

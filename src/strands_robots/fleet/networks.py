@@ -7,116 +7,41 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from functools import partial
-from typing import TYPE_CHECKING, Any, Self
+from itertools import zip_longest
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 from strands_robots.envelope import Envelope, error
 from strands_robots.errors import NoSuchRobotError, RefusalError, UnreachableError
-from strands_robots.fleet.adapter import FIND_S, STOP_S, FoundRobot, NetworkAdapter, OnEvent
-from strands_robots.fleet.fleet_verdict import combined, verdict_of_answer
+from strands_robots.fleet.adapter import FIND_S, STOP_S, Detail, FoundRobot, NetworkAdapter, OnEvent
+from strands_robots.fleet.joining import Joining
 from strands_robots.fleet.refusals import answered
-from strands_robots.fleet.shared_id import SharedId, decided
-from strands_robots.fleet.side_by_side import side_by_side
-from strands_robots.safety.stopping import StopVerdict
+from strands_robots.fleet.side_by_side import on_own_thread, side_by_side, those
 from strands_robots.serving.known_verbs import READS, RESUMES, STOPS
 from strands_robots.utils import near, plain_text
 
 if TYPE_CHECKING:
+    from strands_robots.fleet.shared_id import SharedId
     from strands_robots.safety.network_key import NetworkKey
+    from strands_robots.safety.stopping import StopVerdict
     from strands_robots.serving.advertised import AdvertisedVerb
 
 logger = logging.getLogger(__name__)
 
-AGAIN_S, AGAIN_MAX_S = 1.0, 5.0
-"""Seconds until a network that could not be joined is tried again: the first time, and at most."""
-
 SHARED_IDS_MAX = 1024
 """Ids on several networks of which the decided network is remembered."""
+
+ASKING_MAX = 64
+"""Robots at a time of which callers on an event loop ask which network has them."""
+
+R = TypeVar("R")
 
 STILL = READS | STOPS | RESUMES | {"wait"}
 """Verbs of our robots that move nothing."""
 
 CLOSED = "the networks were left"
-
-
-class _Joining:
-    """One network, from the first attempt to join it to its end.
-
-    Attributes:
-        attempted: set once the first attempt is over.
-        why: the reason of the last attempt that failed; empty before the first.
-        unexpected: what an attempt raised that is no refusal.
-    """
-
-    def __init__(self, network: NetworkAdapter, *, again: bool, changed: Callable[[_Joining], None]) -> None:
-        self.network = network
-        self.attempted = threading.Event()
-        self.why = ""
-        self.unexpected: Exception | None = None
-        self._again, self._changed = again, changed
-        self._lock = threading.Lock()
-        self._closing = threading.Event()
-        self._begun = self._up = False
-
-    @property
-    def up(self) -> bool:
-        """True while the network is joined."""
-        return self._up
-
-    def begin(self, *, here: bool = False) -> None:
-        """Join on a thread of its own, or on this one; a second call does nothing."""
-        with self._lock:
-            begun, self._begun = self._begun, True
-        if begun:
-            return
-        try:
-            if not here:
-                threading.Thread(target=self._run, name=f"join {self.network.name}", daemon=True).start()
-                return
-        except RuntimeError:
-            # The interpreter ends and starts no thread.
-            logger.debug("%s is joined on the thread of its caller.", self.network.name)
-        self._run()
-
-    def _run(self) -> None:
-        """Join; go on trying where that is wanted."""
-        pause = AGAIN_S
-        while not self._attempt() and self._again and not self._closing.wait(pause):
-            pause = min(2 * pause, AGAIN_MAX_S)
-
-    def close(self) -> None:
-        """Leave the network; one that is being joined is left once it is."""
-        with self._lock:
-            self._closing.set()
-            joined, self._up = self._up, False
-        if joined:
-            self._leave()
-
-    def _attempt(self) -> bool:
-        try:
-            self.network.open()
-        except UnreachableError as exc:
-            self.why = exc.why
-        except Exception as exc:
-            if self.unexpected is None:
-                # The other networks are joined all the same.
-                logger.exception("%s cannot be joined.", self.network.name)
-            self.unexpected, self.why = exc, plain_text(f"{type(exc).__name__}: {exc}")
-        else:
-            self.why, self.unexpected = "", None
-            with self._lock:
-                self._up = not self._closing.is_set()
-            if not self._up:
-                self._leave()
-        self.attempted.set()
-        self._changed(self)
-        return not self.why
-
-    def _leave(self) -> None:
-        try:
-            self.network.close()
-        except Exception as exc:  # noqa: BLE001 - the others are left all the same
-            logger.warning("%s was not left in good order: %s", self.network.name, exc)
 
 
 class Networks:
@@ -131,10 +56,10 @@ class Networks:
         absent: networks that are not joined, with the reason.
         keys: names of absent networks under which their robots are remembered, so that a stop names these.
         stays: go on trying to join those that are not there yet.
-        later: absent networks that may come: each returns its network once that is there, and is asked every second.
+        unasked: networks that no one asked for, so that their absence is not told.
 
     Attributes:
-        stated: as given, and those that came later.
+        stated: as given.
         keys: as given.
         absent: networks that are not joined or do not answer, with the reason.
     """
@@ -146,19 +71,21 @@ class Networks:
         keys: Mapping[str, Callable[[], NetworkKey]] | None = None,
         *,
         stays: bool = False,
-        later: Sequence[Callable[[], NetworkAdapter | None]] = (),
+        unasked: Collection[str] = (),
     ) -> None:
         self.stated = tuple(stated)
+        self._unasked = frozenset(unasked)
         self.absent: dict[str, str] = dict(absent or {})
         self.keys = dict(keys or {})
-        self._stays, self._later = stays, later
-        self._closed = self._waiting = False
-        self._left: threading.Event | None = None
-        self._joinings: tuple[_Joining, ...] = ()
+        self._stays = stays
+        self._opened = self._closed = False
+        self._joinings: tuple[Joining, ...] = ()
+        self._last: tuple[Joining, ...] = ()
         self._change = threading.Condition()
         self._listeners: list[Callable[[NetworkAdapter], None]] = []
         self._told: list[NetworkAdapter] = []
         self._shared_ids: dict[str, SharedId] = {}
+        self._asking: ThreadPoolExecutor | None = None
 
     def __enter__(self) -> Self:
         self.open()
@@ -167,15 +94,26 @@ class Networks:
     def __exit__(self, *_exception: object) -> None:
         self.close()
 
-    def open(self) -> None:
+    def open(self, *, in_turn: bool = False) -> None:
         """Begin to join all networks; return once one of them is joined.
+
+        Args:
+            in_turn: join the others only once the first one cannot be joined, or lacks what is asked for.
 
         Raises:
             UnreachableError: none of them can be reached, and they do not stay.
         """
-        self.begin(here=len(self.stated) == 1 and not self._stays)
-        with self._change:
-            self._change.wait_for(lambda: self.joined or all(each.attempted.is_set() for each in self._joinings))
+        self._closed = False
+        try:
+            if in_turn and self.stated and not self._stays:
+                self._attempts()[0].begin(here=True)
+            if not self.joined:
+                self.begin(here=len(self.stated) == 1 and not self._stays)
+            with self._change:
+                self._change.wait_for(lambda: self.joined or all(each.attempted.is_set() for each in self._joinings))
+        except BaseException:
+            self.close()
+            raise
         unexpected = next((each.unexpected for each in self._joinings if each.unexpected), None)
         if not self.joined and (unexpected or not self._stays):
             self.close()
@@ -190,19 +128,16 @@ class Networks:
         self._closed = False
         for each in self._attempts():
             each.begin(here=here)
-        with self._change:
-            later, self._waiting, left = self._later if not self._waiting else (), True, self._left
-        for came in later:
-            threading.Thread(target=self._await, args=(came, left), name="await a network", daemon=True).start()
 
     def close(self) -> None:
         """Leave the networks."""
         with self._change:
-            self._closed, joinings, self._joinings = True, self._joinings, ()
-            left, self._left, self._waiting = self._left, None, False
+            self._closed, self._opened = True, False
+            joinings, self._joinings = self._joinings, ()
+            asking, self._asking = self._asking, None
             self._told.clear()
-        if left is not None:
-            left.set()
+        if asking is not None:
+            asking.shutdown(wait=False)
         for each in joinings:
             each.close()
 
@@ -212,7 +147,7 @@ class Networks:
             self._listeners.append(callback)
             joined = tuple(self._told)
         for each in joined:
-            callback(each)
+            _tell(callback, each)
 
     @property
     def joined(self) -> tuple[NetworkAdapter, ...]:
@@ -225,7 +160,7 @@ class Networks:
         Raises:
             UnreachableError: as it says.
         """
-        if self._left is None:
+        if not self._opened:
             raise UnreachableError("not joined: use it as a context manager", remedy="with connect() as fleet: ...")
 
     def settled(self) -> tuple[NetworkAdapter, ...]:
@@ -257,9 +192,21 @@ class Networks:
         return "" if joining.up else joining.why or CLOSED
 
     @property
+    def missing(self) -> dict[str, str]:
+        """The absent networks that someone asked for, with their reasons."""
+        return {name: why for name, why in self.absent.copy().items() if self.asks_for(name)}
+
+    def asks_for(self, network: str) -> bool:
+        """Return whether someone asked for a network, which then has to be there."""
+        return network not in self._unasked
+
+    @property
     def absences(self) -> str:
-        """The absent networks with their reasons, as one text."""
-        return "; ".join(f"{name}: {why.rstrip('.')}" for name, why in self.absent.items())
+        """Reasons why networks are absent, first of those that someone asked for."""
+        stated = self.missing or self.absent.copy()
+        if len(stated) == 1:
+            return next(iter(stated.values()))
+        return "; ".join(f"{name}: {why.rstrip('.')}" for name, why in stated.items())
 
     @property
     def reach(self) -> str:
@@ -347,13 +294,32 @@ class Networks:
             return network
         bearers = self.bearers(robot)
         if len(bearers) < len(joined):
-            bearers = _waited_for(robot, joined, every=moves)
+            bearers = those(lambda each: _reaches(each, robot), joined, every=moves)
         if not bearers:
             remedy = near(robot, {name for each in joined for name in each.announced()}).strip()
             raise NoSuchRobotError(f"No robot {robot[:100]!r} is in reach", robot=robot, verb=verb, remedy=remedy)
-        if len(bearers) == 1 or not moves:
-            return self._decided(robot, bearers) or bearers[0]
-        return decided(self._shared_id(robot), robot, verb, bearers)
+        return self._chosen(robot, verb, bearers, moves=moves)
+
+    def instead(self, robot: str, verb: str, gone: NetworkAdapter, *, moves: bool) -> NetworkAdapter | None:
+        """Return the network that has a robot which has left another one; None for none.
+
+        Args:
+            robot: its id.
+            verb: for the refusal.
+            gone: the network that no longer has it.
+            moves: as of :meth:`of`, which names what is raised.
+        """
+        others = [each for each in self.bearers(robot) if each is not gone]
+        return self._chosen(robot, verb, others, moves=moves) if others else None
+
+    def decides(self, robot: str) -> bool:
+        """Return whether a motion needs a decision which robot it is for; asks no one."""
+        return len(self.bearers(robot)) > 1 or bool(self._enrolled_on_absent(robot))
+
+    def decided(self, robot: str) -> NetworkAdapter | None:
+        """Return the network that was decided on, where it still has the robot."""
+        known = self._shared_ids.get(robot)
+        return known.decided if known is not None and known.decided in self.bearers(robot) else None
 
     def session(self, robot: str) -> object:
         """Return what differs once another robot may answer to this id; asks no one."""
@@ -394,12 +360,29 @@ class Networks:
     def call(
         self, robot: str, verb: str, arguments: Mapping[str, Any], timeout: float, *, moves: bool = True
     ) -> Envelope:
-        """Call a verb on the network that has the robot.
+        """Call a verb on the network that has the robot; stop it on every network.
 
         Raises:
             RefusalError: as :meth:`NetworkAdapter.call`, or as :meth:`of`.
         """
-        return self.of(robot, verb, moves=moves).call(robot, verb, arguments, timeout)
+        if verb in STOPS and len(self.stated) > 1:
+            name, unread = _meant(arguments)
+            return _one_answer(robot, self.stop(robot, timeout, name), unread)
+        if len(self.joined) == 1 and not moves:
+            # The others are not joined before the first one lacks the robot.
+            try:
+                return self.joined[0].call(robot, verb, arguments, timeout)
+            except NoSuchRobotError:
+                if len(self.settled()) == 1:
+                    raise
+        network = self.of(robot, verb, moves=moves)
+        try:
+            return network.call(robot, verb, arguments, timeout)
+        except NoSuchRobotError:
+            other = self.instead(robot, verb, network, moves=moves)
+            if other is None:
+                raise
+        return other.call(robot, verb, arguments, timeout)
 
     async def call_async(
         self, robot: str, verb: str, arguments: Mapping[str, Any], within: float, *, moves: bool = True
@@ -407,8 +390,17 @@ class Networks:
         """Call a verb from an event loop; every failure is an answer of status error."""
 
         async def called() -> Envelope:
+            if verb in STOPS and len(self.stated) > 1:
+                name, unread = _meant(arguments)
+                return _one_answer(robot, await self.stop_async(robot, within, name), unread)
             network = await self.of_async(robot, verb, moves=moves)
-            return await network.call_async(robot, verb, arguments, within)
+            try:
+                return await network.call_async(robot, verb, arguments, within)
+            except NoSuchRobotError:
+                other = await self._off_loop(partial(self.instead, robot, verb, network, moves=moves))
+                if other is None:
+                    raise
+            return await other.call_async(robot, verb, arguments, within)
 
         return await answered(called())
 
@@ -424,14 +416,25 @@ class Networks:
         """Do as :meth:`of`, without blocking the event loop."""
         if (network := self._at_once(robot, moves=moves)) is not None:
             return network
-        return await asyncio.to_thread(partial(self.of, robot, verb, moves=moves))
+        return await self._off_loop(partial(self.of, robot, verb, moves=moves))
+
+    async def _off_loop(self, work: Callable[[], R]) -> R:
+        """Return what ``work`` returns, on a thread that no stop needs."""
+        with self._change:
+            if self._closed:
+                raise UnreachableError(CLOSED)
+            if self._asking is None:
+                self._asking = ThreadPoolExecutor(ASKING_MAX, "networks")
+            begun = self._asking.submit(work)
+        return await asyncio.wrap_future(begun)
 
     def stop(self, robot: str, timeout: float = STOP_S, robot_name: str = "") -> dict[str, Envelope]:
         """Stop every bearer of an id; return the answers by network.
 
-        A network that does not know the robot has no answer; one that remembers it, and where it is silent, has one of
-        unknown outcome. Of a robot that none knows the first network's answer is returned. The networks need not be
-        opened. It never raises for one that fails.
+        It is sent on every network as soon as that is up. One that does not know the robot has no answer; one that
+        remembers it, and where it is silent or the stop did not leave, has one of unknown outcome. Of a robot that none
+        knows the first network's answer is returned. The networks need not be opened. It never raises for one that
+        fails.
 
         Args:
             robot: its id.
@@ -439,51 +442,61 @@ class Networks:
             robot_name: stops one robot of a world alone.
         """
         alone = len(self.stated) == 1
-        answers = self._stopped(robot, timeout, robot_name, insist=alone)
-        if alone or any(each.get("stopped") is not None for each in answers.values()):
-            return answers
-        # A robot that no network knows may be slow to answer: it is stopped again, and waited for.
-        again = self._stopped(robot, timeout, robot_name, insist=True)
-        known = {name: each for name, each in again.items() if name in answers or each.get("stopped") is not None}
-        return {**answers, **known} or dict(list(again.items())[:1])
+        said = self._stopped(self.stated, robot, timeout, robot_name, insist=alone)
+        again: dict[NetworkAdapter, Envelope | None] = {}
+        if not alone and not any(_graded(each) for each in said.values()):
+            # A robot that no network knows may be slow to answer: it is stopped again, and waited for.
+            rest = [network for network, each in said.items() if each is None]
+            again = self._stopped(rest, robot, timeout, robot_name, insist=True)
+            said |= {network: each for network, each in again.items() if _graded(each)}
+        unknown = {each.name: answer for each, answer in again.items() if answer is not None}
+        return self._with_silent(robot, said) or dict(list(unknown.items())[:1])
 
     def halt(self, robot: str, robot_name: str = "") -> StopVerdict:
         """Stop every bearer of an id; return the verdict."""
+        from strands_robots.fleet.fleet_verdict import combined, verdict_of_answer  # noqa: PLC0415 - a call need not load it
+        from strands_robots.fleet.stop_answers import by_bearer  # noqa: PLC0415 - as above
+
         began, answers = time.monotonic(), self.stop(robot, robot_name=robot_name)
         name = f"{robot}/{robot_name}" if robot_name else robot
-        verdicts = [
-            verdict_of_answer(said, name if len(answers) == 1 else f"{name} on {network}")
-            for network, said in answers.items()
-        ]
+        verdicts = [verdict_of_answer(said, bearer) for bearer, said in by_bearer(name, answers).items()]
         return combined(name, verdicts, (time.monotonic() - began) * 1000)
 
     async def stop_async(self, robot: str, within: float = STOP_S, robot_name: str = "") -> dict[str, Envelope]:
-        """Stop every bearer of an id from an event loop; return the answers by network.
+        """Do as :meth:`stop`, from an event loop.
 
-        It is sent on every network, as soon as that is joined. Once a robot has answered, networks that do not know it
-        are not waited for.
+        Once a robot has answered, networks that are still being joined, or may never know that they lack it, are not
+        waited for.
         """
 
-        async def stopped(joining: _Joining) -> Envelope:
+        async def stopped(joining: Joining) -> Envelope | None:
             if not joining.attempted.is_set():
-                await asyncio.to_thread(joining.attempted.wait)
+                # Not on a thread of the loop's, which may all be taken.
+                await asyncio.wrap_future(on_own_thread(joining.attempted.wait))
             if not joining.up:
-                return error(joining.why or CLOSED, stopped=None)
-            return await joining.network.stop_async(robot, within, robot_name)
+                return None
+            try:
+                return await joining.network.stop_async(robot, within, robot_name)
+            except Exception as exc:  # noqa: BLE001 - a stop that fails is a verdict, whatever it raised
+                return _failed(exc)
 
-        joinings = [each for each in self._joinings if each.up or not each.attempted.is_set()]
-        sent = {asyncio.ensure_future(stopped(each)): each.network for each in joinings}
-        answers, graded, pending = dict[NetworkAdapter, Envelope](), set[NetworkAdapter](), set(sent)
+        joinings = {asyncio.ensure_future(stopped(each)): each for each in self._joinings}
+        answers = dict[NetworkAdapter, Envelope | None](dict.fromkeys(self.stated))
+        pending = set(joinings)
         while pending:
             done, pending = await asyncio.wait(pending, return_when=asyncio.FIRST_COMPLETED)
-            answers |= {sent[each]: each.result() for each in done}
-            graded = {each for each, said in answers.items() if said.get("stopped") is not None}
-            if graded and not any(_bears(sent[each], robot) for each in pending):
+            answers |= {joinings[each].network: _result(each) for each in done}
+            rest = [joinings[each] for each in pending if joinings[each].up]
+            if any(map(_graded, answers.values())) and not any(
+                each.network.tells_absence or _bears(each.network, robot) for each in rest
+            ):
                 break
-        of_bearers = {each.name: said for each, said in answers.items() if each in graded or _bears(each, robot)}
-        return of_bearers or {each.name: said for each, said in answers.items()}
+        said = {each: None if _absent(each, robot, answer) else answer for each, answer in answers.items()}
+        known = await asyncio.wrap_future(on_own_thread(lambda: self._with_silent(robot, said)))
+        unknown = {each.name: answer for each, answer in answers.items() if answer is not None}
+        return known or dict(list(unknown.items())[:1]) or {each.name: self._not_left(each) for each in self.stated}
 
-    def subscribe(self, robot: str, on_event: OnEvent) -> Callable[[], None]:
+    def subscribe(self, robot: str, on_event: OnEvent, detail: Detail = Detail.EVENTS) -> Callable[[], None]:
         """Receive a robot's events on every network, also on those that are joined later.
 
         Returns:
@@ -493,7 +506,7 @@ class Networks:
 
         def follow(network: NetworkAdapter) -> None:
             try:
-                end = network.subscribe(robot, on_event)
+                end = network.subscribe(robot, on_event, detail)
             except RefusalError as exc:
                 logger.warning("Events on %s cannot be received: %s", network.name, exc)
                 return
@@ -507,35 +520,27 @@ class Networks:
 
         def end_all() -> None:
             with self._change:
-                self._listeners.remove(follow)
+                self._listeners[:] = [each for each in self._listeners if each is not follow]
             with lock:
                 over.set()
-            for end in ends:
+                begun, ends[:] = list(ends), []
+            for end in begun:
                 end()
 
         return end_all
 
-    def _attempts(self) -> tuple[_Joining, ...]:
+    def _attempts(self) -> tuple[Joining, ...]:
         """Return the attempts to join each network; none once they were left."""
         with self._change:
-            if self._left is None and not self._closed:
-                self._left = threading.Event()
-                self._joinings = tuple(_Joining(each, again=self._stays, changed=self._changed) for each in self.stated)
+            if not self._opened and not self._closed:
+                self._opened = True
+                self._joinings = self._last = tuple(
+                    Joining(each, again=self._stays, changed=self._changed, before=last)
+                    for each, last in zip_longest(self.stated, self._last)
+                )
             return self._joinings
 
-    def _await(self, came: Callable[[], NetworkAdapter | None], left: threading.Event) -> None:
-        """Join a network once it is there."""
-        while (network := came()) is None:
-            if left.wait(AGAIN_S):
-                return
-        joining = _Joining(network, again=True, changed=self._changed)
-        with self._change:
-            if left.is_set():
-                return
-            self.stated, self._joinings = (*self.stated, network), (*self._joinings, joining)
-        joining.begin(here=True)
-
-    def _changed(self, joining: _Joining) -> None:
+    def _changed(self, joining: Joining) -> None:
         if joining.up:
             self.absent.pop(joining.network.name, None)
         elif joining.why:
@@ -545,45 +550,81 @@ class Networks:
             listeners = list(self._listeners) if joining.up else []
             self._told += [joining.network] if joining.up else []
         for each in listeners:
-            each(joining.network)
+            _tell(each, joining.network)
 
-    def _stopped(self, robot: str, timeout: float, robot_name: str, *, insist: bool) -> dict[str, Envelope]:
+    def _stopped(
+        self, networks: Sequence[NetworkAdapter], robot: str, timeout: float, robot_name: str, *, insist: bool
+    ) -> dict[NetworkAdapter, Envelope | None]:
+        """Stop a robot on each network; return the answers, None where it is not."""
+
         def stopped(network: NetworkAdapter) -> Envelope | None:
-            answer: Envelope | None = None
             try:
                 # Each stop leaves as soon as its network is up.
-                why = self.awaited(network)
-                if not why:
-                    answer = network.stop(robot, timeout, robot_name, insist=insist)
+                if not self.awaited(network):
+                    return network.stop(robot, timeout, robot_name, insist=insist)
             except Exception as exc:  # noqa: BLE001 - a stop that fails is a verdict, whatever it raised
-                if not isinstance(exc, NoSuchRobotError):
-                    return error(f"{type(exc).__name__}: {exc}", stopped=None)
-                why = ""
-            if insist:
-                return error(why, stopped=None) if why and not self.joined else answer
-            return answer or _silent(network, robot, why)
+                return _failed(exc)
+            return self._not_left(network) if insist and not self.joined else None
 
-        answers = side_by_side(stopped, self.stated)
-        return {each.name: said for each, said in zip(self.stated, answers, strict=True) if said is not None}
+        return dict(zip(networks, side_by_side(stopped, networks), strict=True))
+
+    def _not_left(self, network: NetworkAdapter) -> Envelope:
+        return error(self.absent.get(network.name) or CLOSED, stopped=None)
+
+    def _with_silent(self, robot: str, answers: Mapping[NetworkAdapter, Envelope | None]) -> dict[str, Envelope]:
+        """Return the answers by network, also for those that remember the robot.
+
+        Args:
+            robot: the id.
+            answers: to the stop, None of a network where it is not, or that is gone.
+        """
+        # A mesh that is not there has no key as long as it is not asked for.
+        keys = {each.name: partial(getattr, each, "key") for each, said in answers.items() if said is None} | self.keys
+        known = {each.name: said for each, said in answers.items() if said is not None}
+        if not keys:
+            return known
+        from strands_robots.fleet.stop_answers import remembered  # noqa: PLC0415 - loaded once the stop has left
+
+        joined = {each.name for each in self.joined}
+        whys = {name: "" if name in joined else self.absent.get(name) or "it is not joined" for name in keys}
+        return known | remembered(robot, keys, whys)
 
     def _at_once(self, robot: str, *, moves: bool) -> NetworkAdapter | None:
         """Return the network of a robot where it is known without a question."""
         joined = self.joined
         if len(joined) == 1 and all(each.attempted.is_set() for each in self._joinings):
-            return joined[0]
+            return None if moves and self._enrolled_on_absent(robot) else joined[0]
         bearers = self.bearers(robot)
-        return None if moves or not bearers else self._decided(robot, bearers) or bearers[0]
+        return None if moves or not bearers else self._chosen(robot, "", bearers, moves=False)
+
+    def _chosen(self, robot: str, verb: str, bearers: Sequence[NetworkAdapter], *, moves: bool) -> NetworkAdapter:
+        if not moves:
+            return self.decided(robot) or bearers[0]
+        absent = self._enrolled_on_absent(robot)
+        if len(bearers) == 1 and not absent:
+            return bearers[0]
+        from strands_robots.fleet.shared_id import decided  # noqa: PLC0415 - few ids are on two networks
+
+        return decided(self._shared_id(robot), robot, verb, bearers, absent)
+
+    def _enrolled_on_absent(self, robot: str) -> dict[str, bytes]:
+        """Return the keys of an id that are enrolled on networks which are gone."""
+        joined, keys = self.joined, dict[str, bytes]()
+        for each in self.stated:
+            if each not in joined:
+                # A mesh of this machine that is not there has none.
+                with suppress(RefusalError):
+                    if key := each.enrolled_key(robot):
+                        keys[each.name] = key
+        return keys
 
     def _shared_id(self, robot: str) -> SharedId:
+        from strands_robots.fleet.shared_id import SharedId  # noqa: PLC0415 - as above
+
         with self._change:
             if len(self._shared_ids) >= SHARED_IDS_MAX and robot not in self._shared_ids:
                 del self._shared_ids[next(iter(self._shared_ids))]
             return self._shared_ids.setdefault(robot, SharedId())
-
-    def _decided(self, robot: str, bearers: Sequence[NetworkAdapter]) -> NetworkAdapter | None:
-        """Return the network that was decided on, where it still has the robot."""
-        known = self._shared_ids.get(robot)
-        return known.decided if known is not None and known.decided in bearers else None
 
 
 def _by_id(listed: Sequence[tuple[NetworkAdapter, list[FoundRobot]]]) -> dict[str, tuple[FoundRobot, NetworkAdapter]]:
@@ -602,47 +643,56 @@ def _bears(network: NetworkAdapter, robot: str) -> bool:
         return False
 
 
-def _silent(network: NetworkAdapter, robot: str, why: str) -> Envelope | None:
-    """Return the answer of a silent robot that a network remembers, else None.
+def _meant(arguments: Mapping[str, Any]) -> tuple[str, str]:
+    """Return the robot of a world that a stop means, empty for all, and a note."""
+    if not arguments:
+        return "", ""
+    from strands_robots.serving.stop_arguments import robot_of_world  # noqa: PLC0415 - a call need not load it
 
-    Args:
-        network: where it is remembered.
-        robot: its id.
-        why: the reason why the network is not joined; empty for one that is.
-    """
-    from strands_robots.fleet.stop_answers import not_reached  # noqa: PLC0415 - few stops need it
+    return robot_of_world(arguments)
 
+
+def _one_answer(robot: str, answers: Mapping[str, Envelope], unread: str) -> Envelope:
+    from strands_robots.fleet.stop_answers import answer_of_bearers  # noqa: PLC0415 - loaded once the stop has left
+    from strands_robots.serving.stop_arguments import noted  # noqa: PLC0415 - as above
+
+    return noted(answer_of_bearers(robot, answers), unread)
+
+
+def _graded(answer: Envelope | None) -> bool:
+    """Return whether an answer says that a robot has stopped, or not."""
+    return answer is not None and answer.get("stopped") is not None
+
+
+def _absent(network: NetworkAdapter, robot: str, answer: Envelope | None) -> bool:
+    """Return whether no robot of this id took a stop."""
+    return answer is None or (answer.get("in_reach") is False and not _bears(network, robot))
+
+
+def _failed(exc: BaseException) -> Envelope | None:
+    """Return what stands for the answer to a stop that failed."""
+    return None if isinstance(exc, NoSuchRobotError) else error(f"{type(exc).__name__}: {exc}", stopped=None)
+
+
+def _result(stop: asyncio.Future[Envelope | None]) -> Envelope | None:
     try:
-        outcome = not_reached(network.key, left=not why)
-    except Exception as exc:  # noqa: BLE001 - a memory that cannot be read hides no answer of another network
-        logger.warning("The roster of %s cannot be read: %s", network.name, exc)
-        return None
-    # One that said that it left may be on another network now.
-    left = any(row.name == robot and row.departed for row in outcome.roster.rows)
-    if left or robot not in outcome.report.silent:
-        return None
-    reason = "; ".join(filter(None, (why.rstrip("."), outcome.reasons.get(robot, ""))))
-    return error(f"{robot} did not answer: {reason or 'it is remembered there'}.", stopped=None)
+        return stop.result()
+    except asyncio.CancelledError:
+        # Of one network, which hides no answer of another one.
+        return error(CLOSED, stopped=None)
 
 
-def _waited_for(robot: str, networks: Sequence[NetworkAdapter], *, every: bool) -> list[NetworkAdapter]:
-    """Return the networks that have a robot: all, or the first one that is known to."""
-    found: dict[NetworkAdapter, bool] = {}
-    change = threading.Condition()
+def _tell(listener: Callable[[NetworkAdapter], None], network: NetworkAdapter) -> None:
+    """Call a listener, whose failure keeps no other one from hearing."""
+    try:
+        listener(network)
+    except Exception:
+        logger.exception("A listener failed for %s.", network.name)
 
-    def ask(network: NetworkAdapter) -> None:
-        try:
-            there = network.reaches(robot)
-        except RefusalError as exc:
-            logger.debug("%s: %s cannot be looked for: %s", network.name, robot, exc)
-            there = False
-        with change:
-            found[network] = there
-            change.notify_all()
 
-    for each in networks[1:]:
-        threading.Thread(target=ask, args=(each,), name=f"look on {each.name}", daemon=True).start()
-    ask(networks[0])
-    with change:
-        change.wait_for(lambda: len(found) == len(networks) or (not every and any(found.values())))
-        return [each for each in networks if found.get(each)]
+def _reaches(network: NetworkAdapter, robot: str) -> bool:
+    try:
+        return network.reaches(robot)
+    except RefusalError as exc:
+        logger.debug("%s: %s cannot be looked for: %s", network.name, robot, exc)
+        return False

@@ -73,9 +73,7 @@ def said(refusal: RefusalError) -> str:
     The ids near an absent one stay.
     """
     if refusal.envelope:
-        text = text_of(refusal.envelope)
-        # The mesh refuses with a word, of which an agent knows no meaning.
-        return f"{text}: {refusal.why}." if text.endswith(tuple(EXACT)) else text
+        return text_of(refusal.envelope)
     if isinstance(refusal, UnreachableError):
         return f"The network does not carry this: {refusal.why}"
     if isinstance(refusal, ValueError):
@@ -95,6 +93,12 @@ async def answered(call: Awaitable[Envelope]) -> Envelope:
         return await call
     except RefusalError as refusal:
         return answer_to(refusal)
+
+
+def with_meaning(text: str) -> str:
+    """Return a refusal of the mesh, with its meaning where it is a fixed word."""
+    known = EXACT.get(text)
+    return text if known is None else f"{text}: {known[1]}"
 
 
 def refusal_of(robot: str, verb: str, answer: Mapping[str, Any]) -> RefusalError:

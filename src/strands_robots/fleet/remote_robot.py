@@ -9,7 +9,6 @@ from __future__ import annotations
 import base64
 import io
 import logging
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -20,13 +19,12 @@ from strands_robots.errors import NoSuchRobotError, RefusalError, RobotError, Un
 from strands_robots.fleet.adapter import STOP_S, FoundRobot, NetworkAdapter
 from strands_robots.fleet.description import docstring, python_name, signature
 from strands_robots.fleet.event_feed import EventFeed
-from strands_robots.fleet.fleet_verdict import combined, verdict_of_answer
 from strands_robots.fleet.lease import HeldLease, SharedLease
+from strands_robots.fleet.networks import STILL, Networks
 from strands_robots.fleet.refusals import refusal_of
-from strands_robots.fleet.shared_id import SharedId, decided
-from strands_robots.fleet.side_by_side import side_by_side
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.advertised import AdvertisedVerb, RobotDescription
+from strands_robots.serving.known_verbs import READS, RESUMES, STOPS
 from strands_robots.serving.verbs import LEASE_ID
 from strands_robots.utils import DURATION_MAX_S, START_S, WAIT_S, near, number, optional_module, text
 
@@ -41,15 +39,6 @@ ROBOTS_MAX = 1000
 
 ROBOT_NAME = "robot_name"
 """Argument that names one robot of a world."""
-
-OF_THE_HOLDER = ("renewControl", "releaseControl", "resume")
-"""Verbs that write and move nothing; they go to the robot that reads go to."""
-
-READS = frozenset({"getStatus", "getState", "getFeatures", "status", "state", "features"})
-"""Names of reads that a mesh peer answers to without describing each of them."""
-
-Networks = Callable[[], Sequence[NetworkAdapter]]
-"""Returns the networks that are joined now."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,15 +84,15 @@ class RemoteRobot:
     Args:
         found: the robot as its network announces it.
         network: the network that reads and calls go to.
-        networks: returns all networks on which a robot may have this id; ``network`` alone by default.
+        networks: all on which a robot may have this id; ``network`` alone by default.
     """
 
     def __init__(self, found: FoundRobot, network: NetworkAdapter, networks: Networks | None = None) -> None:
         self._found, self._network = found, network
-        self._networks: Networks = networks or (lambda: (network,))
+        self._networks = networks or Networks([network])
+        self._one: Mapping[str, str] = {}
         self._described_as: _Known | None = None
         self._lease = SharedLease()
-        self._shared_id = SharedId()
         self._of_world: dict[str, RobotOfWorld] = {}
 
     @property
@@ -228,15 +217,8 @@ class RemoteRobot:
         Returns:
             The verdict; *unknown* by name where the robot did not answer or has no stop.
         """
-        began, networks = time.monotonic(), tuple(self._networks()) or (self._network,)
         logger.debug("%s is halted: %s", self.id, reason)
-        answers = side_by_side(self._stopped_on, networks)
-        bearers = [(each, said) for each, said in zip(networks, answers, strict=True) if said is not None]
-        verdicts = [
-            verdict_of_answer(said, self.id if len(bearers) == 1 else f"{self.id} on {each.name}")
-            for each, said in bearers
-        ]
-        return combined(self.id, verdicts, (time.monotonic() - began) * 1000)
+        return self._networks.halt(self.address, **self._one)
 
     @contextmanager
     def control(self, ttl_s: float = 60.0) -> Iterator[Self]:
@@ -325,15 +307,10 @@ class RemoteRobot:
         del verb
         return arguments
 
-    def _stopped_on(self, network: NetworkAdapter) -> object:
-        return _stopped(self.address, network, insist=network is self._network)
-
     def rediscovered(self, found: FoundRobot, network: NetworkAdapter) -> None:
         """Take what a new discovery found; its verbs are read again when they are used."""
-        decided = self._shared_id.decided
-        if decided is not None and decided is not network and decided.bears(self.address):
-            network = decided
-        self._found, self._network, self._described_as = found, network, None
+        self._found, self._described_as = found, None
+        self._network = self._networks.decided(self.address) or network
 
     def _acquired(self, ttl_s: float) -> HeldLease:
         if not self.has_lease:
@@ -364,9 +341,14 @@ class RemoteRobot:
         return method
 
     def _call(self, verb: str, arguments: Mapping[str, Any], timeout: float | None) -> dict[str, Any]:
+        if verb in STOPS and len(self._networks.stated) > 1:
+            # It waits for no description, and goes to every robot of this id.
+            stop = {**arguments, **self._one}
+            return self._taken(verb, self._networks.call(self.address, verb, stop, timeout or STOP_S))
         description = self._described.verbs.get(verb)
         kind = ("read" if verb in READS else "motion") if description is None else description.kind
-        if kind == "motion" and verb not in OF_THE_HOLDER:
+        moves = kind == "motion" and verb not in STILL
+        if moves:
             if self._decide(verb):
                 description = self._described.verbs.get(verb)
             lease_id = self._lease.lease_id
@@ -377,21 +359,31 @@ class RemoteRobot:
         if timeout is None:
             timeout = _patience(description, arguments)
         try:
-            answer: Envelope = self._network.call(self.address, verb, self._sent(verb, arguments), timeout)
+            return self._taken(verb, self._answer(verb, self._sent(verb, arguments), timeout, moves=moves))
         except UnknownVerbError:
             self._describe(anew=True)
             raise self._unknown(verb) from None
+
+    def _answer(self, verb: str, arguments: Mapping[str, Any], timeout: float, *, moves: bool) -> Envelope:
+        try:
+            return self._network.call(self.address, verb, arguments, timeout)
+        except NoSuchRobotError:
+            other = self._networks.instead(self.address, verb, self._network, moves=moves)
+            if other is None:
+                raise
+        self._network, self._described_as = other, None
+        return other.call(self.address, verb, arguments, timeout)
+
+    def _taken(self, verb: str, answer: Envelope) -> Envelope:
         if is_error(answer):
             raise refusal_of(self.id, verb, answer)
         return answer
 
     def _decide(self, verb: str) -> bool:
         """Use the network that motions go to; True where it is another one."""
-        networks = self._networks()
-        bearers = [each for each in networks if each.bears(self.address)] if len(networks) > 1 else ()
-        if len(bearers) < 2:
+        if not self._networks.decides(self.address):
             return False
-        network = decided(self._shared_id, self.address, verb, bearers)
+        network = self._networks.of(self.address, verb, moves=True)
         if network is self._network:
             return False
         self._network, self._described_as = network, None
@@ -418,7 +410,7 @@ class RobotOfWorld(RemoteRobot):
             FoundRobot(f"{world.id}/{name}", world.type, name, world.tags), world._network, world._networks
         )
         self._whole: _Known | None = None
-        self._shared_id = world._shared_id
+        self._one = {ROBOT_NAME: name}
 
     @property
     def address(self) -> str:
@@ -462,11 +454,8 @@ class RobotOfWorld(RemoteRobot):
     def _sent(self, verb: str, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         whole = self._world.verbs.get(verb)
         # A motion that is not described is never sent without the robot's name: it would move another one.
-        named = verb not in {*READS, *OF_THE_HOLDER} if whole is None else ROBOT_NAME in whole.by_name
-        return {**arguments, ROBOT_NAME: self._name} if named else arguments
-
-    def _stopped_on(self, network: NetworkAdapter) -> object:
-        return _stopped(self.address, network, self._name, insist=network is self._network)
+        named = verb not in READS | RESUMES if whole is None else ROBOT_NAME in whole.by_name
+        return {**arguments, **self._one} if named else arguments
 
 
 def _of_one(verb: AdvertisedVerb) -> AdvertisedVerb | None:
@@ -478,15 +467,6 @@ def _of_one(verb: AdvertisedVerb) -> AdvertisedVerb | None:
 
 _RESERVED = frozenset(dir(RemoteRobot))
 """Names of members, which no verb of a robot takes."""
-
-
-def _stopped(robot: str, network: NetworkAdapter, robot_name: str = "", *, insist: bool = False) -> object:
-    try:
-        return network.stop(robot, STOP_S, robot_name, insist=insist)
-    except NoSuchRobotError:
-        return None
-    except Exception as exc:  # noqa: BLE001 - a stop that fails is a verdict, whatever it raised
-        return {"status": "error", "stopped": None, "reason": f"{type(exc).__name__}: {exc}"}
 
 
 def _patience(verb: AdvertisedVerb | None, arguments: Mapping[str, Any]) -> float:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import secrets
 import threading
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Collection, Mapping, Sequence
+from types import MappingProxyType
 
-from strands_robots.errors import AmbiguousRobotError, RefusalError
+from strands_robots.errors import AmbiguousRobotError, NoSuchRobotError, RefusalError
 from strands_robots.fleet.adapter import NetworkAdapter
 from strands_robots.fleet.side_by_side import side_by_side
 from strands_robots.safety.statements import Purpose, own_key
@@ -14,12 +17,15 @@ from strands_robots.safety.statements import Purpose, own_key
 ASK_S = 5.0
 """Seconds in which both robots have to sign."""
 
+DECIDED_S = 10.0
+"""Seconds for which a decision counts: another process may take the id unseen."""
+
 
 class SharedId:
     """Decides which network has the robot that motions of one id go to.
 
-    A robot that is served on both networks signs on both with the key of its machine. Answers are remembered until a
-    session ends or robots are looked for again.
+    A robot that is served on both networks signs on both with the key of its machine. A decision counts for
+    :data:`DECIDED_S` seconds, unless a session ends or robots are looked for again.
 
     Attributes:
         decided: the network of the last decision; None without one.
@@ -29,58 +35,79 @@ class SharedId:
         self.decided: NetworkAdapter | None = None
         self._lock = threading.Lock()
         self._asked: tuple[object, ...] = ()
+        self._asked_at = -math.inf
 
-    def decide(self, robot: str, bearers: Sequence[NetworkAdapter]) -> NetworkAdapter | None:
+    def decide(
+        self, robot: str, bearers: Sequence[NetworkAdapter], absent: Mapping[str, bytes] = MappingProxyType({})
+    ) -> NetworkAdapter | None:
         """Return the network that motions go to; None where no key decides.
 
         Args:
             robot: the id.
             bearers: networks that have it, the one to prefer first.
+            absent: keys of this id that are enrolled on networks which are not joined, one of which has to sign then.
         """
         with self._lock:
-            asked = tuple((each.name, each.session(robot)) for each in bearers)
-            if asked != self._asked or self.decided not in bearers:
-                keys = side_by_side(lambda each: _signing_key(robot, each), bearers)
-                self.decided = _proven(robot, bearers, keys)
+            asked = (tuple(absent.items()), *((each.name, each.session(robot)) for each in bearers))
+            old = time.monotonic() - self._asked_at > DECIDED_S
+            if old or asked != self._asked or self.decided not in bearers:
+                signed = side_by_side(lambda each: _signing_key(robot, each), bearers)
+                keys = {each: key for each, (there, key) in zip(bearers, signed, strict=True) if there}
+                self.decided = _proven(robot, keys, set(absent.values()))
                 # A robot that did not answer, or not signed, is asked again.
-                self._asked = asked if self.decided is not None else ()
+                self._asked, self._asked_at = (asked if self.decided is not None else ()), time.monotonic()
             return self.decided
 
 
-def decided(shared_id: SharedId, robot: str, verb: str, bearers: Sequence[NetworkAdapter]) -> NetworkAdapter:
+def decided(
+    shared_id: SharedId, robot: str, verb: str, bearers: Sequence[NetworkAdapter], absent: Mapping[str, bytes]
+) -> NetworkAdapter:
     """Return the network that a motion goes to.
 
     Raises:
         AmbiguousRobotError: no key decides.
     """
-    network = shared_id.decide(robot, bearers)
+    network = shared_id.decide(robot, bearers, absent)
     if network is None:
         named = " and ".join(each.name for each in bearers)
+        several = f"{named} both have a robot of this id, and no key decides"
+        enrolled = " and ".join(absent)
+        alone = f"it is enrolled on {enrolled}, which is not joined, and that on {named} has not shown the key"
         raise AmbiguousRobotError(
-            f"{verb} is sent to neither: {named} both have a robot of this id, and no key decides",
+            f"{verb} is sent to neither: {several}" if len(bearers) > 1 else f"{verb} is not sent: {alone}",
             robot=robot,
             verb=verb,
         )
     return network
 
 
-def _proven(robot: str, bearers: Sequence[NetworkAdapter], keys: Sequence[bytes | None]) -> NetworkAdapter | None:
-    if None not in keys and len(set(keys)) == 1:
+def _proven(
+    robot: str, keys: Mapping[NetworkAdapter, bytes | None], absent: Collection[bytes]
+) -> NetworkAdapter | None:
+    """Return the network whose robot's key proves it.
+
+    Args:
+        robot: the id.
+        keys: that signed the answer on each network that has the robot, the one to prefer first.
+        absent: keys that are enrolled on networks which are not joined.
+    """
+    bearers = [*keys]
+    if not absent and (len(bearers) == 1 or (bearers and None not in keys.values() and len({*keys.values()}) == 1)):
         return bearers[0]
-    enrolled = [
-        each for each, key in zip(bearers, keys, strict=True) if key is not None and key == each.enrolled_key(robot)
-    ]
-    return enrolled[0] if len(enrolled) == 1 else None
+    enrolled = [each for each, key in keys.items() if key is not None and key in {each.enrolled_key(robot), *absent}]
+    return enrolled[0] if enrolled and len({keys[each] for each in enrolled}) == 1 else None
 
 
-def _signing_key(robot: str, network: NetworkAdapter) -> bytes | None:
-    """Return the key that signs an answer to a fresh question; None for none."""
+def _signing_key(robot: str, network: NetworkAdapter) -> tuple[bool, bytes | None]:
+    """Return whether the robot is there, and the key that signs a fresh answer."""
     nonce = secrets.token_hex(16)
     try:
         answer = network.call(robot, network.reads["status"], {"nonce": nonce}, ASK_S)
+    except NoSuchRobotError:
+        return False, None
     except RefusalError:
-        return None
+        return True, None
     statement = answer.get("statement")
     if not isinstance(statement, Mapping) or statement.get("nonce") != nonce:
-        return None
-    return own_key(Purpose.LOCKOUT_STATE, robot, statement)
+        return True, None
+    return True, own_key(Purpose.LOCKOUT_STATE, robot, statement)

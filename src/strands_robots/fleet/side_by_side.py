@@ -4,10 +4,31 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from functools import partial
 from typing import TypeVar
 
 T = TypeVar("T")
 R = TypeVar("R")
+
+
+def on_own_thread(work: Callable[[], R]) -> Future[R]:
+    """Begin ``work`` on a thread of its own, or do it here where none starts."""
+    done: Future[R] = Future()
+    # From now on it cannot be cancelled.
+    done.set_running_or_notify_cancel()
+
+    def run() -> None:
+        try:
+            done.set_result(work())
+        except BaseException as exc:  # noqa: BLE001 - it is raised where the result is taken
+            done.set_exception(exc)
+
+    try:
+        threading.Thread(target=run, name="fleet-work", daemon=True).start()
+    except RuntimeError:
+        run()
+    return done
 
 
 def side_by_side(work: Callable[[T], R], items: Sequence[T]) -> list[R]:
@@ -41,3 +62,27 @@ def side_by_side(work: Callable[[T], R], items: Sequence[T]) -> list[R]:
     if failed:
         raise failed[min(failed)]
     return [done[place] for place in range(len(items))]
+
+
+def those(test: Callable[[T], bool], items: Sequence[T], *, every: bool) -> list[T]:
+    """Return items for which ``test`` is true: all, or those known at the first one.
+
+    One that raises is none.
+    """
+    found: dict[int, bool] = {}
+    change = threading.Condition()
+
+    def one(place: int) -> None:
+        there = False
+        try:
+            there = test(items[place])
+        finally:
+            with change:
+                found[place] = there
+                change.notify_all()
+
+    for place in range(len(items)):
+        on_own_thread(partial(one, place))
+    with change:
+        change.wait_for(lambda: len(found) == len(items) or (not every and any(found.values())))
+        return [each for place, each in enumerate(items) if found.get(place)]

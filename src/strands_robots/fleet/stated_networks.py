@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-import socket
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
-from typing import Any, NoReturn
+from typing import Any, NoReturn, cast
 
 from strands_robots import settings
 from strands_robots._mesh_switch import mesh_env_request
 from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH, NetworkAdapter
 from strands_robots.fleet.link_flags import LinkFlags
+from strands_robots.fleet.mesh.local import LocalMesh, local_key, no_hub
 from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.profiles import FleetProfile
-from strands_robots.safety import network_key
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.utils import MissingExtraError, ValidationError
-
-HUB_S = 0.2
-"""Seconds in which the mesh's hub on this machine takes a connection."""
 
 
 def networks_of(
@@ -32,6 +28,7 @@ def networks_of(
     mesh: bool | None = None,
     stays: bool = False,
     preload: bool = False,
+    console: bool = False,
 ) -> Networks:
     """Return the networks of a caller, not joined yet.
 
@@ -46,6 +43,7 @@ def networks_of(
         mesh: True joins the mesh in any case, False leaves it out.
         stays: go on trying to join what is not there yet, such as the mesh once its hub has come.
         preload: load now what a stop must not wait for, as a program does that lasts longer than a command.
+        console: on the mesh the caller's name is its whole id, by which robots may know a safety controller.
 
     Raises:
         ValidationError: the profile or the flags cannot be used.
@@ -53,7 +51,6 @@ def networks_of(
     absent: dict[str, str] = {}
     keys: dict[str, Callable[[], NetworkKey]] = {}
     networks: list[NetworkAdapter] = []
-    later: list[Callable[[], NetworkAdapter | None]] = []
     if not devices:
         absent[DEVICE_CONNECT] = "it is left out"
     elif profile is not None and not profile.reaches_devices(given):
@@ -65,27 +62,33 @@ def networks_of(
         networks.append(DeviceConnectNetwork(flags.link(), source, preload=preload or stays))
     else:
         absent[DEVICE_CONNECT] = "the extra device-connect is not installed"
+    unasked = {*absent}
     stated = None if profile is None or mesh is False else profile.mesh
-    if mesh is False or mesh_env_request() is False:
+    off = mesh is False or mesh_env_request() is False
+    if not mesh and (off or (stated is None and (profile is not None or not _states_mesh()))):
+        unasked.add(MESH)
+    if off:
         absent[MESH] = "it is switched off"
     elif profile is not None and stated is None and mesh is None:
         # The mesh of the environment may be another fleet's.
         absent[MESH] = f"the connection profile {profile.label} has none"
     elif mesh is None and stated is None and find_spec("zenoh") is None:
         absent[MESH] = "the extra mesh is not installed"
-    elif mesh is None and stated is None and (why := _no_hub()):
+    elif MESH in unasked:
         # Its code is not loaded: most machines have no mesh.
-        absent[MESH], keys[MESH] = why, _mesh_here
-        later += [lambda: None if _no_hub() else _mesh(source, None)] if stays else []
+        if stays or not (why := no_hub()):
+            networks.append(cast("NetworkAdapter", LocalMesh(source, console=console)))
+        else:
+            absent[MESH], keys[MESH] = why, local_key
     else:
-        networks.append(_mesh(source, stated))
-    return Networks(networks, absent, keys, stays=stays, later=later)
+        networks.append(_mesh(source, stated, console))
+    return Networks(networks, absent, keys, stays=stays, unasked=unasked)
 
 
-def _mesh(source: str, stated: Mapping[str, str] | None) -> NetworkAdapter:
+def _mesh(source: str, stated: Mapping[str, str] | None, console: bool) -> NetworkAdapter:
     from strands_robots.fleet.mesh.network import MeshNetwork  # noqa: PLC0415 - loaded when it is used
 
-    return MeshNetwork(source, stated)
+    return MeshNetwork(source, stated, console=console)
 
 
 def networks_for_stop(
@@ -116,23 +119,13 @@ def networks_for_stop(
     raise unfit
 
 
-def _no_hub() -> str:
-    """Return why this machine has no mesh, or "" where it may have one."""
-    if settings.raw("STRANDS_MESH_BACKEND").lower() != "zenoh" or mesh_env_request():
-        return ""
-    if any(settings.items(f"{whose}_{way}") for whose in ("STRANDS_MESH", "ZENOH") for way in ("CONNECT", "LISTEN")):
-        return ""
-    port = settings.integer("STRANDS_MESH_PORT")
-    try:
-        socket.create_connection(("127.0.0.1", port), HUB_S).close()
-    except OSError:
-        return f"no mesh answers on 127.0.0.1:{port}"
-    return ""
-
-
-def _mesh_here() -> NetworkKey:
-    """Return the name of this machine's mesh, as ``mesh.session`` has it."""
-    return NetworkKey.of(network_key.MESH, [f"tcp/127.0.0.1:{settings.integer('STRANDS_MESH_PORT')}"])
+def _states_mesh() -> bool:
+    """Return whether the settings ask for a mesh."""
+    return (
+        settings.raw("STRANDS_MESH_BACKEND").lower() != "zenoh"
+        or bool(mesh_env_request())
+        or any(settings.items(f"{whose}_{way}") for whose in ("STRANDS_MESH", "ZENOH") for way in ("CONNECT", "LISTEN"))
+    )
 
 
 def _unusable(unfit: Exception) -> NoReturn:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
 from strands_robots.envelope import Envelope, error, is_error, success, text_of
+from strands_robots.fleet.side_by_side import side_by_side
 from strands_robots.safety.answers import Answer
 from strands_robots.safety.controller import StopReport
 from strands_robots.safety.network_key import NetworkKey
@@ -16,6 +18,26 @@ from strands_robots.safety.silence import Sending
 from strands_robots.safety.stop_notes import stop_notes
 from strands_robots.safety.stop_roster import StopOutcome, StopRoster
 from strands_robots.safety.stopping import explain, grade
+
+logger = logging.getLogger(__name__)
+
+
+def by_bearer(robot: str, answers: Mapping[str, Envelope]) -> dict[str, Envelope]:
+    """Return answers by network under names that tell their robots apart."""
+    several = len(answers) > 1
+    return {f"{robot} on {network}" if several else robot: said for network, said in answers.items()}
+
+
+def answer_of_bearers(robot: str, answers: Mapping[str, Envelope], stale: str = "") -> Envelope:
+    """Return the answers of all robots of an id as one, that of one network as it is.
+
+    Args:
+        robot: the id.
+        answers: by network.
+        stale: as of :func:`combined_verdict`, where several networks have answered.
+    """
+    first, *others = answers.values() or (unanswered(robot),)
+    return combined_verdict(by_bearer(robot, answers), stale) if others else first
 
 
 def stop_outcome(answer: Envelope) -> tuple[bool | None, str]:
@@ -86,6 +108,43 @@ def not_reached(network: NetworkKey, *, left: bool = False) -> StopOutcome:
     roster = StopRoster(network)
     threading.Thread(target=roster.read, name="stop roster", daemon=True).start()
     return measured({}, roster, Sending(left=left))
+
+
+def remembered(
+    robot: str, keys: Mapping[str, Callable[[], NetworkKey]], whys: Mapping[str, str]
+) -> dict[str, Envelope]:
+    """Return by network the answer of a silent robot that is remembered there.
+
+    Args:
+        robot: its id.
+        keys: return the names under which robots of each network are remembered.
+        whys: the reasons why the stop did not leave on a network; empty where it did.
+    """
+    names = list(keys)
+    said = side_by_side(lambda name: _silence_of(robot, name, keys[name], whys[name]), names)
+    return {name: each for name, each in zip(names, said, strict=True) if each is not None}
+
+
+def _silence_of(robot: str, network: str, key: Callable[[], NetworkKey], why: str) -> Envelope | None:
+    """Return the answer of a silent robot that this machine remembers, else None.
+
+    Args:
+        robot: its id.
+        network: the name of the network where it is remembered.
+        key: returns the name under which its robots are.
+        why: the reason why the stop did not leave there; empty where it did.
+    """
+    try:
+        outcome = not_reached(key(), left=not why)
+    except Exception as exc:  # noqa: BLE001 - a memory that cannot be read hides no answer of another network
+        logger.warning("The roster of %s cannot be read: %s", network, exc)
+        return None
+    # One that said that it left may be on another network now.
+    if not any(row.name == robot and not row.departed for row in outcome.roster.rows):
+        return None
+    reasons = [f"it did not leave on {network}: {why.rstrip('.')}" if why else "", outcome.reasons.get(robot, "")]
+    said = "; ".join(filter(None, reasons)) or "it is remembered there"
+    return error(f"{robot} did not answer: {said}.", stopped=None)
 
 
 def with_reasons(outcome: StopOutcome, answers: Mapping[str, Envelope], *, plain: bool = False) -> StopOutcome:

@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Collection
 from dataclasses import replace
+from functools import partial
 from typing import Any, Protocol
 
 from strands_robots.safety.controller import OnProgress, Progress, StopReport
@@ -20,6 +21,13 @@ from strands_robots.safety.stop_roster import StopOutcome, StopRoster
 
 KEY_REPEAT_S = 1.0
 """Presses closer than this are one stop: a key held down repeats, and a robot distinguishes at most 64 stops."""
+
+
+LATE_S = 10.0
+"""Seconds after a press in which it leaves on a network that is added then."""
+
+Expected = Callable[[Scope], Collection[str]]
+"""Returns the robots that must answer a stop of a scope."""
 
 
 class StopSender(Protocol):
@@ -96,6 +104,7 @@ class StopButton:
         self._scope = scope
         self._guard = threading.Lock()
         self._id, self._running, self._last = "", False, float("-inf")
+        self._over = ""
         self._closing = threading.Event()
 
     @property
@@ -103,15 +112,19 @@ class StopButton:
         """True while a stop waits for answers."""
         return self._running
 
-    def press(self) -> None:
-        """Stop everything; returns at once."""
+    def press(self, estop_id: str = "") -> None:
+        """Stop everything; returns at once.
+
+        Args:
+            estop_id: of a stop that begins with this press, 32 hex digits; a fresh one by default.
+        """
         now = time.monotonic()
         with self._guard:
             repeated, self._last = now - self._last < KEY_REPEAT_S, now
             if repeated and self._running:
                 return
             if not (repeated and self._id):
-                self._id = new_epoch()
+                self._id = new_epoch() if estop_id in ("", self._over) else estop_id
                 self._controller.press(self._id)
             self._running = True
             threading.Thread(target=self._stop, args=(self._id,), name="space bar", daemon=True).start()
@@ -166,8 +179,9 @@ class StopButton:
                 self.outcome, self._roster = outcome, roster
                 self.report, self._running = report, unfinished and not self._closing.is_set()
                 if not self._running:
-                    # A robot that was resumed meanwhile acts only on a stop with a new id.
-                    self._id = "" if report.refused else self._id
+                    if report.refused:
+                        # A robot that was resumed meanwhile acts only on a stop with a new id.
+                        self._id, self._over = "", estop_id
                     return
 
     def _measured(self, roster: StopRoster | None, report: StopReport) -> StopOutcome | None:
@@ -177,38 +191,86 @@ class StopButton:
 
 
 class StopButtons:
-    """Stop button of all robots, and one for each robot or cell that was pressed.
+    """Stop buttons of a console: for each scope that was pressed one on each network.
 
-    Each press of another one is a stop of its own, so that none waits for another or narrows it.
+    Each press of another scope is a stop of its own, so that none waits for another or narrows it. One press has one
+    id on all networks. A stop of every robot leaves on a network that is added later, too, under its id: where it was
+    pressed in the last :data:`LATE_S` seconds, or still runs on another network. One of some robots does not: it is
+    for the networks that have them.
 
     Args:
-        make: makes the button of a scope.
+        reason: sent to the robots.
     """
 
-    def __init__(self, make: Callable[[Scope], StopButton]) -> None:
-        self._make = make
-        self.latest = make(EVERY_ROBOT)
-        """The button that was pressed last."""
-        self._buttons = {EVERY_ROBOT: self.latest}
+    def __init__(self, reason: str) -> None:
+        self._reason = reason
+        self._lock = threading.Lock()
+        self._networks: dict[str, tuple[StopSender, Expected]] = {}
+        self._buttons: dict[tuple[str, Scope], StopButton] = {}
+        self._pressed: dict[Scope, tuple[str, float]] = {}
+        self._scope = EVERY_ROBOT
 
-    def press(self, scope: Scope = EVERY_ROBOT) -> None:
-        """Stop the robots of a scope; returns at once."""
-        if scope not in self._buttons:
-            self._buttons = {**self._buttons, scope: self._make(scope)}
-        self.latest = self._buttons[scope]
-        self.latest.press()
+    def add(self, network: str, controller: StopSender, expected: Expected) -> None:
+        """Add a network; a press that it has missed leaves on it.
+
+        Args:
+            network: its name.
+            controller: sends on it.
+            expected: returns the robots that must answer a stop of a scope; called at each press.
+        """
+        with self._lock:
+            self._networks[network] = controller, expected
+            estop_id, at = self._pressed.get(EVERY_ROBOT, ("", float("-inf")))
+            held = any(each.running for (_, scope), each in self._buttons.items() if scope.everything)
+            late = self._button(network, EVERY_ROBOT) if held or time.monotonic() - at < LATE_S else None
+        if late is not None:
+            late.press(estop_id)
+
+    def press(self, scope: Scope = EVERY_ROBOT, networks: Collection[str] = ()) -> None:
+        """Stop the robots of a scope; returns at once.
+
+        Args:
+            scope: the robots.
+            networks: names of those that have them; all by default.
+        """
+        now = time.monotonic()
+        with self._lock:
+            estop_id, at = self._pressed.get(scope, ("", float("-inf")))
+            # A key that is held down repeats: it is one stop.
+            estop_id = estop_id if now - at < KEY_REPEAT_S else new_epoch()
+            self._pressed[scope], self._scope = (estop_id, now), scope
+            meant = [name for name in self._networks if name in networks] or list(self._networks)
+            buttons = [self._button(name, scope) for name in meant]
+        for each in buttons:
+            each.press(estop_id)
+
+    @property
+    def latest(self) -> dict[str, StopButton]:
+        """The buttons of the scope that was pressed last, by network."""
+        with self._lock:
+            return {name: each for (name, scope), each in self._buttons.items() if scope == self._scope}
 
     @property
     def running(self) -> bool:
         """True while a stop waits for answers."""
-        return any(each.running for each in self._buttons.values())
+        return any(each.running for each in self._every())
 
     def review(self) -> None:
         """Take what robots have said since the stops ended."""
-        for each in self._buttons.values():
+        for each in self._every():
             each.review()
 
     def close(self) -> None:
         """Give up stops that wait for the link."""
-        for each in self._buttons.values():
+        for each in self._every():
             each.close()
+
+    def _every(self) -> list[StopButton]:
+        with self._lock:
+            return list(self._buttons.values())
+
+    def _button(self, network: str, scope: Scope) -> StopButton:
+        if (network, scope) not in self._buttons:
+            controller, expected = self._networks[network]
+            self._buttons[network, scope] = StopButton(controller, partial(expected, scope), self._reason, scope)
+        return self._buttons[network, scope]

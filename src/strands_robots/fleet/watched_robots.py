@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Mapping, Sequence
 
 from strands_robots.errors import RefusalError
 from strands_robots.fleet.adapter import NetworkAdapter
@@ -27,28 +26,21 @@ BEAT_FRESH_S = 3.0
 GONE_S = 5.0
 """A robot that was silent for this long is shown as gone; it must still answer a stop."""
 
-Join = Callable[[], NetworkAdapter]
-"""Joins the network that is polled; raises :class:`RefusalError` where that fails."""
-
 
 class WatchedRobots:
-    """Robots that were seen and not forgotten, polled on a thread of its own.
-
-    Args:
-        join: joins the network.
+    """Robots of one network that were seen and not forgotten.
 
     Attributes:
         problem: why the robots cannot be polled, or which of them give an alarm.
     """
 
-    def __init__(self, join: Join) -> None:
-        self._join = join
+    def __init__(self) -> None:
         self._robots: dict[str, LockoutReport] = {}
         self._beats: dict[str, float] = {}
         self._asked: dict[str, float] = {}
         self._unanswered: set[str] = set()
         self._all_since = float("-inf")
-        self.problem = "Looking for robots..."
+        self.problem = ""
         self._closed = threading.Event()
 
     @property
@@ -73,6 +65,13 @@ class WatchedRobots:
             name for name, cell in cells.items() if not isinstance(cell, str) or scope.covers(name, {cell} - {""})
         )
 
+    def has(self, scope: Scope) -> bool:
+        """Return whether a robot was seen that a stop of some robots is for."""
+        robots = self._robots.items()
+        if scope.only:
+            return any(name in scope.only for name, _ in robots)
+        return any(scope.covers(name, {str(last.facts.get("cell") or "")} - {""}) for name, last in robots)
+
     def known(self) -> Collection[str]:
         """Return the robots that were seen and not forgotten."""
         return tuple(self._robots)
@@ -82,16 +81,13 @@ class WatchedRobots:
         now = time.monotonic()
         self._robots = {name: last for name, last in self._robots.items() if now - self.seen_at(last) < GONE_S}
 
-    @contextmanager
-    def polling(self) -> Iterator[None]:
-        """Poll the robots for the length of the block."""
-        thread = threading.Thread(target=self._poll, name="watched robots", daemon=True)
-        thread.start()
-        try:
-            yield
-        finally:
-            self._closed.set()
-            thread.join(2 * ASK_S + 1.0)
+    def poll(self, network: NetworkAdapter) -> None:
+        """Poll the robots of a joined network on a thread until :meth:`close`."""
+        threading.Thread(target=self._poll, args=(network,), name="watched robots", daemon=True).start()
+
+    def close(self) -> None:
+        """End polling."""
+        self._closed.set()
 
     def take_beats(self, beats: Mapping[str, float | None]) -> None:
         """Take the monotonic times of the robots' last beats or heartbeats."""
@@ -132,26 +128,20 @@ class WatchedRobots:
         # The screen and the space bar may be reading the old dictionary, so it is replaced and not changed.
         self._robots = robots
         alarms = [f"{each.name}: {each.problem}." for each in reports if "ALARM" in each.problem]
-        self.problem = " ".join(alarms) if robots or alarms else "No robot is on this network yet."
+        self.problem = " ".join(alarms)
 
     def seen_at(self, last: LockoutReport) -> float:
         """Return when a robot gave its last sign of life, in monotonic seconds."""
         return max(last.at, self._beats.get(last.name, last.at))
 
-    def _poll(self) -> None:
-        while not self._closed.is_set():
+    def _poll(self, network: NetworkAdapter) -> None:
+        while not self._closed.wait(LOOK_S):
             try:
-                network = self._join()
-                try:
-                    while not self._closed.wait(LOOK_S):
-                        names = {*network.lockable(ASK_S), *self._robots}
-                        self.take_beats(network.beats(names))
-                        self.update(network.lockouts(self.due(names), ASK_S))
-                finally:
-                    network.close()
+                names = {*network.lockable(ASK_S), *self._robots}
+                self.take_beats(network.beats(names))
+                self.update(network.lockouts(self.due(names), ASK_S))
             except (RefusalError, TimeoutError, KeyFileError) as exc:
-                self.problem = f"The robots cannot be polled: {exc} A stop has a connection of its own."
-                self._closed.wait(LOOK_S)
+                self.problem = f"The robots cannot be polled: {exc}"
 
 
 def _epochs(report: LockoutReport) -> set[str]:

@@ -23,7 +23,7 @@ from strands_robots.fleet.fleet_verdict import FleetVerdict
 from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.refusals import LEASE_CODES, said
 from strands_robots.fleet.robot_task import runs
-from strands_robots.fleet.stop_answers import combined_verdict
+from strands_robots.fleet.stop_answers import answer_of_bearers
 from strands_robots.mcp.queries import NoTurnError, Queries
 from strands_robots.mcp.results import refused
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
@@ -231,11 +231,7 @@ class Caller:
         if not robot:
             return await self._urgently(lambda: stop_all(self.networks))
         answers = await self.networks.stop_async(robot, robot_name=robot_name)
-        if len(answers) == 1:
-            return next(iter(answers.values()))
-        return combined_verdict(
-            {f"{robot} on {each}": answer for each, answer in answers.items()}, self.networks.absences
-        )
+        return answer_of_bearers(robot, answers, self.networks.absences)
 
     async def emergency_stop(self, reason: str, scope: Scope = EVERY_ROBOT) -> Envelope:
         """Stop and lock every robot, or those of ``scope``."""

@@ -39,7 +39,10 @@ class StandingController:
     @property
     def problem(self) -> str:
         """Empty while it stands on each network, else the reasons why it does not."""
-        why = {each.name: self._problem_on(each.name) for each in self._networks.stated}
+        absent, missing = self._networks.absent, self._networks.missing
+        # A network that no one asked for need not be there.
+        named = [each.name for each in self._networks.stated if each.name in missing or each.name not in absent]
+        why = {name: self._problem_on(name) for name in named}
         return "; ".join(f"{name}: {problem}" for name, problem in why.items() if problem)
 
     def open(self) -> None:

@@ -82,6 +82,10 @@ class PresencePublisher:
         with self._declaring:
             listener, self.listener = self.listener, None
             token, self._token = self._token, None
+        session = self._context.session_id()
+        if session is not None:
+            # Further peers of this process share the registry; they may leave before they see the token go.
+            self._context.registry.lost(self._context.peer_id, session)
         if token is not None:
             undeclare([token])
         if listener is not None:

@@ -31,6 +31,7 @@ __all__ = [
     "acquire",
     "clear_peers",
     "current_session",
+    "cut_off",
     "dial",
     "get_peer",
     "get_peers",
@@ -169,6 +170,12 @@ def session_alive() -> bool:
     """True while the session is open."""
     transport = _shared.transport
     return transport is not None and transport.is_alive()
+
+
+def cut_off() -> bool:
+    """True while the session is open, and linked to no hub."""
+    transport = _shared.transport
+    return transport is not None and not transport.anchored()
 
 
 def opened_with() -> Mapping[str, str] | None:

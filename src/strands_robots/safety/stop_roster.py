@@ -48,7 +48,7 @@ class StopOutcome:
         roster: all rows: remembered, reported, named, found, and those that only answered.
         no_stop: devices that have no stop.
         unproven: robots that controllers without a known signature say they miss, and who says so.
-        reasons: of silent robots.
+        reasons: of silent robots, and of those that are not locked.
         problems: why the roster may lack robots; with one of them no exit code is 0.
         unsigned: the answers are those to a plain stop, which no robot signs on Device Connect.
         not_locked: devices that did not act on the emergency stop, and got a plain stop.

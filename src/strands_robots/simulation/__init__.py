@@ -6,6 +6,7 @@ without the ``sim`` extra that raises one sentence.
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from strands_robots.utils import missing_extra
@@ -22,6 +23,8 @@ def __getattr__(name: str) -> Any:
     if name != "Simulation":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     try:
+        # Before another module imports MuJoCo, which would load its default backend as well as the chosen one.
+        import_module("strands_robots.simulation.engine")
         from strands_robots.simulation.world import Simulation  # noqa: PLC0415 - heavy, so only when asked for
     except ModuleNotFoundError as exc:
         if (exc.name or "").partition(".")[0] in _EXTRA:

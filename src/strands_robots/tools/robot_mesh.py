@@ -18,7 +18,7 @@ from typing import Any
 
 from strands_robots import settings
 from strands_robots.agent_tool import fitted, tool
-from strands_robots.envelope import Envelope, error, success
+from strands_robots.envelope import Envelope, error, is_error, success, text_of
 from strands_robots.errors import RefusalError, StrandsRobotsError
 from strands_robots.fleet.adapter import STOP_S, FoundRobot
 from strands_robots.fleet.all_stops import answer_of, estop_all, stop_all
@@ -28,12 +28,13 @@ from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.profiles import profile_for
 from strands_robots.fleet.refusals import said
 from strands_robots.fleet.stated_networks import networks_for_stop, networks_of
-from strands_robots.fleet.stop_answers import combined_verdict
+from strands_robots.fleet.stop_answers import by_bearer, combined_verdict
+from strands_robots.serving import known_verbs
 from strands_robots.serving.advertised import RobotDescription, fitting
 from strands_robots.serving.robot_verbs import ARM_VERBS, WORLD_VERBS
 from strands_robots.serving.stop_arguments import noted, stop_reason, stop_robot, stop_scope
 from strands_robots.serving.verbs import unknown_arguments
-from strands_robots.utils import WAIT_S, ValidationError, choice, device_id, identifier, mapping, shown
+from strands_robots.utils import WAIT_S, ValidationError, choice, device_id, identifier, mapping, plain_text, shown
 
 CALLED = {"move": "moveTo", "picture": "getPicture", "wait": "wait"}
 """Verb of each action that calls one where none is named."""
@@ -152,6 +153,8 @@ def _started(there: Networks, robot: str, task: Mapping[str, Any]) -> Envelope:
 
 def _called(there: Networks, robot: str, verb: str, arguments: Mapping[str, Any]) -> Envelope:
     """Call any verb of the robot, and wait as long as it lasts by its description."""
+    if verb in known_verbs.STOPS:
+        return there.call(robot, verb, arguments, STOP_S)
     network, described = there.described(robot, verb)
     return network.call(robot, verb, arguments, CALL_S + (described.lasts_s if described is not None else 0.0))
 
@@ -165,9 +168,7 @@ def _stop(target: object, arguments: object) -> dict[str, Any]:
         unread = "arguments is no object"
 
     def stopped(there: Networks) -> Envelope:
-        answers = there.stop(robot, STOP_S, of_world.get("robot_name", ""))
-        names = [robot] if len(answers) == 1 else [f"{robot} on {network}" for network in answers]
-        return combined_verdict(dict(zip(names, answers.values(), strict=True)))
+        return combined_verdict(by_bearer(robot, there.stop(robot, STOP_S, of_world.get("robot_name", ""))))
 
     answer = _answer(stopped, stops=True) if robot else _all_stopped(stop_all)
     return noted(answer, unknown, unread)
@@ -215,11 +216,19 @@ def _answer(work: Callable[[Networks], Envelope], *, stops: bool) -> Envelope:
     make, fields = (networks_for_stop, {"stopped": None}) if stops else (networks_of, {})
     try:
         with closing(make(profile_for(None, {}), {}, TOOL, devices=not on_mesh)) as there:
-            return work(there)
+            return _read_by_a_model(work(there))
     except RefusalError as refusal:
         return error(said(refusal), **fields)
     except (StrandsRobotsError, LookupError, TimeoutError, RuntimeError, ValueError) as exc:
         return error(str(exc.args[0]) if exc.args else type(exc).__name__, **fields)
+
+
+def _read_by_a_model(answer: Envelope) -> Envelope:
+    """Return an answer whose error has a text, as a model reads it."""
+    if not is_error(answer) or "content" in answer:
+        return answer
+    fields = {name: value for name, value in answer.items() if name not in ("status", "reason")}
+    return error(plain_text(text_of(answer)) or "It gave no reason.", **fields)
 
 
 def _row(found: FoundRobot, network: str, functions: object) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from strands_robots.fleet.adapter import CLOSED
 from strands_robots.fleet.device_connect import lockouts
 from strands_robots.fleet.device_connect.network import DeviceConnectNetwork
 from strands_robots.safety.identity import KeyFileError
+from strands_robots.serving.advertised import AdvertisedVerb, find_verb
 from strands_robots.utils import ValidationError
 
 
@@ -32,6 +33,14 @@ class Client(clients.FleetClient):
 
     async def stop_async(self, device: str, within: float = 5.0, robot_name: str = "") -> dict[str, Any]:
         return await self.call_async(device, "stop")
+
+    functions: tuple[dict[str, Any], ...] = ()
+
+    def verb(self, device: str, name: str) -> AdvertisedVerb | None:
+        return find_verb(self.functions, name)
+
+    def call(self, device: str, function: str, params: Any = None, timeout: float = 10.0) -> dict[str, Any]:
+        return success(function)
 
     def announces(self, device: str, function: str, argument: str) -> bool:
         return False
@@ -89,6 +98,29 @@ def test_device_that_is_gone_is_forgotten(there: Any, monkeypatch: pytest.Monkey
     with pytest.raises(errors.NoSuchRobotError):
         asyncio.run(there.call_async("arm-1", "getStatus", {}, 1.0))
     assert not there.bears("arm-1")
+
+
+@pytest.mark.parametrize(
+    ("verb", "functions", "called"),
+    [
+        ("status", ("getStatus",), "getStatus"),
+        ("state", ("getState",), "getState"),
+        ("features", (), "getFeatures"),
+        ("start", ("execute",), "execute"),
+        ("getStatus", ("getStatus",), "getStatus"),
+        # A device that is not ours may have a function of that name.
+        ("status", ("status", "getStatus"), "status"),
+        ("start", ("start",), "start"),
+        ("spin", ("start",), "spin"),
+    ],
+)
+def test_verb_is_called_by_its_name_on_the_mesh_unless_the_device_has_that_function(
+    there: Any, verb: str, functions: tuple[str, ...], called: str
+) -> None:
+    there._client.functions = tuple({"name": each} for each in functions)
+    assert there.call("arm-1", verb, {}, 1.0)["content"][0]["text"] == called
+    described = there.verb("arm-1", verb)
+    assert (None if described is None else described.name) == (called if called in functions else None)
 
 
 def test_end_of_the_events_of_a_lost_connection_does_not_fail(there: Any, monkeypatch: pytest.MonkeyPatch) -> None:

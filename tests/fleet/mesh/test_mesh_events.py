@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -13,7 +14,7 @@ from fixtures.mesh_robots import Arm, World
 from fixtures.waiting import eventually
 from tests.mesh.peers import Fleet, fleet
 
-from strands_robots.fleet.adapter import EVERY, RobotEvent
+from strands_robots.fleet.adapter import EVERY, Detail, RobotEvent
 from strands_robots.fleet.mesh.events import LOAD_MAX
 from strands_robots.fleet.mesh.network import MeshNetwork
 
@@ -65,6 +66,75 @@ def test_heartbeat_is_a_sign_of_life_with_the_task_of_the_registry(followed: Fol
 def test_state_has_the_joints(followed: Followed) -> None:
     heard = followed.arrived("state")
     assert (heard.robot, heard.joints, heard.frequent) == ("arm-1", {"shoulder": 1.5}, True)
+
+
+def test_state_and_steps_of_one_robot_come_with_joints_and_task(followed: Followed) -> None:
+    seen: list[RobotEvent] = []
+    end = followed.there.subscribe("arm-1", seen.append, Detail.STATES)
+    eventually(lambda: [each for each in seen if each.name == "state"], what="a state")
+    state = next(each for each in seen if each.name == "state")
+    assert (state.robot, state.joints) == ("arm-1", {"shoulder": 1.5})
+    assert state.task == {"state": "idle", "instruction": "", "step": 0}
+    followed.say("arm-1/state", {"peer_id": "arm-9", "joints": {"forged": 1.0}})
+    followed.say("arm-1/stream", {"step": 1})
+    followed.say("arm-1/safety/event", {"event": "last"})
+    eventually(lambda: {"stream", "safety_event"} <= {each.name for each in seen}, what="a step and an event")
+    assert "forged" not in str(seen)
+    end()
+
+
+@pytest.mark.parametrize(
+    ("message", "joints", "task"),
+    [
+        ({"joints": {"pan": {"position": 0.5, "velocity": None}}}, {"pan": 0.5}, {"state": "idle", "instruction": ""}),
+        (
+            {"task": {"status": "running", "instruction": "wave", "steps": 7}},
+            None,
+            {"state": "running", "instruction": "wave", "step": 7},
+        ),
+        ({"degraded": {"task": {"reason": "refused"}}}, None, None),
+        ({"task": "nonsense", "joints": ["nonsense"]}, None, None),
+        ({"degraded": "nonsense"}, None, {"state": "idle", "instruction": ""}),
+    ],
+)
+def test_state_is_read_as_positions_and_task(
+    followed: Followed, message: dict[str, Any], joints: object, task: object
+) -> None:
+    seen: list[RobotEvent] = []
+    end = followed.there.subscribe("sim-1", seen.append, Detail.STATES)
+    followed.say("sim-1/state", {"peer_id": "sim-1", **message})
+    eventually(lambda: seen, what="the state")
+    assert (seen[0].joints, seen[0].task) == (joints, task)
+    end()
+
+
+def test_recording_has_pictures_and_each_stop_of_the_fleet_once(followed: Followed) -> None:
+    seen: list[RobotEvent] = []
+    for robot in ("arm-1", "arm-2"):
+        followed.there.subscribe(robot, seen.append, Detail.ALL)
+    jpeg = b"\xff\xd8picture"
+    followed.say("arm-1/camera/front", {"data": base64.b64encode(jpeg).decode()})
+    followed.say("arm-1/camera/front", {"data": "no base64"})
+    followed.say("arm-2/camera/front", {"data": 7})
+    followed.say("arm-1/stream", {"step": 1})
+    followed.say("safety/resume", {"peer_id": "desk-1"})
+    followed.say("safety/estop", {})
+    followed.say("arm-2/safety/event", {"event": "last"})
+    eventually(lambda: any(each.robot == "arm-2" and each.name == "safety_event" for each in seen), what="the last one")
+    told = [(each.robot, each.name, each.part, each.picture) for each in seen if each.name != "state"]
+    assert sorted(told, key=repr) == sorted(
+        [
+            ("arm-1", "camera_front", "front", jpeg),
+            ("arm-1", "camera_front", "front", None),
+            ("arm-2", "camera_front", "front", None),
+            ("arm-1", "streamStep", "", None),
+            ("desk-1", "resume", "", None),
+            ("mesh", "emergencyStop", "", None),
+            ("arm-2", "safety_event", "", None),
+        ],
+        key=repr,
+    )
+    eventually(lambda: ("arm-1", "state") in {(each.robot, each.name) for each in seen}, what="a state")
 
 
 def test_message_about_another_robot_than_its_topic_names_is_left_out(followed: Followed) -> None:

@@ -182,11 +182,18 @@ def test_call_from_an_event_loop_is_refused_for_such_an_argument_and_a_stop_is_n
     assert [command for _, command, _ in mesh.sent] == [{"action": "stop"}]
 
 
-def test_stop_of_a_robot_that_was_not_found_is_sent_where_it_can_be_nowhere_else() -> None:
+def test_stop_of_a_robot_that_was_not_found_is_sent_and_only_waited_for_where_it_can_be_nowhere_else() -> None:
     mesh = FakeMesh([], timeout)
     there = joined(mesh)
     assert there.stop("arm-1", 1.0) is None
-    assert mesh.sent == []
+    assert [command for _, command, _ in mesh.sent] == [{"action": "stop"}]
     answer = there.stop("arm-1", 1.0, insist=True)
     assert answer is not None and answer["stopped"] is None
+    assert mesh.sent[-1][2] == 1.0
+
+
+def test_stop_leaves_before_the_robot_is_known() -> None:
+    mesh = FakeMesh([], done)
+    answer = joined(mesh).stop("arm-1", 1.0)
+    assert answer is not None and answer["stopped"] is True
     assert [command for _, command, _ in mesh.sent] == [{"action": "stop"}]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import pytest
@@ -26,15 +26,21 @@ def test_discovery_of_a_stated_endpoint_outlasts_its_retry_pause() -> None:
 class TimedMesh:
     """A mesh on a clock of its own: robots that come into reach at a time, and the times of its stops."""
 
-    def __init__(self, arrivals: dict[str, float], silent: frozenset[str] = frozenset()) -> None:
-        self.now, self.arrivals, self.silent = 0.0, arrivals, silent
+    def __init__(
+        self,
+        arrivals: dict[str, float],
+        silent: frozenset[str] = frozenset(),
+        facts: Mapping[str, Mapping[str, Any]] | None = None,
+    ) -> None:
+        self.now, self.arrivals, self.silent, self.facts = 0.0, arrivals, silent, facts or {}
         self.peer_id, self.lockout_epoch, self.alive = "tool", "e" * 32, True
         self.stops: list[float] = []
         self.ids: set[str] = set()
 
     @property
     def peers(self) -> list[dict[str, Any]]:
-        return [{"peer_id": name, "reachable": True} for name, at in self.arrivals.items() if at <= self.now]
+        there = [name for name, at in self.arrivals.items() if at <= self.now]
+        return [{"peer_id": name, "reachable": True, **self.facts.get(name, {})} for name in there]
 
     def emergency_stop(
         self, signing_key: Any = None, *, estop_id: str = "", on_answers: Callable[[list[Any]], None]
@@ -95,6 +101,16 @@ def test_loopback_estop_is_sent_at_once_and_again_when_a_robot_appears(timed_mes
     assert len(mesh.stops) == 2
     assert mesh.stops[0] == 0.0
     assert mesh.now < 1.5
+
+
+@pytest.mark.parametrize(("facts", "missed"), [({}, []), ({"locked": False}, ["desk"]), ({"type": "robot"}, ["desk"])])
+def test_program_that_only_calls_robots_is_missed_by_no_stop(
+    timed_mesh: Callable[..., TimedMesh], facts: dict[str, Any], missed: list[str]
+) -> None:
+    mesh = timed_mesh(
+        {"arm-1": 0.0, "desk": 0.3}, silent=frozenset({"desk"}), facts={"desk": {"type": "tool", **facts}}
+    )
+    assert locked(mesh)["silent"] == missed
 
 
 @pytest.mark.parametrize("hangs", ["roster", "keys"])

@@ -182,7 +182,6 @@ def test_caller_not_on_the_allowlist_cannot_move_the_robot(machine: Machine) -> 
         ("serve", "so100", "--listen", "tcp/0.0.0.0:0"),
         ("serve",),
         ("call",),
-        ("call", "arm-1", "--mesh"),
         ("fly",),
     ],
 )

@@ -19,7 +19,7 @@ from fixtures.waiting import eventually
 from fixtures.zenoh_router import ZenohRouter
 
 from strands_robots.device_connect import FleetClient, LinkConfig, init_device_connect_sync, stop_device_connect
-from strands_robots.tools.networks import Robots, on_device_connect
+from strands_robots.tools import robot_mesh
 
 pytestmark = pytest.mark.system
 EVERYONE = ["arm-1", "arm-2", "bare-1"]
@@ -96,7 +96,7 @@ def test_every_tool_finds_the_robots_that_the_registry_lists(site: Site) -> None
     assert (code, [peer["id"] for peer in said["peers"]], said["stale"]) == (0, EVERYONE, "")
     code, said = site.machine.json("lockout")
     assert (code, sorted(said["live"])) == (0, ["arm-1", "arm-2"])
-    assert [peer["id"] for peer in Robots(on_device_connect).peers()["peers"]] == EVERYONE
+    assert [peer["id"] for peer in robot_mesh(action="peers")["peers"]] == EVERYONE
 
 
 def test_stop_all_stops_every_robot_that_the_registry_lists(site: Site) -> None:
@@ -105,7 +105,7 @@ def test_stop_all_stops_every_robot_that_the_registry_lists(site: Site) -> None:
     assert (code, sorted(said["devices"])) == (0, EVERYONE)
     assert not site.moving
     site.move()
-    assert Robots(on_device_connect).stop("")["stopped"] is True
+    assert robot_mesh(action="stop")["stopped"] is True
     assert not site.moving
 
 

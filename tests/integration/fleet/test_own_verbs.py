@@ -1,9 +1,11 @@
-"""A robot's own verbs as methods of a RemoteRobot, on Device Connect and on the mesh."""
+"""A robot's own verbs as methods of a RemoteRobot, on Device Connect and on the mesh.
+
+``tests/integration/faces`` has stops, leases and lockouts of such verbs.
+"""
 
 from __future__ import annotations
 
 import inspect
-import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
@@ -102,54 +104,6 @@ def test_refusals_say_who_what_and_why(served: Served) -> None:
             careless.spill()
         assert (failed.value.robot, failed.value.verb) == ("careless-2", "spill")
         assert careless.weigh()["samples"] == [[1.0, 2.0]]
-
-
-def test_halt_in_mid_verb_stops_it_twice(served: Served) -> None:
-    body = Barista()
-    barista = served.robot(body, "barista-3")
-    answers: list[dict[str, Any]] = []
-    for turn in (1, 2):
-        working = threading.Thread(target=lambda: answers.append(barista.brew_coffee(8)))
-        working.start()
-        eventually(body.brewing.is_set)
-        verdict = barista.halt("enough")
-        written = body.writes
-        assert verdict.stopped is True
-        assert "brewCoffee" in verdict.halted
-        working.join(20.0)
-        assert body.writes == written
-        assert [each["task_status"] for each in answers] == ["stopped"] * turn
-
-
-def test_verb_that_ignores_the_stop_is_a_verdict_and_keeps_the_robot_busy(
-    served: Served, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.5")
-    body = Stubborn()
-    mill = served.robot(body, "mill-4")
-    working = threading.Thread(target=mill.grind)
-    working.start()
-    try:
-        eventually(body.started.is_set)
-        assert mill.halt().stopped is False
-        with pytest.raises(errors.BusyError):
-            mill.grind()
-    finally:
-        body.released.set()
-        working.join(20.0)
-    eventually(lambda: mill.halt().stopped is True)
-
-
-def test_lease_holds_for_own_verbs(served: Served) -> None:
-    barista = served.robot(Barista(), "barista-5")
-    with connect(name="other") as others:
-        other = others["barista-5"]
-        with barista.control(ttl_s=30):
-            assert barista.brew_coffee(1)["cups"] == 1
-            with pytest.raises(errors.ControlError):
-                other.brew_coffee(1)
-            assert other.beans_left()["result"] == 250.0
-        assert other.brew_coffee(1)["cups"] == 1
 
 
 def test_call_under_way_ends_when_the_fleet_is_closed(served: Served) -> None:

@@ -9,8 +9,9 @@ import random
 from typing import Any
 
 import pytest
-from fixtures.mcp_frames import INITIALIZE, RawServer, memory_mb
+from fixtures.mcp_frames import INITIALIZE, RawServer
 from fixtures.mcp_site import McpSite
+from fixtures.memory import memory_mb
 
 pytest.importorskip("mcp.server.mcpserver", reason="needs the extra mcp", exc_type=ImportError)
 

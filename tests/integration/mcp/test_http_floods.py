@@ -12,8 +12,9 @@ from pathlib import Path
 
 import pytest
 from fixtures.half_sent import KINDS, beginning, closed, half_sent
-from fixtures.mcp_frames import INITIALIZE, memory_mb
+from fixtures.mcp_frames import INITIALIZE
 from fixtures.mcp_site import WAVE, McpSite
+from fixtures.memory import memory_mb
 from fixtures.waiting import eventually
 
 pytest.importorskip("mcp.server.mcpserver", reason="needs the extra mcp", exc_type=ImportError)

@@ -14,6 +14,7 @@ import pytest
 from device_connect_edge.messaging import MessagingError
 from fixtures.bare_caller import Caller
 from fixtures.echo_device import EchoDevice
+from fixtures.forked import COMMANDS, start
 from fixtures.waiting import accepts, eventually, eventually_async, free_port, until
 from tests.integration.mesh.conftest import Join
 
@@ -62,8 +63,9 @@ def served_on_both(port: int, tmp_path: Path) -> Iterator[str]:
     state = tmp_path / "both"
     state.mkdir(mode=0o700)
     both = {"STRANDS_MESH": "true", "STRANDS_MESH_PORT": str(port), "STRANDS_DC_PORT": str(port)}
-    serving = subprocess.Popen(
+    serving = start(
         [sys.executable, "-m", "strands_robots.cli", "serve", "so100", "--peer-id", "arm-1", "--json"],
+        imports=COMMANDS,
         stdout=subprocess.PIPE,
         text=True,
         env={**os.environ, **both, "STRANDS_STATE_DIR": str(state)},

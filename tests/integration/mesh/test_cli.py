@@ -135,15 +135,19 @@ def test_resume_of_a_silent_peer_of_the_mesh_is_no_success(tmp_path: Path, machi
     keygen(key, "Correct-Horse-7-Battery")
     signed = ("resume", "--mesh", "--key", str(key), "--passphrase-file", str(secret))
     assert machine.json(*signed)[0] == 3
-    code, answer = machine.json(*signed, "--targets", "arm-9", "--timeout", "0.5")
-    assert (code, answer["devices"]["arm-9"]["free"]) == (1, False)
+    with machine.serving("arm-1", "--mesh"):
+        code, answer = machine.json(*signed, "--targets", "arm-9", "--timeout", "0.5")
+        assert (code, answer["devices"]["arm-9"]["free"]) == (1, False)
 
 
 def test_space_bar_stops_the_mesh_and_its_check_in_keeps_a_robot_free(machine: Machine) -> None:
     line = [*COMMAND, "safety-controller", "--mesh", "--id", "desk-1", "--check-in", "0.2"]
     with on_a_terminal(line, machine.environment) as terminal:
-        eventually(lambda: "the stop link is up; checks in every 0.2 s" in terminal.drawn, within=60)
+        # It is never the hub: until a robot is there no mesh answers.
+        eventually(lambda: "the stop link is DOWN; checks in every 0.2 s" in terminal.drawn, within=60)
+        eventually(lambda: "mesh: no mesh answers on tcp/127.0.0.1" in terminal.drawn, within=60)
         with machine.serving("arm-1", "--mesh", STRANDS_CHECKIN_TIMEOUT_S="30"):
+            eventually(lambda: "the stop link is up; checks in every 0.2 s" in terminal.drawn, within=60)
             eventually(lambda: "s left" in terminal.drawn, within=60)
             assert "LOCKED" not in terminal.drawn
             terminal.press(" ")

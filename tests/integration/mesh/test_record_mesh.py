@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 from fixtures.command_line import COMMAND
+from fixtures.forked import COMMANDS, start
 from fixtures.mesh_peer import MeshPeer
 from fixtures.waiting import eventually
 
@@ -39,7 +40,7 @@ def has_joints(run: Path) -> bool:
 
 
 def start_process(*arguments: str) -> Any:
-    return subprocess.Popen([*COMMAND, *arguments, "--json"], stdout=subprocess.PIPE, text=True)
+    return start([*COMMAND, *arguments, "--json"], imports=COMMANDS, stdout=subprocess.PIPE, text=True)
 
 
 @pytest.mark.usefixtures("settings")

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 from fixtures.command_line import COMMAND
+from fixtures.forked import COMMANDS, start
 from fixtures.leaders import write_csv
 from fixtures.mesh_peer import MeshPeer, share_console_key
 from fixtures.waiting import eventually
@@ -32,12 +33,11 @@ def replay(port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.setenv("STRANDS_STATE_DIR", str(tmp_path))
     share_console_key(tmp_path)
 
-    def start(*arguments: str) -> subprocess.Popen[str]:
-        return subprocess.Popen(
-            [*COMMAND, "replay", *arguments, "--json"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )
+    def replaying(*arguments: str) -> subprocess.Popen[str]:
+        pipes: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        return start([*COMMAND, "replay", *arguments, "--json"], imports=COMMANDS, **pipes)
 
-    return start
+    return replaying
 
 
 def ended(replaying: subprocess.Popen[str]) -> tuple[int, list[dict[str, Any]]]:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from fixtures.command_line import COMMAND
+from fixtures.forked import COMMANDS, start
 from fixtures.leaders import write_csv
 from fixtures.waiting import free_port
 
@@ -40,8 +41,9 @@ def test_an_operator_leads_a_certified_peer(hub: str, side: Callable[..., Mappin
     write_csv(tmp_path / "pan.csv", [(0.1 * step, {"shoulder_pan": 0.01 * step}) for step in range(31)])
     endpoint = f"tls/127.0.0.1:{free_port()}"
     way = {True: {"ZENOH_LISTEN": endpoint}, False: {"ZENOH_CONNECT": endpoint}}
-    serving = subprocess.Popen(
+    serving = start(
         [*COMMAND, "serve", "so100", "--mesh", "--peer-id", "arm-1", "--json"],
+        imports=COMMANDS,
         stdout=subprocess.PIPE,
         text=True,
         env=side("arm-1", hub, **way[hub == "arm-1"]),

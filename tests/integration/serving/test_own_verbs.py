@@ -1,16 +1,18 @@
-"""A robot's own verbs over Device Connect and over the mesh: found, called, refused, held, stopped in mid-verb."""
+"""A robot's own verbs on the wire of each network: described, carried out, refused, approved.
+
+``tests/integration/faces`` has what a user does with them at every face.
+"""
 
 from __future__ import annotations
 
 import itertools
-import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import pytest
-from fixtures.barista import Barista, Careless, Stubborn
+from fixtures.barista import Barista
 from fixtures.waiting import eventually, free_port
 
 from strands_robots.device_connect import (
@@ -19,12 +21,8 @@ from strands_robots.device_connect import (
     loopback_config,
     stop_device_connect,
 )
-from strands_robots.device_connect.stop_link import stop_link
 from strands_robots.mesh import init_mesh, session
 from strands_robots.safety.approval import Grants
-from strands_robots.safety.estop_listener import ESTOP, notification
-from strands_robots.safety.orders import new_epoch
-from strands_robots.safety.stopping import Outcome, grade
 from strands_robots.state_files import state_dir
 from strands_robots.utils import ValidationError
 
@@ -44,9 +42,7 @@ class Reached:
     """A robot that a caller on its network has found."""
 
     call: Call
-    stop: Callable[[], dict[str, Any]]
     describe: Callable[[], list[Mapping[str, Any]]]
-    estop: Callable[[], object]
 
 
 @contextmanager
@@ -57,23 +53,9 @@ def over_device_connect(robot: Any, name: str) -> Iterator[Reached]:
         with FleetClient(link, "tester") as client:
             eventually(lambda: name in [peer.id for peer in client.peers()])
 
-            def estop() -> None:
-                controller = stop_link(link)
-                controller.open((), lambda event, source, payload: None, lambda up: None)
-                try:
-                    eventually(lambda: controller.up)
-                    order = notification(ESTOP, {"estop_id": new_epoch()})
-                    eventually(
-                        lambda: controller.publish("safety-1", ESTOP, order) or client.call(name, "getStatus")["locked"]
-                    )
-                finally:
-                    controller.close()
-
             yield Reached(
                 lambda verb, **arguments: client.call(name, verb, arguments, 20.0),
-                lambda: client.stop(name, 20.0),
                 lambda: next(list(peer.functions) for peer in client.peers() if peer.id == name),
-                estop,
             )
     finally:
         stop_device_connect(runtime)
@@ -98,9 +80,7 @@ def over_the_mesh(robot: Any, name: str) -> Iterator[Reached]:
         eventually(lambda: console.get_peer(name) and "own_verbs" in (console.get_peer(name) or {}))
         yield Reached(
             call,
-            lambda: call("stop"),
             lambda: call("describe")["functions"],
-            console.emergency_stop,
         )
     finally:
         console.close()
@@ -115,7 +95,6 @@ def network(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setenv("STRANDS_MESH", "true")
     monkeypatch.setenv("STRANDS_MESH_PORT", str(free_port()))
     monkeypatch.setenv("DEVICE_CONNECT_RPC_ALLOW", "*")
-    monkeypatch.setenv("DEVICE_CONNECT_ESTOP_ALLOW", "safety-1,console")
     monkeypatch.setenv("BYPASS_TOOL_CONSENT", "true")
     yield
     eventually(lambda: session.current_session() is None, what="the mesh's session is closed")
@@ -156,82 +135,6 @@ def test_own_verbs_are_described_and_carried_out(reach: Any) -> None:
             assert refused["status"] == "error"
             assert next(iter(set(bad) - {"cups"} or {"cups"})) in refused["reason"]
         assert robot.cups == 3
-
-
-def test_stop_ends_the_verb_in_its_middle_and_again(reach: Any) -> None:
-    robot = Barista()
-    with reach(robot, own_name()) as reached:
-        answers: list[dict[str, Any]] = []
-        for turn in (1, 2):
-            working = threading.Thread(target=lambda: answers.append(reached.call("brewCoffee", cups=8)))
-            working.start()
-            eventually(robot.brewing.is_set)
-            stopped = reached.stop()
-            written = robot.writes
-            assert grade(stopped) is Outcome.STOPPED
-            assert "brewCoffee" in str(stopped)
-            assert not robot.brewing.is_set()
-            working.join(20.0)
-            assert robot.writes == written
-            assert len(answers) == turn
-
-
-def test_locked_robot_refuses_its_own_verb_and_answers_its_read(reach: Any) -> None:
-    robot = Barista()
-    with reach(robot, own_name()) as reached:
-        working = threading.Thread(target=lambda: reached.call("brewCoffee", cups=8))
-        working.start()
-        eventually(robot.brewing.is_set)
-        reached.estop()
-        eventually(lambda: not robot.brewing.is_set())
-        working.join(20.0)
-        for _ in range(2):
-            refused = reached.call("brewCoffee", cups=1)
-            assert refused["status"] == "error"
-            assert "locked" in refused["reason"] or refused["reason"] == "command rejected"
-        assert reached.call("beansLeft")["result"] == 250.0
-
-
-def test_verb_that_ignores_the_stop_is_named(reach: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.5")
-    robot = Stubborn()
-    with reach(robot, own_name()) as reached:
-        working = threading.Thread(target=lambda: reached.call("grind"))
-        working.start()
-        try:
-            eventually(robot.started.is_set)
-            for _ in range(2):
-                answer = reached.stop()
-                assert grade(answer) is Outcome.REFUSED
-                assert "grind" in str(answer)
-            refused = reached.call("grind")
-            assert refused["status"] == "error"
-            assert "has not returned" in refused["reason"] or refused["reason"] == "busy"
-        finally:
-            robot.released.set()
-            working.join(20.0)
-        eventually(lambda: grade(reached.stop()) is Outcome.STOPPED)
-        assert reached.call("grind")["status"] == "success"
-
-
-def test_lease_holds_a_robot_for_its_own_verbs(reach: Any) -> None:
-    robot = Barista()
-    with reach(robot, own_name()) as reached:
-        lease = reached.call("acquireControl", ttl_s=60.0)["lease_id"]
-        refused = reached.call("brewCoffee", cups=1)
-        assert refused["status"] == "error"
-        assert reached.call("brewCoffee", cups=1, lease_id=lease)["status"] == "success"
-
-
-def test_what_careless_verbs_do_is_answered(reach: Any) -> None:
-    with reach(Careless(), own_name()) as reached:
-        for _ in range(2):
-            failed = reached.call("spill")
-            assert failed["status"] == "error"
-            assert "failed inside the device" in failed["reason"] or failed["reason"] == "dispatch error"
-            assert reached.call("weigh")["samples"] == [[1.0, 2.0]]
-            assert "declared a read" in reached.call("peek")["reason"]
-            assert reached.call("brewCoffee", cups=1)["status"] == "success"
 
 
 def test_real_robot_asks_the_operator_for_its_own_verb(reach: Any, monkeypatch: pytest.MonkeyPatch) -> None:

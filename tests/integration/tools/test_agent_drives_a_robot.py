@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import pytest
-from fixtures.barista import Barista
 from fixtures.scripted_model import ScriptedModel
 from fixtures.toy_robots import ToyWorld
 from fixtures.waiting import eventually, free_port
 from strands import Agent
 
 from strands_robots.device_connect import init_device_connect_sync, loopback_config, stop_device_connect
-from strands_robots.mesh import init_mesh
-from strands_robots.mesh.session import clear_peers
 from strands_robots.tools import robot_mesh
 
 
@@ -90,44 +86,3 @@ def test_silent_robot_is_an_error_by_name(world: ToyWorld) -> None:
     for answer in results(*calls):
         assert answer["status"] == "error"
         assert "no-such-robot" in str(answer["content"])
-
-
-@pytest.fixture(params=["device connect", "mesh"])
-def barista(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, patient_halts: None) -> Iterator[Barista]:
-    """A robot with verbs of its own, on the network that the tool uses."""
-    port, robot = free_port(), Barista()
-    for name in ("STRANDS_DC_PORT", "STRANDS_MESH_PORT"):
-        monkeypatch.setenv(name, str(port))
-    monkeypatch.setenv("DEVICE_CONNECT_RPC_ALLOW", "*")
-    monkeypatch.setenv("BYPASS_TOOL_CONSENT", "true")
-    with ExitStack() as stack:
-        if request.param == "mesh":
-            monkeypatch.setenv("STRANDS_ROBOT_MESH_DC", "false")
-            peer = init_mesh(robot, "barista")
-            assert peer is not None
-            stack.callback(clear_peers)
-            stack.callback(peer.close)
-        else:
-            runtime = init_device_connect_sync(robot, peer_id="barista", link=loopback_config())
-            stack.callback(stop_device_connect, runtime)
-        yield robot
-
-
-def test_agent_calls_a_verb_that_only_its_robot_has(barista: Barista) -> None:
-    def brew(cups: int) -> dict[str, Any]:
-        return {"action": "call", "target": "barista", "verb": "brewCoffee", "arguments": {"cups": cups}}
-
-    answers = results(
-        {"action": "peers"},
-        brew(2),
-        brew(9),
-        {"action": "call", "target": "barista", "verb": "beansLeft"},
-        {"action": "emergency_stop", "instruction": "smoke"},
-        brew(1),
-    )
-    assert "brewCoffee" in str(answers[0]["content"])
-    assert [each["status"] for each in answers[1:4]] == ["success", "error", "success"]
-    assert "cups must be an integer from 1 to 8, not 9" in str(answers[2]["content"])
-    assert "250.0" in str(answers[3]["content"])
-    assert "locked" in str(answers[5]["content"]) or "command rejected" in str(answers[5]["content"])
-    assert barista.cups == 2

@@ -12,6 +12,7 @@ from fixtures.mesh_peer import MeshPeer
 from fixtures.toy_robots import ToyRobot
 from fixtures.waiting import accepts, eventually, free_port
 
+from strands_robots import connect
 from strands_robots.device_connect import init_device_connect_sync, loopback_config, stop_device_connect
 from strands_robots.mesh.session import clear_peers
 from strands_robots.tools import robot_mesh
@@ -91,6 +92,17 @@ def test_robot_of_a_network_that_is_gone_is_named_by_every_stop(cell: Cell) -> N
         assert answer["silent"] == ["far-arm"]
         assert "far-arm" in answer["reason"]
         assert "stopped" in answer["robots"]["arm-1"].lower()
+
+
+def test_visitors_that_have_left_are_missed_by_no_stop(cell: Cell) -> None:
+    cell.serve_on_the_mesh("far-arm")
+    with connect(name="desk") as fleet:
+        assert set(fleet["far-arm"].status())
+        for name in ("arm-1", "far-arm"):
+            assert robot_mesh(action="status", target=name)["status"] == "success"
+    for action in ("stop", "emergency_stop"):
+        answer = robot_mesh(action=action)
+        assert (answer["status"], answer["silent"]) == ("success", []), answer
 
 
 def test_motion_of_an_id_that_two_robots_bear_is_refused_and_a_stop_reaches_both(cell: Cell) -> None:

@@ -18,7 +18,16 @@ from strands_robots.errors import (
     UnknownVerbError,
     UnreachableError,
 )
-from strands_robots.fleet.adapter import CLOSED, DEVICE_CONNECT, FIND_S, STOP_S, FoundRobot, OnEvent, ReceivedCall
+from strands_robots.fleet.adapter import (
+    CLOSED,
+    DEVICE_CONNECT,
+    FIND_S,
+    STOP_S,
+    Detail,
+    FoundRobot,
+    OnEvent,
+    ReceivedCall,
+)
 from strands_robots.fleet.link_flags import described
 from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope
 from strands_robots.utils import ValidationError, device_id, plain_text
@@ -46,9 +55,6 @@ DESCRIBE = "requestRegistration"
 DESCRIBE_S = 2.0
 """Seconds in which a device has to describe itself."""
 
-UNKNOWN_STOP_S = 1.0
-"""Seconds in which a device that was not found has to answer a stop."""
-
 
 class DeviceConnectNetwork:
     """One tenant of Device Connect.
@@ -61,9 +67,11 @@ class DeviceConnectNetwork:
 
     name = DEVICE_CONNECT
     has_stop_link = True
+    tells_absence = True
     announces_verbs = True
     reads: Mapping[str, str] = {"status": "getStatus", "state": "getState", "features": "getFeatures"}
     starts = "execute"
+    _aliases: Mapping[str, str] = {**reads, "start": starts}
 
     def __init__(self, link: LinkConfig, source: str, *, preload: bool = False) -> None:
         self._link, self._source, self._preload = link, device_id("source", source), preload
@@ -174,10 +182,17 @@ class DeviceConnectNetwork:
     def verb(self, robot: str, name: str) -> AdvertisedVerb | None:
         """Return a function as the device itself describes it."""
         with self._asked(robot, name):
-            return self._connected.verb(robot, name)
+            described = self._connected.verb(robot, name)
+            if described is None and (alias := self._aliases.get(name)):
+                return self._connected.verb(robot, alias)
+            return described
 
     def call(self, robot: str, verb: str, arguments: Mapping[str, Any], timeout: float) -> Envelope:
-        """Call a function of the device."""
+        """Call a function of the device, also by its name on the mesh."""
+        if verb in self._aliases:
+            # A device may have a function of that name.
+            described = self.verb(robot, verb)
+            verb = self._aliases[verb] if described is None else described.name
         with self._asked(robot, verb):
             return self._connected.call(robot, verb, arguments, timeout)
 
@@ -185,10 +200,12 @@ class DeviceConnectNetwork:
         self, robot: str, timeout: float = STOP_S, robot_name: str = "", *, insist: bool = False
     ) -> Envelope | None:
         """Stop the device by ``stop``, else by ``stopMotion``."""
-        within = timeout if insist or self.bears(robot) else min(timeout, UNKNOWN_STOP_S)
-        answer = self._connected.stop(robot, within, robot_name)
-        unknown = answer.get("status") == "error" and answer.get("stopped") is None
-        return None if unknown and not insist and not self.bears(robot) else answer
+        answer = self._connected.stop(robot, timeout, robot_name)
+        if answer.get("in_reach") is False:
+            # Its presence says whether it is still there.
+            self._peers.pop(robot, None)
+            return answer if insist or self.bears(robot) else None
+        return answer
 
     def received(self, robot: str, verb: str, arguments: Mapping[str, Any]) -> ReceivedCall:
         """Return the call as it is: a device receives what was sent."""
@@ -338,8 +355,13 @@ class DeviceConnectNetwork:
         with _carried():
             return resume_robots(self._connected, reports, signer, timeout)
 
-    def subscribe(self, robot: str, on_event: OnEvent) -> Callable[[], None]:
-        """Receive the device's events."""
+    def beats_every(self, robot: str) -> float:
+        """Return the seconds between two heartbeats of the device, or of its process."""
+        return self._connected.beats_every(robot)
+
+    def subscribe(self, robot: str, on_event: OnEvent, detail: Detail = Detail.EVENTS) -> Callable[[], None]:
+        """Receive the device's events, which are all that it sends."""
+        del detail
         from strands_robots.fleet.device_connect.events import robot_event  # noqa: PLC0415 - a call need not load it
 
         with _carried():

@@ -128,6 +128,7 @@ def stopped_and_locked(
             on_report=search.take,
             scope=scope,
         )
+        sending = replace(controller.sending, left=report.link)
     finally:
         if lookup is not None:
             lookup.end()
@@ -139,14 +140,15 @@ def stopped_and_locked(
         # What has not stopped yet waits for no disk.
         with connect() as fleet:
             answers = fleet.stop_each(rest, STOP_S if deadline_s is None else min(STOP_S, deadline_s))
-    sending = replace(controller.sending, left=report.link)
     outcome = _measured(search, report, sending)
     if rest:
+        missed = {name: why for name, why in outcome.reasons.items() if name in rest}
         report = with_plain_stops(report, outcome, answers)
         outcome = with_reasons(_measured(search, report, sending), answers, plain=True)
+        outcome = replace(outcome, not_locked=tuple(rest), reasons={**missed, **outcome.reasons})
     outcome.record(controller.controller_id)
     search.roster.remember(report)
-    return replace(outcome, not_locked=tuple(rest))
+    return outcome
 
 
 class _Lookup:

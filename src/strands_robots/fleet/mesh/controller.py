@@ -7,11 +7,12 @@ import time
 from collections.abc import Collection
 from typing import TYPE_CHECKING, Any
 
+from strands_robots.fleet.mesh.discovery import LOOK_S
 from strands_robots.fleet.mesh.lockouts import lockable_peers
 from strands_robots.fleet.mesh.standing import MeshReports, mesh_network
 from strands_robots.fleet.stop_answers import stop_outcome
 from strands_robots.safety.answers import Answer
-from strands_robots.safety.controller import OnProgress, Progress, StopReport
+from strands_robots.safety.controller import DEADLINE_S, OnProgress, Progress, StopReport
 from strands_robots.safety.orders import new_epoch
 from strands_robots.safety.peer_answers import enrolled_peers, stop_distrust
 from strands_robots.safety.presses import Press, Presses
@@ -30,11 +31,13 @@ class MeshController:
     """A safety controller whose stops and check-ins travel on the mesh.
 
     Args:
-        mesh: the peer that sends them, under its own id.
+        mesh: the peer that sends them, under its own id; it may have joined just now.
         signing_key: Ed25519 private key, for fleets that act on signed stops only.
     """
 
     def __init__(self, mesh: Mesh, signing_key: Any = None) -> None:
+        from strands_robots.mesh.transport.zenoh_config import DISCOVERY_S  # noqa: PLC0415 - the network is loaded when it is used
+
         self._mesh = mesh
         self._key = signing_key
         self._presses = Presses()
@@ -44,11 +47,14 @@ class MeshController:
         self.sending = Sending(signed=signing_key is not None)
         self._reports = MeshReports(mesh)
         self._reports.begin()
+        self._known_at = time.monotonic() + DISCOVERY_S
 
     @property
     def link_up(self) -> bool:
-        """True while this peer is on the mesh."""
-        return self._mesh.alive
+        """True while this peer is on the mesh, and linked to its hub."""
+        from strands_robots.mesh import session  # noqa: PLC0415 - the network is loaded when it is used
+
+        return self._mesh.alive and not session.cut_off()
 
     def press(self, estop_id: str) -> Press:
         """Note the moment of a press, from which its answers are counted."""
@@ -102,19 +108,31 @@ class MeshController:
                 )
             )
 
-        up = self.link_up
+        until = time.monotonic() + DEADLINE_S
         self._reports.inbox.open(epoch, on_report)
         # On a thread: a disk that hangs delays no sending.
         reading = threading.Thread(target=self._load_keys, name="enrolled keys", daemon=True)
         reading.start()
-        replies = self._mesh.emergency_stop(
-            self._key,
-            estop_id=epoch,
-            on_answers=note,
-            scope=scope,
-            remembers=robots_known_at(mesh_network),
-            on_widened=lambda: widened.append(True),
-        )
+
+        def send() -> list[dict[str, Any]]:
+            return self._mesh.emergency_stop(
+                self._key,
+                estop_id=epoch,
+                on_answers=note,
+                scope=scope,
+                remembers=robots_known_at(mesh_network),
+                on_widened=lambda: widened.append(True),
+            )
+
+        replies = send()
+        if time.monotonic() < self._known_at:
+            # Peers that this one did not know yet have stopped, and were not waited for.
+            time.sleep(max(0.0, self._known_at - time.monotonic()))
+            replies = send()
+        up = self.link_up
+        # Without a hub nothing left; a stop that goes on is sent again in the moment it is back.
+        while not up and not self.link_up and time.monotonic() < until:
+            time.sleep(LOOK_S)
         self._reports.inbox.close(epoch)
         reading.join(READ_WITHIN_S)
         # By the keys of now: a robot may have been enrolled since the last stop.

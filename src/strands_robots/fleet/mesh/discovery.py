@@ -4,13 +4,29 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from strands_robots.mesh import Mesh
 
 LOOK_S = 0.05
+
+CALLER = "tool"
+"""Type of a peer of ours that calls robots and has none."""
+
+
+def has_robot(row: Mapping[str, Any]) -> bool:
+    """Return whether a peer states that it has a robot."""
+    return "locked" in row or "tool_name" in row or "robot_kind" in row
+
+
+def must_answer(mesh: Mesh) -> list[str]:
+    """Return the peers in reach that have to answer a stop.
+
+    Programs that only call robots come and go meanwhile.
+    """
+    return [row["peer_id"] for row in mesh.peers if row["reachable"] and (row.get("type") != CALLER or has_robot(row))]
 
 
 def in_reach(mesh: Mesh) -> list[str]:

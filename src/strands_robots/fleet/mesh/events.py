@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
-from strands_robots.fleet.adapter import EVERY, OnEvent, RobotEvent
+from strands_robots.fleet.adapter import EVERY, Detail, OnEvent, RobotEvent
 from strands_robots.fleet.robot_task import task_of
 from strands_robots.utils import plain_text
 
@@ -14,10 +15,18 @@ if TYPE_CHECKING:
 
 LOAD_MAX = 1000.0
 
+STREAM, STEP = "stream", "streamStep"
+"""Name of a policy step: as an event, and in a recording."""
+
+OF_FLEET = "strands/safety/"
+"""Topics of emergency stops and resumes, which are no robot's."""
+
 OnMessage = Callable[[str, dict[str, Any]], None]
 
 
-def follow(mesh: Mesh, robot: str, on_event: OnEvent, number: int) -> Callable[[], None]:
+def follow(
+    mesh: Mesh, robot: str, on_event: OnEvent, number: int, detail: Detail = Detail.EVENTS
+) -> Callable[[], None]:
     """Receive events of a robot, or of all; return the function that ends it.
 
     Args:
@@ -26,11 +35,18 @@ def follow(mesh: Mesh, robot: str, on_event: OnEvent, number: int) -> Callable[[
             received, or :data:`EVERY`.
         on_event: takes each event.
         number: tells this subscription from the others of the peer.
+        detail: the messages that are received besides.
     """
-    receivers = _of_all(mesh, on_event) if robot == EVERY else _of_one(mesh, robot, on_event)
+    if detail is Detail.ALL:
+        receivers = _recorded(robot, on_event)
+    elif robot == EVERY:
+        receivers = _of_all(mesh, on_event)
+    else:
+        receivers = _of_one(mesh, robot, on_event, states=detail is Detail.STATES)
     names = []
     for key, (name, receive) in receivers.items():
-        names.append(f"fleet {number} {name}")
+        # Those of the fleet arrive once, however many robots are recorded.
+        names.append(f"fleet {name}" if key.startswith(OF_FLEET) else f"fleet {number} {name}")
         mesh.subscribe(key, receive, names[-1])
 
     def end() -> None:
@@ -40,23 +56,28 @@ def follow(mesh: Mesh, robot: str, on_event: OnEvent, number: int) -> Callable[[
     return end
 
 
-def _of_one(mesh: Mesh, robot: str, on_event: OnEvent) -> dict[str, tuple[str, OnMessage]]:
+def _of_one(mesh: Mesh, robot: str, on_event: OnEvent, *, states: bool) -> dict[str, tuple[str, OnMessage]]:
     from strands_robots.mesh import topics  # noqa: PLC0415 - the network is loaded when it is used
 
     last = [_condition(mesh.get_peer(robot))]
 
-    def receiver(name: str) -> OnMessage:
-        return lambda key, message: on_event(RobotEvent(robot, name, message))
-
-    def presence(key: str, message: Mapping[str, Any]) -> None:
+    def presence(_key: str, message: Mapping[str, Any]) -> None:
         row = mesh.get_peer(robot) if message.get("robot_id") == robot else None
         if row is not None and last[0] != (now := _condition(row)):
             last[0] = now
             on_event(RobotEvent(robot, "presence", message, task=task_of(row)))
 
-    named = {topics.stream(robot): "stream", topics.safety_event(robot): "safety_event"}
-    receivers = {key: (name, receiver(name)) for key, name in named.items()}
-    return {**receivers, topics.presence(robot): ("presence", presence)}
+    def state(_key: str, message: Mapping[str, Any]) -> None:
+        if message.get("peer_id") == robot:
+            on_event(RobotEvent(robot, "state", message, joints=_positions(message), task=_task(message)))
+
+    receivers = {
+        topics.stream(robot): (STREAM, _named(STREAM, on_event)),
+        topics.safety_event(robot): ("safety_event", _named("safety_event", on_event)),
+    }
+    # A heartbeat tells the end of a task to whom receives no states.
+    besides = {topics.state(robot): ("state", state)} if states else {topics.presence(robot): ("presence", presence)}
+    return receivers | besides
 
 
 def _condition(row: Mapping[str, Any] | None) -> object:
@@ -64,14 +85,57 @@ def _condition(row: Mapping[str, Any] | None) -> object:
     return None if row is None else ({**task_of(row), "step": None}, row.get("locked"), row.get("epochs"))
 
 
+def _recorded(robot: str, on_event: OnEvent) -> dict[str, tuple[str, OnMessage]]:
+    from strands_robots.mesh import topics  # noqa: PLC0415 - as above
+
+    def picture(key: str, message: Mapping[str, Any]) -> None:
+        camera = key.rpartition("/")[2]
+        try:
+            jpeg: bytes | None = base64.b64decode(message.get("data", ""), validate=True)
+        except (TypeError, ValueError):
+            jpeg = None
+        on_event(RobotEvent(_sender(key), f"camera_{camera}", message, part=camera, picture=jpeg))
+
+    def of_fleet(name: str) -> OnMessage:
+        return lambda _, message: on_event(RobotEvent(str(message.get("peer_id") or "mesh"), name, message))
+
+    return {
+        topics.state(robot): ("state", _named("state", on_event)),
+        topics.stream(robot): (STREAM, _named(STEP, on_event)),
+        topics.camera(robot, "*"): ("camera", picture),
+        topics.safety_event(robot): ("safety_event", _named("safety_event", on_event)),
+        topics.estop(): ("estop", of_fleet("emergencyStop")),
+        topics.resume(): ("resume", of_fleet("resume")),
+    }
+
+
+def _named(name: str, on_event: OnEvent) -> OnMessage:
+    return lambda key, message: on_event(RobotEvent(_sender(key), name, message))
+
+
+def _positions(message: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    """Return the joints' positions; those of a world come with velocities."""
+    joints = message.get("joints")
+    if not isinstance(joints, Mapping):
+        return None
+    return {name: each.get("position") if isinstance(each, Mapping) else each for name, each in joints.items()}
+
+
+def _task(message: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Return the task of a state; a world without one is idle."""
+    task, degraded = message.get("task", {}), message.get("degraded")
+    if not isinstance(task, Mapping) or (isinstance(degraded, Mapping) and "task" in degraded):
+        return None
+    return task_of({**task, "task_status": task.get("status"), "step_count": task.get("steps")})
+
+
 def _of_all(mesh: Mesh, on_event: OnEvent) -> dict[str, tuple[str, OnMessage]]:
     from strands_robots.mesh import topics  # noqa: PLC0415 - the network is loaded when it is used
 
     def state(key: str, message: Mapping[str, Any]) -> None:
-        robot, joints = _sender(key), message.get("joints")
+        robot = _sender(key)
         if message.get("peer_id") == robot:
-            found = joints if isinstance(joints, Mapping) else None
-            on_event(RobotEvent(robot, "state", message, joints=found, frequent=True))
+            on_event(RobotEvent(robot, "state", message, joints=_positions(message), frequent=True))
 
     # An idle robot's states are further apart than its heartbeats.
     def presence(key: str, message: Mapping[str, Any]) -> None:

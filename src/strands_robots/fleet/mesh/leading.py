@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from typing import TYPE_CHECKING, Any
 
 from strands_robots.envelope import Envelope, is_error, text_of
 from strands_robots.errors import NoAnswerError, NoSuchRobotError, RefusalError, RobotError, UnreachableError
+from strands_robots.fleet.mesh.network import MeshNetwork
 from strands_robots.policies.base import Ranges, SpeedLimit, checked_action, numbers
 from strands_robots.teleoperators.leader import UNBOUNDED_PER_S, BoundedLeader, LeaderFinished, LeaderPolicy
 from strands_robots.utils import number, plain_text
@@ -194,6 +195,26 @@ class FollowedPeer:
         if not stats["running"]:
             return f"The robot stopped following: {_stream_end(stats)}."
         return f"{self._peer} has been silent for {_SILENT_S:g} s." if now - self._received > _SILENT_S else ""
+
+
+@contextmanager
+def dialled(source: str, peer: str) -> Iterator[Mesh]:
+    """Join a peer's mesh as a caller, which is never its hub, for a block.
+
+    Args:
+        source: the first part of this caller's id.
+        peer: the one to reach.
+
+    Raises:
+        NoSuchRobotError: there is no mesh.
+    """
+    network = MeshNetwork(source)
+    try:
+        network.open()
+    except UnreachableError as exc:
+        raise NoSuchRobotError(f"No peer {peer!r} is on the mesh of this machine: {exc.why}") from exc
+    with closing(network):
+        yield network.peer
 
 
 def publisher(mesh: Mesh, leader: Any, method: str, hz: float) -> InputPublisher:

@@ -22,18 +22,18 @@ from strands_robots.errors import (
     UnknownVerbError,
     UnreachableError,
 )
-from strands_robots.fleet.adapter import CLOSED, FIND_S, MESH, STOP_S, FoundRobot, OnEvent, ReceivedCall
+from strands_robots.fleet.adapter import CLOSED, FIND_S, MESH, STOP_S, Detail, FoundRobot, OnEvent, ReceivedCall
 from strands_robots.fleet.lockout_report import LockoutReport, Resumed
 from strands_robots.fleet.mesh.controller import MeshController
 from strands_robots.fleet.mesh.descriptions import functions_of, functions_of_each, functions_of_kind
-from strands_robots.fleet.mesh.discovery import awaited, discover, in_reach, is_in_reach
+from strands_robots.fleet.mesh.discovery import CALLER, awaited, discover, has_robot, in_reach, is_in_reach
 from strands_robots.fleet.mesh.events import follow
 from strands_robots.fleet.mesh.lockouts import ask_peers, lockable_peers, resume_peers
 from strands_robots.fleet.mesh.requests import PeerRequests
 from strands_robots.fleet.mesh.standing import mesh_network, stand_on_mesh
-from strands_robots.fleet.mesh.stops import lock_peers, stop_answer, stop_peers
+from strands_robots.fleet.mesh.stops import lock_peers, stop_peer, stop_peers
 from strands_robots.fleet.mesh_settings import MeshSettings
-from strands_robots.fleet.refusals import refusal_of_text
+from strands_robots.fleet.refusals import refusal_of_text, with_meaning
 from strands_robots.fleet.stop_answers import roster_verdict
 from strands_robots.fleet.stop_button import StopSender
 from strands_robots.safety.controller import OnProgress
@@ -54,6 +54,9 @@ DESCRIBE_S = 5.0
 VERB_S = 2.0
 """Seconds in which a peer has to describe a verb of its own before that is called."""
 
+UNSEEN_S = 0.2
+"""Seconds in which an unseen peer has to answer a stop, once peers are known."""
+
 ALWAYS_SENT = ("stop", "releaseTorque")
 """Actions that take energy away: they are sent to a peer that was not seen, too."""
 
@@ -67,16 +70,18 @@ class MeshNetwork:
     Args:
         source: the first part of this peer's id.
         stated: settings of the mesh that a connection profile states, by variable; they hold while it is joined.
+        console: ``source`` is the whole id, by which robots may know a safety controller.
     """
 
     name = MESH
     has_stop_link = False
+    tells_absence = False
     announces_verbs = False
     reads: Mapping[str, str] = {"status": "status", "state": "state", "features": "features"}
     starts = "start"
 
-    def __init__(self, source: str, stated: Mapping[str, str] | None = None) -> None:
-        self._source = source
+    def __init__(self, source: str, stated: Mapping[str, str] | None = None, *, console: bool = False) -> None:
+        self._source, self._console = source, console
         self._settings = MeshSettings(stated or {})
         # Of a profile's mesh it is known once its settings are put.
         self._key = None if stated else mesh_network()
@@ -112,7 +117,8 @@ class MeshNetwork:
         from strands_robots.mesh.wire_identity import IdentityError, visitor_id  # noqa: PLC0415 - as above
 
         try:
-            mesh = Mesh(None, visitor_id(self._source), "tool", parts=Parts(acquire=session.dial))
+            name, kind = (self._source, "controller") if self._console else (visitor_id(self._source), CALLER)
+            mesh = Mesh(None, name, kind, parts=Parts(acquire=session.dial))
             try:
                 mesh.start()
             except BaseException:
@@ -122,11 +128,16 @@ class MeshNetwork:
             raise UnreachableError(plain_text(str(exc))) from exc
         return mesh
 
+    @property
+    def peer(self) -> Mesh:
+        """This caller as a peer, once it has joined."""
+        return self._joined_mesh
+
     def find(self, timeout: float = FIND_S) -> list[FoundRobot]:
         """Return the robots in reach, once they had the time to announce themselves."""
         discover(self._joined_mesh, since=self._joined, within=timeout)
         self._discoveries += 1
-        lockable, rows = {*lockable_peers(self._joined_mesh)}, {str(row["peer_id"]): row for row in self._rows()}
+        lockable, rows = {*lockable_peers(self._joined_mesh)}, {str(row["peer_id"]): row for row in self._judged()}
         return [
             replace(
                 _found(row),
@@ -134,7 +145,7 @@ class MeshNetwork:
                 world=world if (world := name.rpartition("__")[0]) in rows else "",
             )
             for name, row in rows.items()
-            if _has_robot(row)
+            if has_robot(row)
         ]
 
     def listed(self, timeout: float | None = None) -> list[FoundRobot]:
@@ -143,12 +154,7 @@ class MeshNetwork:
             discover(self._joined_mesh, since=self._fresh)
         else:
             time.sleep(max(0.0, self._joined + timeout - time.monotonic()))
-        rows, keys = self._rows(), enrolled_peers()
-        for row in rows:
-            row["tags"] = list(read_tags(row.get("tags")))
-            if "locked" in row and (why := lockout_distrust(row["peer_id"], row, row.get("epochs") or [], keys)):
-                row["distrusted"] = why
-        return [_found(row) for row in rows]
+        return [_found(row) for row in self._judged()]
 
     def known(self, robot: str) -> FoundRobot:
         """Return what the peer announced last."""
@@ -156,12 +162,12 @@ class MeshNetwork:
 
     def announced(self) -> Collection[str]:
         """Return the robots in reach."""
-        return [str(row["peer_id"]) for row in self._rows() if _has_robot(row)]
+        return [str(row["peer_id"]) for row in self._rows() if has_robot(row)]
 
     def bears(self, robot: str) -> bool:
         """Return whether a robot of this id is in reach."""
         mesh = self._joined_mesh
-        return is_in_reach(mesh, robot) and _has_robot(mesh.get_peer(robot) or {})
+        return is_in_reach(mesh, robot) and has_robot(mesh.get_peer(robot) or {})
 
     def reaches(self, robot: str) -> bool:
         """Return whether a robot of this id is in reach, once peers are known."""
@@ -230,7 +236,7 @@ class MeshNetwork:
                 raise self._absent(robot, verb)
             raise NoAnswerError(f"{robot} did not answer", robot=robot, verb=verb)
         why = plain_text(reply.get("error") or reply.get("reason"))
-        said = error(f"{robot}: {why or 'refused'}")
+        said = error(f"{robot}: {with_meaning(why) or 'refused'}")
         if reply.get("type") == "error" or why.startswith("validation: "):
             raise refusal_of_text(robot, verb, why, said)
         raise UnreachableError(why or "the mesh did not carry the call", robot=robot, verb=verb, envelope=said)
@@ -241,12 +247,16 @@ class MeshNetwork:
         """Stop the peer; *stopped* counts only where an enrolled robot has signed it."""
         from strands_robots.mesh.transport.zenoh_config import DISCOVERY_S, discovery_timeout  # noqa: PLC0415 - loaded when it is used
 
-        longest = discovery_timeout(DISCOVERY_S)
-        if not self._waited_for(robot, longest if insist else min(longest, FIND_S)) and not insist:
-            return None
-        one = {"robot_name": robot_name} if robot_name else {}
-        reply = self._joined_mesh.send(robot, {"action": "stop", **one}, timeout)
-        return stop_answer(robot, reply, enrolled_peers())
+        # It leaves at once, and again until the peers in reach are known: a hub may not have linked it yet.
+        mesh, longest = self._joined_mesh, discovery_timeout(DISCOVERY_S)
+        if not is_in_reach(mesh, robot):
+            known_in = max(UNSEEN_S, self._joined + (longest if insist else min(longest, FIND_S)) - time.monotonic())
+            answer = stop_peer(mesh, robot, known_in, robot_name)
+            if "in_reach" not in answer:
+                return answer
+            if not insist and not answer["in_reach"]:
+                return None
+        return stop_peer(mesh, robot, timeout, robot_name)
 
     def received(self, robot: str, verb: str, arguments: Mapping[str, Any]) -> ReceivedCall:
         """Return the call with the defaults of an action of ours."""
@@ -387,9 +397,16 @@ class MeshNetwork:
         """Send the resumes of these peers, which relay them."""
         return resume_peers(self._joined_mesh, reports, signer, timeout)
 
-    def subscribe(self, robot: str, on_event: OnEvent) -> Callable[[], None]:
+    def beats_every(self, robot: str) -> float:
+        """Return twice the time between two heartbeats, as one may come late."""
+        from strands_robots.mesh import topics  # noqa: PLC0415 - loaded when it is used
+
+        del robot
+        return 2 / topics.BY_NAME["presence"].rate_hz
+
+    def subscribe(self, robot: str, on_event: OnEvent, detail: Detail = Detail.EVENTS) -> Callable[[], None]:
         """Receive a robot's policy steps and safety events, or what all say."""
-        return follow(self._joined_mesh, robot, on_event, next(self._subscriptions))
+        return follow(self._joined_mesh, robot, on_event, next(self._subscriptions), detail)
 
     def close(self) -> None:
         """Leave the mesh."""
@@ -423,6 +440,15 @@ class MeshNetwork:
     def _rows(self) -> list[dict[str, Any]]:
         """Return the peers in reach, with a robot or without one."""
         return [row for row in self._joined_mesh.peers if row["reachable"]]
+
+    def _judged(self) -> list[dict[str, Any]]:
+        """Return the peers in reach, each with why its lockout is not believed."""
+        rows, keys = self._rows(), enrolled_peers()
+        for row in rows:
+            row["tags"] = list(read_tags(row.get("tags")))
+            if "locked" in row and (why := lockout_distrust(row["peer_id"], row, row.get("epochs") or [], keys)):
+                row["distrusted"] = why
+        return rows
 
     def _action(self, robot: str, verb: str) -> str:
         return verb if self._owns(robot, verb) else _ALIASES.get(verb, verb)
@@ -483,10 +509,6 @@ def _named_as(verb: str, result: Mapping[str, Any]) -> Envelope:
         return dict(result)
     running = {str(row.get("robot", "")): row for row in rows if isinstance(row, Mapping)}
     return {**result, "running_policies": running}
-
-
-def _has_robot(row: Mapping[str, Any]) -> bool:
-    return "locked" in row or "tool_name" in row or "robot_kind" in row
 
 
 def _found(row: Mapping[str, Any]) -> FoundRobot:

@@ -13,7 +13,7 @@ from strands_robots.fleet.adapter import CLOSED
 from strands_robots.fleet.cached_keys import CachedKeys
 from strands_robots.fleet.lockout_report import LockoutReport
 from strands_robots.fleet.mesh.lockouts import ask_peer
-from strands_robots.fleet.mesh.stops import stop_answer
+from strands_robots.fleet.mesh.stops import stop_peer
 from strands_robots.safety.peer_answers import enrolled_peers
 from strands_robots.utils import plain_text
 
@@ -60,7 +60,7 @@ class PeerRequests:
         """Stop a peer; *stopped* counts only where an enrolled robot has signed it."""
         return await _done(
             self._stops,
-            lambda: _stopped(mesh, robot, seconds, robot_name),
+            lambda: stop_peer(mesh, robot, seconds, robot_name),
             lambda why: error(why, stopped=None),
         )
 
@@ -76,12 +76,6 @@ class PeerRequests:
         """Begin no more requests."""
         for pool in (self._calls, self._stops, self._questions):
             pool.shutdown(wait=False, cancel_futures=True)
-
-
-def _stopped(mesh: Mesh, robot: str, seconds: float, robot_name: str) -> Envelope:
-    one = {"robot_name": robot_name} if robot_name else {}
-    reply = mesh.send(robot, {"action": "stop", **one}, seconds)
-    return stop_answer(robot, reply, enrolled_peers())
 
 
 async def _done(pool: ThreadPoolExecutor, work: Callable[[], T], failed: Callable[[str], T]) -> T:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection, Mapping
 from typing import TYPE_CHECKING, Any
 
 from strands_robots.envelope import Envelope, error, success
-from strands_robots.fleet.mesh.discovery import discover, in_reach
+from strands_robots.fleet.mesh.discovery import discover, must_answer
 from strands_robots.fleet.mesh.standing import MeshReports, mesh_network
 from strands_robots.fleet.stop_answers import measured, unanswered
 from strands_robots.safety.orders import new_epoch
@@ -100,6 +100,16 @@ def lock_peers(
     return outcome
 
 
+def stop_peer(mesh: Mesh, robot: str, seconds: float, robot_name: str = "") -> Envelope:
+    """Stop one peer, or one robot of its world; return the answer.
+
+    *Stopped* counts only where an enrolled robot has signed it. Of a silent peer ``in_reach`` says whether it was seen.
+    """
+    one = {"robot_name": robot_name} if robot_name else {}
+    answer = stop_answer(robot, mesh.send(robot, {"action": "stop", **one}, seconds), enrolled_peers())
+    return {**answer, "in_reach": mesh.get_peer(robot) is not None} if answer == unanswered(robot) else answer
+
+
 def stop_answer(
     target: str, reply: Mapping[str, Any], keys: Mapping[str, bytes] | None, *, locks: Collection[str] = ()
 ) -> Envelope:
@@ -164,7 +174,7 @@ def _stop_all(
         return answers
 
     def unconfirmed() -> bool:
-        seen.update(name for name in in_reach(mesh) if roster.scope.covers(name, _cells(mesh, name)))
+        seen.update(name for name in must_answer(mesh) if roster.scope.covers(name, _cells(mesh, name)))
         return any(not graded().get(name, {}).get("stopped") for name in seen)
 
     send()

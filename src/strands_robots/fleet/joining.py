@@ -1,0 +1,125 @@
+"""Joining of one network, tried again where its caller stays."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+
+from strands_robots.errors import UnreachableError
+from strands_robots.fleet.adapter import NetworkAdapter
+from strands_robots.utils import plain_text
+
+logger = logging.getLogger(__name__)
+
+AGAIN_S, AGAIN_MAX_S = 1.0, 5.0
+"""Seconds until a network that could not be joined is tried again: the first time, and at most."""
+
+
+class Joining:
+    """One network, from the first attempt to join it to its end.
+
+    Args:
+        network: to join.
+        again: go on trying until it is joined.
+        changed: called after each attempt.
+        before: the joining of the same network that was closed last, which ends first.
+
+    Attributes:
+        attempted: set once the first attempt is over.
+        why: the reason of the last attempt that failed; empty before the first.
+        unexpected: what an attempt raised that is no refusal.
+        over: set once no attempt goes on.
+    """
+
+    def __init__(
+        self,
+        network: NetworkAdapter,
+        *,
+        again: bool,
+        changed: Callable[[Joining], None],
+        before: Joining | None = None,
+    ) -> None:
+        self.network = network
+        self.attempted = threading.Event()
+        self.why = ""
+        self.unexpected: BaseException | None = None
+        self._again, self._changed, self._before = again, changed, before
+        self._lock = threading.Lock()
+        self._closing, self.over = threading.Event(), threading.Event()
+        self._begun = self._up = False
+
+    @property
+    def up(self) -> bool:
+        """True while the network is joined."""
+        return self._up
+
+    def begin(self, *, here: bool = False) -> None:
+        """Join on a thread of its own, or on this one; a second call does nothing."""
+        with self._lock:
+            begun, self._begun = self._begun, True
+        if begun:
+            return
+        try:
+            if not here:
+                threading.Thread(target=self._run, name=f"join {self.network.name}", daemon=True).start()
+                return
+        except RuntimeError:
+            # The interpreter ends and starts no thread: one attempt has to do.
+            logger.debug("%s is joined on the thread of its caller.", self.network.name)
+            self._again = False
+        self._run()
+
+    def close(self) -> None:
+        """Leave the network; one that is being joined is left once it is."""
+        with self._lock:
+            self._closing.set()
+            joined, self._up = self._up, False
+            if not self._begun:
+                self._begun = True
+                self.over.set()
+        if joined:
+            self._leave()
+
+    def _run(self) -> None:
+        """Join; go on trying where that is wanted."""
+        pause = AGAIN_S
+        try:
+            if self._before is not None:
+                # They share the network, which the other one leaves at its end.
+                self._before.over.wait()
+                self._before = None
+            while not self._attempt() and self._again and not self._closing.wait(pause):
+                pause = min(2 * pause, AGAIN_MAX_S)
+        finally:
+            self.over.set()
+
+    def _attempt(self) -> bool:
+        try:
+            self.network.open()
+        except UnreachableError as exc:
+            self.why = exc.why or "it gave no reason"
+        except (KeyboardInterrupt, SystemExit) as exc:
+            self.why = type(exc).__name__
+            raise
+        except BaseException as exc:
+            if self.unexpected is None:
+                # The other networks are joined all the same.
+                logger.exception("%s cannot be joined.", self.network.name)
+            self.unexpected, self.why = exc, plain_text(f"{type(exc).__name__}: {exc}")
+        else:
+            self.why, self.unexpected = "", None
+            with self._lock:
+                self._up = not self._closing.is_set()
+            if not self._up:
+                self._leave()
+        finally:
+            self.attempted.set()
+            self._changed(self)
+        return not self.why
+
+    def _leave(self) -> None:
+        try:
+            self.network.close()
+        except Exception as exc:  # noqa: BLE001 - the others are left all the same
+            logger.warning("%s was not left in good order: %s", self.network.name, exc)

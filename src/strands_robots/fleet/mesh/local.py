@@ -1,0 +1,110 @@
+"""The mesh of this machine, looked for before any code of the mesh is loaded."""
+
+from __future__ import annotations
+
+import json
+import socket
+from typing import TYPE_CHECKING, Any
+
+from strands_robots import settings
+from strands_robots.errors import UnreachableError
+from strands_robots.fleet.adapter import MESH
+from strands_robots.safety import network_key
+from strands_robots.safety.network_key import NetworkKey
+
+if TYPE_CHECKING:
+    from strands_robots.fleet.mesh.network import MeshNetwork
+
+CONNECT_S = 0.2
+"""Seconds in which the hub takes a connection."""
+
+ANSWER_S = 0.3
+"""Seconds in which it answers."""
+
+BROADCAST = "strands/broadcast"
+"""Topic that every peer of the mesh subscribes to, those of earlier releases too."""
+
+
+class LocalMesh:
+    """Mesh of this machine as a network, joined where it has a peer.
+
+    Its methods are those of :class:`~strands_robots.fleet.mesh.network.MeshNetwork`, once it was joined.
+
+    Args:
+        source: the first part of this peer's id.
+        console: as :class:`MeshNetwork` has it.
+    """
+
+    name = MESH
+    has_stop_link = False
+    tells_absence = False
+
+    def __init__(self, source: str, *, console: bool = False) -> None:
+        self._source, self._console = source, console
+        self._found: MeshNetwork | None = None
+
+    def open(self) -> None:
+        """Join; raise :class:`UnreachableError` where the mesh has no peer."""
+        if self._found is None:
+            # A port with certificates is none of Device Connect's.
+            if why := no_hub() or ("" if settings.raw("STRANDS_MESH_TLS_CA") else no_peers()):
+                raise UnreachableError(why)
+            from strands_robots.fleet.mesh.network import MeshNetwork  # noqa: PLC0415 - loaded when it is used
+
+            self._found = MeshNetwork(self._source, console=self._console)
+        self._found.open()
+
+    def close(self) -> None:
+        """Leave the mesh."""
+        if self._found is not None:
+            self._found.close()
+
+    @property
+    def key(self) -> NetworkKey:
+        """The name of this mesh."""
+        return local_key()
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "_found" or self._found is None:
+            raise UnreachableError("the mesh is not joined")
+        return getattr(self._found, name)
+
+
+def local_key() -> NetworkKey:
+    """Return the name of this machine's mesh, as ``mesh.session`` has it."""
+    return NetworkKey.of(network_key.MESH, [f"tcp/127.0.0.1:{settings.integer('STRANDS_MESH_PORT')}"])
+
+
+def no_hub() -> str:
+    """Return why this machine has no mesh, or "" where it may have one."""
+    port = settings.integer("STRANDS_MESH_PORT")
+    # Not by create_connection, which loads the tables of international names.
+    with socket.socket() as probe:
+        probe.settimeout(CONNECT_S)
+        return f"no mesh answers on 127.0.0.1:{port}" if probe.connect_ex(("127.0.0.1", port)) else ""
+
+
+def no_peers() -> str:
+    """Return why no peer of the mesh is reached by its port on this machine, or "".
+
+    Robots of Device Connect meet at the same port by default, so one that listens there need not be on a mesh.
+    """
+    import zenoh  # noqa: PLC0415 - an optional dependency, loaded when it is used
+
+    port = settings.integer("STRANDS_MESH_PORT")
+    config = {
+        "mode": "client",
+        "namespace": settings.raw("STRANDS_MESH_NAMESPACE"),
+        "connect": {"endpoints": [f"tcp/127.0.0.1:{port}"], "timeout_ms": int(ANSWER_S * 1000)},
+        "scouting": {"multicast": {"enabled": False}},
+    }
+    absent = f"no peer of a mesh is behind 127.0.0.1:{port}"
+    try:
+        with zenoh.open(zenoh.Config.from_json5(json.dumps(config))) as session:
+            publisher = session.declare_publisher(BROADCAST)
+            # The hub answers in order: before it answers this question it has named the subscribers.
+            list(session.liveliness().get(BROADCAST, timeout=ANSWER_S))
+            # The stub has it as a bool.
+            return "" if publisher.matching_status.matching else absent  # type: ignore[attr-defined]
+    except zenoh.ZError:
+        return absent
