@@ -53,6 +53,8 @@ def run(quick: bool = False) -> list[Row]:
     """Measure and give the rows of the table."""
     with tempfile.TemporaryDirectory() as state:
         machine = Machine(Path(state))
+        # Both networks meet at one port by default, so each command looks there for a mesh.
+        machine.environment["STRANDS_MESH_PORT"] = machine.environment["STRANDS_DC_PORT"]
         # As after an installation, which compiles: without this each command may compile the whole package anew.
         machine.environment.pop("PYTHONDONTWRITEBYTECODE", None)
         with machine.serving("arm-1"):

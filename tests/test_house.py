@@ -35,6 +35,7 @@ FLOORS: list[set[str]] = [
         "agent_tool",
         "_mesh_switch",
         "zenoh_sockets",
+        "certificates",
     },
     {"safety", "audit", "contract", "verb_declaration", "verb_parameters"},
     {"arm_mixin", "kinematics", "policies", "teleop_mixin", "teleoperators", "recording"},

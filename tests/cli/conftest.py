@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -86,14 +85,6 @@ class Given(DeviceConnectNetwork):
 def connect(monkeypatch: pytest.MonkeyPatch, fleet: Any) -> None:
     """Put ``fleet`` in the place of the robots on every network."""
 
-    @contextmanager
-    def connected(network: Network, source: str = "") -> Iterator[Any]:
-        yield fleet
-
-    def networks(network: Network, **_: object) -> Networks:
-        return Networks([DeviceConnectNetwork.joined(fleet)])
-
-    monkeypatch.setattr(Network, "fleet", connected)
     monkeypatch.setattr(Network, "networks", lambda *_, **__: Networks([Given.joined(fleet)]))
 
 

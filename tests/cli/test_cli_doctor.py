@@ -45,6 +45,24 @@ def test_every_finding_that_is_not_ok_has_a_remedy(run: Run) -> None:
         assert found["mark"] == "ok" or found["remedy"], found
 
 
+@pytest.mark.parametrize(
+    ("settings", "mark", "said"),
+    [
+        ({}, "ok", "no mesh answers"),
+        ({"STRANDS_MESH": "false"}, "ok", "it is switched off"),
+        ({"STRANDS_MESH": "true"}, "warn", "no mesh answers"),
+        ({"STRANDS_MESH_BACKEND": "memory"}, "ok", "its peers are reached by every command"),
+    ],
+)
+def test_mesh_that_commands_reach_is_joined(
+    run: Run, monkeypatch: pytest.MonkeyPatch, settings: dict[str, str], mark: str, said: str
+) -> None:
+    for name, value in settings.items():
+        monkeypatch.setenv(name, value)
+    found = checked(run("doctor", "--json"))["mesh"]
+    assert (found["mark"], said in found["said"]) == (mark, True), found
+
+
 def test_missing_required_package_is_broken_and_exits_with_1(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "_version", lambda name: None)
     result = run("doctor", "--json")

@@ -7,7 +7,7 @@ import time
 from typing import Any
 
 import pytest
-from fixtures.page_feed import PageFeed
+from fixtures.page_feed import PageFeed, page_robot
 from fixtures.waiting import until
 
 from strands_robots.dashboard import driving
@@ -28,7 +28,7 @@ class Page:
         self.control = HandControl(self.told.append)
 
     async def take(self, **more: Any) -> Any:
-        return await self.control.take(KEY, self.feed, ARM, **more)
+        return await self.control.take(KEY, page_robot(self.feed, ARM), **more)
 
     async def jog(self, **changes: Any) -> None:
         assert self.control.begin(KEY, {**JOG, **changes}) == ""

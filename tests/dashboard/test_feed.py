@@ -227,6 +227,15 @@ def test_forgotten_robot_is_met_anew_with_its_verbs(page: Page) -> None:
     eventually(lambda: row.forms, what="its verbs")
 
 
+def test_device_of_others_says_what_it_lacks(page: Page) -> None:
+    page.there.robots["kettle"] = (function("boil"),)
+    page.there.of_kind = (function("boil"),)
+    row = page.shown("kettle")
+    eventually(lambda: row.lacking == "no lockout, no lease, no stop", what="what it lacks")
+    ours = page.shown("arm-1")
+    eventually(lambda: ours.forms and not ours.lacking, what="one of ours lacks nothing")
+
+
 def test_call_that_is_refused_is_an_answer_and_a_stop_is_graded(page: Page) -> None:
     page.there.answers["moveTo"] = lambda arguments: error("busy")
     moved = asyncio.run(page.feed.call("arm-1", "moveTo", {"x": 1.0}, 3.0))
@@ -262,12 +271,9 @@ def test_resume_frees_the_robots_and_names_the_network_that_is_gone(page: Page) 
     assert page.feed.resume(["arm-1"], None, 1.0) == {"arm-1": (False, "the broker is gone")}
 
 
-def test_stops_come_from_the_controller_of_the_network_which_knows_the_robots_of_the_page(page: Page) -> None:
+def test_feed_that_is_closed_hears_nothing_more(page: Page) -> None:
     page.shown("arm-1")
-    assert page.feed.controller is page.there.controller
-    assert page.there.standing_for[0]() == ("arm-1",)
     page.feed.close()
-    assert page.there.standing_for == []
     assert page.there.subscribers == []
 
 

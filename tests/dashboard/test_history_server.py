@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from fixtures.page_feed import PageFeed
+from fixtures.page_feed import PageFeed, page_feeds
 from fixtures.waiting import eventually
 from starlette.testclient import TestClient
 
@@ -42,7 +42,7 @@ def site() -> Iterator[Site]:
         model.update("dc", name, kind="strands_robot")
         model.sign_of_life("dc", name)
     model.observe("dc", "arm-1", {"pan": 0.5, "lift": -1.0})
-    app = Dashboard(model, [PageFeed()], Access(loopback_origins(8800))).app()
+    app = Dashboard(model, page_feeds(model, PageFeed()), Access(loopback_origins(8800))).app()
     with TestClient(app, base_url=ORIGIN, client=("127.0.0.1", 4000)) as client:
         made = Site(client, model)
         with client.websocket_connect("ws://127.0.0.1:8800/state", headers={"origin": ORIGIN}) as socket:

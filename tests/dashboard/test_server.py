@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fixtures.page_feed import JPEG, PageFeed
+from fixtures.page_feed import JPEG, PageFeed, page_feeds
 from fixtures.waiting import eventually
 from starlette.testclient import TestClient, WebSocketTestSession
 from starlette.websockets import WebSocketDisconnect
@@ -57,7 +57,7 @@ def make(tmp_path: Path) -> Iterator[Make]:
     def made(access: Access | None = None, client: str = "127.0.0.1", key: Path | None = None) -> Site:
         model, feed = FleetModel(), PageFeed()
         model.update("dc", "arm-1", kind="strands_robot", forms=FORMS, expected=True)
-        page = Dashboard(model, [feed], access or Access(loopback_origins(8800)), OperatorKey(key))
+        page = Dashboard(model, page_feeds(model, feed), access or Access(loopback_origins(8800)), OperatorKey(key))
         browser = TestClient(page.app(), base_url=ORIGIN, client=(client, 4000))
         stack.append(browser)
         browser.__enter__()
@@ -236,6 +236,26 @@ def test_page_whose_state_cannot_be_sent_any_more_loses_its_connection(
         with pytest.raises(WebSocketDisconnect) as closed:
             received(socket, "never")
         assert closed.value.code == 1011
+
+
+def test_verbs_that_a_robot_describes_later_are_told_to_the_page_that_looks_at_it(make: Make) -> None:
+    site = make()
+    with site.open("/state") as socket:
+        hello(socket)
+        socket.send_json({"type": "watch", "key": "dc:arm-1"})
+        while not received(socket, "robot")["looked"]:
+            pass
+        site.model.update("dc", "arm-1", forms=FORMS[:1])
+        assert [form["name"] for form in received(socket, "robot")["forms"]] == ["execute"]
+
+
+def test_networks_that_are_missing_are_told_with_the_reason(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    site = make()
+    monkeypatch.setattr(type(site.page.feeds), "missing", {"mesh": "no mesh answers"})
+    with site.open("/stop") as stop:
+        stop.send_json({"type": "hello"})
+        told = received(stop, "link")
+    assert (told["missing"], told["can_stop"]) == ({"mesh": "no mesh answers"}, True)
 
 
 def test_verb_that_the_robot_does_not_describe_is_not_called(make: Make) -> None:

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import asyncio
-import math
 import threading
 
-import numpy as np
-import pytest
 from fixtures.waiting import until
 from hypothesis import given
 from hypothesis import strategies as st
 
 from strands_robots.contract import RolloutEvent
 from strands_robots.device_connect import telemetry
-from strands_robots.device_connect.telemetry import CATCH_UP, RolloutPump, numbers, step_limiter
+from strands_robots.device_connect.telemetry import CATCH_UP, RolloutPump, step_limiter
 
 
 class Clock:
@@ -108,16 +105,6 @@ def test_observer_never_raises_after_the_loop_is_gone() -> None:
         return RolloutPump(_nothing, 50.0)
 
     asyncio.run(make()).observe(event("started"))
-
-
-@pytest.mark.parametrize("value", [math.nan, math.inf, True, "1", None, [1.0], np.zeros(3), {"position": math.nan}])
-def test_numbers_keeps_only_finite_numbers(value: object) -> None:
-    assert numbers({"a": value, "b": 1, "c": np.float64(2.5), "d": {"position": 3.0}}) == {"b": 1.0, "c": 2.5, "d": 3.0}
-
-
-@pytest.mark.parametrize("value", [None, [], "x", 3])
-def test_numbers_of_a_value_that_is_no_mapping_are_empty(value: object) -> None:
-    assert numbers(value) == {}
 
 
 async def _nothing(each: RolloutEvent) -> None:

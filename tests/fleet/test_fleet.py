@@ -87,6 +87,23 @@ def test_id_on_both_is_one_robot_where_one_key_signs_both(
         both.move_to(x=3)
 
 
+def test_robot_of_one_key_is_moved_on_the_network_on_which_it_still_answers(
+    fleet: Fleet, device_connect: ScriptedNetwork, mesh: ScriptedNetwork, keys: list[SigningIdentity]
+) -> None:
+    device_connect.sign_with(keys[0])
+    mesh.sign_with(keys[0])
+    both = fleet["both"]
+    both.move_to(x=1)
+    device_connect.answers["getStatus"] = errors.NoAnswerError("it did not answer")
+    device_connect.sessions += 1
+    both.move_to(x=2)
+    assert [call[1] for call in mesh.calls if call[1] == "moveTo"] == ["moveTo"]
+    mesh.sign_with(keys[1])
+    mesh.sessions += 1
+    with pytest.raises(errors.AmbiguousRobotError):
+        both.move_to(x=3)
+
+
 def test_enrolled_robot_wins_an_id_on_both(
     fleet: Fleet, device_connect: ScriptedNetwork, mesh: ScriptedNetwork, keys: list[SigningIdentity]
 ) -> None:

@@ -327,6 +327,19 @@ class TestStays:
             assert sorted(networks.find()) == ["arm-1", "arm-2", "both"]
         assert told == [near, far]
 
+    def test_only_networks_that_someone_asked_for_are_missing(self, near: ScriptedNetwork, far: SlowNetwork) -> None:
+        near.unreachable = "the broker is down"
+        networks = Networks([near, far], stays=True, unasked=[MESH])
+        networks.begin()
+        try:
+            assert networks.joined == (), "nothing is waited for"
+            far.unreachable = "no mesh answers"
+            far.may_open.set()
+            eventually(lambda: len(networks.absent) == 2, what="both reasons")
+            assert networks.missing == {DEVICE_CONNECT: "the broker is down"}
+        finally:
+            networks.close()
+
     def test_none_in_reach_is_no_error(self, near: ScriptedNetwork) -> None:
         near.unreachable = "no broker"
         with Networks([near], stays=True) as networks:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from strands_robots.policies.base import SpeedLimit, checked_action, checked_speeds, numbers
+from strands_robots.policies.base import SpeedLimit, checked_action, checked_speeds, numbers, plain_numbers
 from strands_robots.utils import ValidationError
 
 RANGES = {"a": (-1.0, 1.0), "b": (-math.inf, math.inf)}
@@ -47,6 +47,20 @@ def test_numbers_leaves_out_what_no_float_can_be() -> None:
 def test_numbers_leaves_out_images_flags_and_text() -> None:
     observation = {"a": np.float64(1), "b": 2, "c": True, "d": "x", "e": np.zeros((2, 2)), "f": math.nan, "g": None}
     assert numbers(observation) == {"a": 1.0, "b": 2.0}
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, True, "1", None, [1.0], np.zeros(3), {"position": math.nan}])
+def test_plain_numbers_keeps_only_finite_numbers(value: object) -> None:
+    assert plain_numbers({"a": value, "b": 1, "c": np.float64(2.5), "d": {"position": 3.0}}) == {
+        "b": 1.0,
+        "c": 2.5,
+        "d": 3.0,
+    }
+
+
+@pytest.mark.parametrize("value", [None, [], "x", 3])
+def test_plain_numbers_of_a_value_that_is_no_mapping_are_empty(value: object) -> None:
+    assert plain_numbers(value) == {}
 
 
 @given(st.floats(-5, 5), st.floats(-5, 5), st.floats(0.001, 0.1))

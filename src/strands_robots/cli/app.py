@@ -35,7 +35,7 @@ COMMANDS = {
 }
 """Words of the command line, by the module that has them."""
 
-HELP = """Robots on Device Connect: serve one, find them, drive them, and stop them.
+HELP = """Robots on Device Connect and the native mesh: serve one, find them, drive them, and stop them.
 
 Without network flags everything stays on this machine. Exit codes: 0 done, 1 refused or failed,
 2 wrong usage, 3 no answer, 130 Ctrl-C."""

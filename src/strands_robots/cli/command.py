@@ -23,7 +23,7 @@ from strands_robots.utils import ValidationError, shown
 Body = TypeVar("Body", bound=Callable[..., None])
 
 Timeout = Annotated[float, typer.Option("--timeout", help="Seconds to wait for an answer.")]
-OnMesh = Annotated[bool, typer.Option("--mesh", help="On the native mesh instead of Device Connect.")]
+OnMesh = Annotated[bool, typer.Option("--mesh", help="On the native mesh alone.")]
 Seconds = Annotated[float | None, typer.Option("--for", help="End after that many seconds.")]
 
 WITHOUT_CHECK = ("stop", "estop", "doctor")

@@ -17,17 +17,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from strands_robots import settings
+from strands_robots._mesh_switch import mesh_env_request
 from strands_robots.cli.command import command
 from strands_robots.cli.keys import PassphraseFile, signing_key
-from strands_robots.cli.network import Network, joined_mesh
+from strands_robots.cli.network import Network
 from strands_robots.cli.output import CliError, Exit, Screen
 from strands_robots.safety.ed25519 import keygen
 from strands_robots.utils import device_id, missing_extra
 
 if TYPE_CHECKING:
     from strands_robots.cli.demo.processes import RobotProcess
-    from strands_robots.dashboard.feed import FleetFeed
-    from strands_robots.dashboard.fleet_model import FleetModel
     from strands_robots.dashboard.listening import RemoteAddress
     from strands_robots.dashboard.server import Dashboard
 
@@ -67,18 +66,21 @@ def dashboard(
     meet: Annotated[
         int | None, typer.Option("--meet", help="Loopback port where local robots meet.", min=1, max=65535)
     ] = None,
-    with_mesh: Annotated[bool, typer.Option("--mesh", help="Also the robots of the native mesh.")] = False,
+    with_mesh: Annotated[bool, typer.Option("--mesh", help="Say so where the native mesh is not there.")] = False,
     demo: Annotated[bool, typer.Option("--demo", help="Serve four simulated robots to try it with.")] = False,
 ) -> None:
     """Show every robot in a browser: watch, drive, stop; on 127.0.0.1 alone."""
     source = device_id("--as", source)
     if operator_key is not None and not operator_key.is_file():
         raise CliError(f"--operator-key {operator_key} is no file.", Exit.USAGE)
-    if demo and (operator_key is not None or meet is not None or network != Network()):
+    if demo and (operator_key is not None or meet is not None or with_mesh or network != Network()):
         raise CliError("--demo has robots, a network and an operator's key of its own.", Exit.USAGE)
+    if with_mesh and mesh_env_request() is False:
+        raise CliError("--mesh: STRANDS_MESH switches the mesh off.", Exit.USAGE)
     signer = None if key is None else signing_key(key, passphrase_file)
     try:
-        from strands_robots.dashboard.fleet_model import FleetModel  # noqa: PLC0415 - loaded when it is used
+        from strands_robots.dashboard.feeds import Feeds  # noqa: PLC0415 - loaded when it is used
+        from strands_robots.dashboard.fleet_model import FleetModel  # noqa: PLC0415 - as above
         from strands_robots.dashboard.listening import access_for, remote_address  # noqa: PLC0415 - as above
         from strands_robots.dashboard.operator_key import OperatorKey  # noqa: PLC0415 - as above
         from strands_robots.dashboard.server import Dashboard  # noqa: PLC0415 - as above
@@ -95,10 +97,13 @@ def dashboard(
         if remote is not None:
             sockets.append(stack.enter_context(_bound(remote.host, port)))
         model = FleetModel()
-        feeds = _feeds(stack, model, replace(network, port=meet), source, signer, with_mesh=with_mesh)
+        networks = replace(network, port=meet).networks(source=source, stays=True, with_mesh=with_mesh)
+        if not networks.stated:
+            raise CliError(f"No network is there: {networks.absences}.", Exit.SILENT)
+        stack.callback(networks.close)
         page = Dashboard(
             model,
-            feeds,
+            Feeds(model, networks, signer),
             access_for(port, remote, viewer=viewer),
             OperatorKey(operator_key),
             source=source,
@@ -106,19 +111,8 @@ def dashboard(
             starting=() if robots is None else tuple(DEMO_ROBOTS),
         )
         stack.callback(page.close)
+        page.feeds.begin()
         _serve(screen, page, sockets, remote, robots, browser=not no_browser)
-
-
-def _feeds(
-    stack: ExitStack, model: FleetModel, network: Network, source: str, signer: Any, *, with_mesh: bool
-) -> list[FleetFeed]:
-    """Join the networks; they are left when the stack ends."""
-    from strands_robots.dashboard.feed import FleetFeed  # noqa: PLC0415 - as above
-
-    networks = [stack.enter_context(network.adapter(source=source))]
-    if with_mesh:
-        networks.append(stack.enter_context(joined_mesh(source, "controller")))
-    return [FleetFeed(model, each, signer) for each in networks]
 
 
 @contextmanager
@@ -255,6 +249,8 @@ def _demo_robots(screen: Screen) -> Iterator[DemoRobots]:
         for name in ("DEVICE_CONNECT_ESTOP_ALLOW", "DEVICE_CONNECT_ESTOP_PUBLIC_KEYS"):
             settings.put(name, "")
         settings.put("STRANDS_CHECKIN_TIMEOUT_S", "0")
+        # Its STOP is for its own robots, not for those of the user's mesh.
+        settings.put("STRANDS_MESH", "false")
         port = free_port()
         screen.say("Four simulated robots start while you open the page.")
         screen.data({"event": "demo", "passphrase": passphrase, "meet": port})

@@ -17,7 +17,6 @@ from strands_robots import settings
 from strands_robots._mesh_switch import mesh_env_request
 from strands_robots.cli.output import CliError, Exit, Screen, plain
 from strands_robots.cli.readiness import other_user
-from strands_robots.envelope import Envelope
 from strands_robots.errors import (
     AmbiguousRobotError,
     ArgumentsError,
@@ -34,7 +33,6 @@ from strands_robots.fleet.profiles import FleetProfile, mesh_at, profile_for, pr
 from strands_robots.utils import ValidationError, near, port, redacted
 
 if TYPE_CHECKING:
-    from strands_robots.device_connect import FleetClient
     from strands_robots.device_connect.backends import LinkConfig
     from strands_robots.fleet.adapter import NetworkAdapter
     from strands_robots.fleet.networks import Networks
@@ -140,12 +138,19 @@ class Network:
         return self._flags_over(self._profile)
 
     def networks(
-        self, *, on_mesh: bool = False, source: str | None = None, stays: bool = False, console: bool = False
+        self,
+        *,
+        on_mesh: bool = False,
+        source: str | None = None,
+        stays: bool = False,
+        console: bool = False,
+        with_mesh: bool = False,
     ) -> Networks:
         """Return the networks of the flags, not joined yet.
 
         Args:
             on_mesh: the native mesh alone.
+            with_mesh: the native mesh in any case, so that its absence is told.
             source: the caller's name; by default that of :meth:`caller`.
             stays: the command lasts, and goes on trying to join what is not there yet.
             console: a safety controller, whose name is its whole id on the mesh.
@@ -163,9 +168,8 @@ class Network:
                 raise CliError("The native mesh is off: STRANDS_MESH switches it off.", Exit.SILENT)
             return networks_of(None, {}, name, devices=False, mesh=True, stays=stays, console=console)
         try:
-            networks = networks_of(
-                self._profile, self._given, name, mesh=self._usable_mesh, stays=stays, console=console
-            )
+            mesh = True if with_mesh else self._usable_mesh
+            networks = networks_of(self._profile, self._given, name, mesh=mesh, stays=stays, console=console)
         except ValidationError as exc:
             raise CliError(str(exc), Exit.USAGE) from exc
         if not networks.stated and not self.on_mesh_alone:
@@ -175,30 +179,6 @@ class Network:
             # For the processes that a command starts, and for what it prints.
             settings.put("MESSAGING_CREDENTIALS_FILE", str(credentials))
         return networks
-
-    @contextmanager
-    def fleet(self, source: str | None = None) -> Iterator[FleetClient]:
-        """Connect to the robots on this network for the length of the block.
-
-        Args:
-            source: the caller's name; by default that of :meth:`caller`.
-
-        Raises:
-            CliError: the network cannot be reached, or fails in use.
-        """
-        link = self.link()
-        name = self.caller() if source is None else source
-        from device_connect_edge.messaging import MessagingError  # noqa: PLC0415 - loaded when a network is used
-
-        from strands_robots.device_connect import FleetClient  # noqa: PLC0415 - as above
-
-        try:
-            with FleetClient(link, name) as fleet:
-                yield fleet
-        except MessagingError as exc:
-            raise CliError(f"The network does not carry this: {exc}", Exit.SILENT) from exc
-        except UnreachableError as refusal:
-            raise CliError(plain(f"The network does not carry this: {refusal.why}", 2000), Exit.SILENT) from refusal
 
     @contextmanager
     def joined(
@@ -223,28 +203,25 @@ class Network:
             raise CliError(plain(f"The network does not carry this: {refusal.why}", 2000), Exit.SILENT) from refusal
 
     @contextmanager
-    def adapter(
-        self, *, on_mesh: bool = False, source: str | None = None, peer: str = "console"
-    ) -> Iterator[NetworkAdapter]:
-        """Join Device Connect, or the native mesh, for the length of the block.
-
-        Args:
-            on_mesh: the native mesh.
-            source: the caller's name on Device Connect, as in :meth:`fleet`.
-            peer: the first part of this peer's id on the mesh.
+    def adapter(self, source: str) -> Iterator[NetworkAdapter]:
+        """Connect to Device Connect for the length of the block.
 
         Raises:
-            CliError: the network cannot be reached, fails in use, or takes no such flag.
+            CliError: it cannot be reached, or fails in use.
         """
-        if on_mesh:
-            self.use_mesh()
-            with joined_mesh(peer, "tool") as mesh:
-                yield mesh
-            return
-        from strands_robots.fleet.device_connect.network import DeviceConnectNetwork  # noqa: PLC0415 - loaded when a network is used
+        link = self.link()
+        from device_connect_edge.messaging import MessagingError  # noqa: PLC0415 - loaded when a network is used
 
-        with self.fleet(source) as fleet:
-            yield DeviceConnectNetwork.joined(fleet)
+        from strands_robots.device_connect import FleetClient  # noqa: PLC0415 - as above
+        from strands_robots.fleet.device_connect.network import DeviceConnectNetwork  # noqa: PLC0415 - as above
+
+        try:
+            with FleetClient(link, source) as fleet:
+                yield DeviceConnectNetwork.joined(fleet)
+        except MessagingError as exc:
+            raise CliError(f"The network does not carry this: {exc}", Exit.SILENT) from exc
+        except UnreachableError as refusal:
+            raise CliError(plain(f"The network does not carry this: {refusal.why}", 2000), Exit.SILENT) from refusal
 
     def other_user(self, networks: Networks) -> str:
         """Return who else serves robots where those of this machine meet, or ""."""
@@ -359,7 +336,7 @@ def answering(there: Networks, robot: str, verb: str) -> Iterator[None]:
         if several:
             reason += " Give one of them another id; --mesh means the one on the mesh."
         elif isinstance(refusal, NoSuchRobotError):
-            reason += "" if refusal.remedy else near_robots(there, robot)
+            reason += "" if refusal.remedy else _near_robots(there, robot)
             reason += "".join(f" Not reached: {name}, {why.rstrip('.')}." for name, why in there.missing.items())
         elif isinstance(refusal, ArgumentsError) and not answer:
             code = Exit.USAGE
@@ -370,18 +347,10 @@ def answering(there: Networks, robot: str, verb: str) -> Iterator[None]:
         raise CliError(plain(reason, 2000), code, **fields) from refusal
 
 
-def call_robot(
-    there: Networks, robot: str, verb: str, params: Mapping[str, Any], seconds: float, *, moves: bool = False
-) -> Envelope:
-    """Call a verb of a robot and return its answer; raises as :func:`answering`."""
-    with answering(there, robot, verb):
-        return there.call(robot, verb, params, seconds, moves=moves)
-
-
-def near_robots(there: Networks | NetworkAdapter, robot: str) -> str:
+def _near_robots(there: Networks, robot: str) -> str:
     """Return a sentence with the ids that resemble an absent one."""
     try:
-        names = [each if isinstance(each, str) else each.id for each in there.find(1.0)]
+        names = there.find(1.0)
     except RefusalError:
         return ""
     return "" if robot in names else near(robot, names)

@@ -54,7 +54,10 @@ def peers(
     timeout: Timeout = FIND_S,
     on_mesh: OnMesh = False,
 ) -> None:
-    """List the robots in reach, or what one of them can do. With --mesh also peers without a robot."""
+    """List the robots in reach, or what one of them can do.
+
+    With --mesh these are all peers of the mesh, also those without a robot.
+    """
     seconds = number("--timeout", timeout, above=0, high=60)
     wanted = None if device is None else identifier("DEVICE", device)
     with network.joined(on_mesh=on_mesh) as there:

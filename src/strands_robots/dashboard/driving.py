@@ -10,13 +10,13 @@ import asyncio
 import contextlib
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from strands_robots.dashboard.feed import FleetFeed
+from strands_robots.dashboard.page_robots import PageRobot
 from strands_robots.envelope import Envelope, error, is_error, text_of
-from strands_robots.policies.base import numbers
+from strands_robots.policies.base import plain_numbers
 from strands_robots.safety.stopping import grade
 from strands_robots.serving.control import HUMAN
 from strands_robots.serving.take_assertion import sign_take
@@ -122,8 +122,7 @@ class JogAxis:
 class HeldRobot:
     """A robot that this page holds."""
 
-    feed: FleetFeed
-    robot: str
+    robot: PageRobot
     part: str
     lease_id: str
     renewing: asyncio.Task[None] | None = None
@@ -175,28 +174,34 @@ class HandControl:
         """Return True for a robot that this page holds."""
         return key in self._held
 
-    async def take(self, key: str, feed: FleetFeed, robot: str, *, part: str = "", signer: Any = None) -> Envelope:
+    @property
+    def held(self) -> Collection[str]:
+        """Keys of the robots that this page holds."""
+        return tuple(self._held)
+
+    async def take(self, key: str, robot: PageRobot, *, part: str = "", signer: Any = None) -> Envelope:
         """Hold a robot: acquire it where it is free, else take it from its holder.
 
         Args:
             signer: the operator's key, where the robot asks for a signature.
         """
         if key in self._held or key in self._taking:
-            return error(f"This page holds {robot} already.")
+            return error(f"This page holds {robot.id} already.")
         self._taking.add(key)
         try:
             which = {"robot_name": part} if part else {}
-            answer = await feed.call(robot, "acquireControl", {"kind": HUMAN, "ttl_s": LEASE_S, **which}, ANSWER_S)
+            asked = {"kind": HUMAN, "ttl_s": LEASE_S, **which}
+            answer = await robot.call("acquireControl", asked, ANSWER_S, moves=True)
             if is_error(answer) and answer.get("code") == "not_holder":
-                answer = await self._displace(feed, robot, which, signer)
+                answer = await self._displace(robot, which, signer)
             lease = answer.get(LEASE_ID)
             if is_error(answer) or not isinstance(lease, str):
-                return answer if is_error(answer) else error(f"{robot} gave no lease.")
-            held = HeldRobot(feed, robot, part, lease)
+                return answer if is_error(answer) else error(f"{robot.id} gave no lease.")
+            held = HeldRobot(robot, part, lease)
             if self._gone:
                 # Nobody is there to drive it, and nobody would ever give it back.
-                await feed.call(robot, "releaseControl", self._lease_of(held), ANSWER_S)
-                return error(f"The page has gone; {robot} was given back.")
+                await robot.call("releaseControl", self._lease_of(held), ANSWER_S)
+                return error(f"The page has gone; {robot.id} was given back.")
             self._held[key] = held
             held.renewing = asyncio.create_task(self._renew(key, held))
         finally:
@@ -211,7 +216,7 @@ class HandControl:
             return error("This page does not hold the robot.")
         await self._end_jog(held, "control was given back")
         self._forget(key)
-        return await held.feed.call(held.robot, "releaseControl", self._lease_of(held), ANSWER_S)
+        return await held.robot.call("releaseControl", self._lease_of(held), ANSWER_S)
 
     def begin(self, key: str, message: Mapping[str, Any], units: Mapping[str, str] | None = None) -> str:
         """Begin a jog of a held robot; return the reason of a refusal, or ""."""
@@ -251,31 +256,31 @@ class HandControl:
 
     async def _leave(self, key: str, held: HeldRobot) -> None:
         if held.jog is None:
-            await held.feed.stop(held.robot)
+            await held.robot.stop()
         await self.give(key)
 
-    async def _displace(self, feed: FleetFeed, robot: str, which: dict[str, str], signer: Any) -> Envelope:
-        before = await feed.call(robot, "getControl", which, ANSWER_S)
+    async def _displace(self, robot: PageRobot, which: dict[str, str], signer: Any) -> Envelope:
+        before = await robot.call("getControl", which, ANSWER_S)
         if is_error(before):
             return before
         asked: dict[str, Any] = {"reason": "an operator took over on the page", **which}
         part, epoch = which.get("robot_name", ""), before.get("epoch")
         if signer is not None and isinstance(epoch, int):
-            asked["assertion"] = sign_take(signer, f"{robot}/{part}" if part else robot, epoch)
-        answer = await feed.call(robot, "takeControl", asked, ANSWER_S)
+            asked["assertion"] = sign_take(signer, f"{robot.id}/{part}" if part else robot.id, epoch)
+        answer = await robot.call("takeControl", asked, ANSWER_S, moves=True)
         lease = answer.get(LEASE_ID)
         if is_error(answer) or not isinstance(lease, str):
             return answer
         # A lease that was taken lasts a minute; ours ends soon after this server.
         held = {LEASE_ID: lease, "kind": HUMAN, "ttl_s": LEASE_S, **which}
-        kept = await feed.call(robot, "acquireControl", held, ANSWER_S)
+        kept = await robot.call("acquireControl", held, ANSWER_S, moves=True)
         return {**kept, "taken_from": str(before.get("holder", ""))[:128], "signed": signer is not None}
 
     async def _renew(self, key: str, held: HeldRobot) -> None:
         silent_since: float | None = None
         while True:
             await asyncio.sleep(RENEW_S)
-            answer = await held.feed.call(held.robot, "renewControl", self._lease_of(held), LEASE_S)
+            answer = await held.robot.call("renewControl", self._lease_of(held), LEASE_S)
             if not is_error(answer):
                 silent_since = None
                 continue
@@ -321,13 +326,13 @@ class HandControl:
         while not jog.released.is_set():
             joints: Mapping[str, float] = {}
             if jog.axis.kind == "joint":
-                pose = await self._until_release(held, jog, "getPose", {"robot_name": jog.axis.part}, [])
+                pose = await self._until_release(held, jog, "getPose", {"robot_name": jog.axis.part})
                 if pose is None:
                     return ""
                 joints = pose["joints"] if isinstance(pose.get("joints"), Mapping) else {}
                 if is_error(pose):
                     # A robot without a model has no pose, and may have joints.
-                    state = await self._until_release(held, jog, "getState", {}, [])
+                    state = await self._until_release(held, jog, "getState", {})
                     joints = stated_positions(state or {}, jog.units)
                     if not joints:
                         return "" if state is None else text_of(pose)
@@ -363,7 +368,7 @@ class HandControl:
             return "" if jog.released.is_set() or jog.axis.kind == "gripper" else DRIVEN
         params = {"task_id": task_id, "seconds": 5.0, **({"robot_name": jog.axis.part} if jog.axis.part else {})}
         while True:
-            state = await self._until_release(held, jog, "wait", params, [])
+            state = await self._until_release(held, jog, "wait", params)
             status = "" if state is None else str(state.get("task_status", "")).lower()
             if state is None or status == "completed":
                 return ""
@@ -371,12 +376,22 @@ class HandControl:
                 return text_of(state) or f"the motion ended as {shown(status)}"
 
     async def _until_release(
-        self, held: HeldRobot, jog: Jogging, verb: str, params: Mapping[str, Any], begun: list[asyncio.Task[Envelope]]
+        self,
+        held: HeldRobot,
+        jog: Jogging,
+        verb: str,
+        params: Mapping[str, Any],
+        begun: list[asyncio.Task[Envelope]] | None = None,
     ) -> Envelope | None:
-        """Call a verb; None where the release comes before its answer."""
+        """Call a verb; None where the release comes before its answer.
+
+        Args:
+            begun: takes the call of a motion; None for a read.
+        """
         given = {name: value for name, value in params.items() if value != ""}
-        call = asyncio.ensure_future(held.feed.call(held.robot, verb, given, ANSWER_S))
-        begun.append(call)
+        call = asyncio.ensure_future(held.robot.call(verb, given, ANSWER_S, moves=begun is not None))
+        if begun is not None:
+            begun.append(call)
         release = asyncio.ensure_future(jog.released.wait())
         await asyncio.wait([call, release], return_when=asyncio.FIRST_COMPLETED)
         release.cancel()
@@ -403,7 +418,7 @@ class HandControl:
 def stated_positions(state: Mapping[str, Any], units: Mapping[str, str]) -> dict[str, float]:
     """Return the joints of known unit in degrees, of a slide in metres."""
     joints = state.get("joints")
-    known = numbers(joints) if isinstance(joints, Mapping) else {}
+    known = plain_numbers(joints)
     return {key: at * DEGREES_OF[units[key]] for key, at in known.items() if units.get(key) in DEGREES_OF}
 
 
@@ -424,7 +439,7 @@ async def _stopped(held: HeldRobot, begun: list[asyncio.Task[Envelope]]) -> Enve
     answer: Envelope = error("nothing was asked", stopped=None)
     for _attempt in range(STOPS_MAX):
         open_before = [each for each in begun if not each.done()]
-        answer = await held.feed.stop(held.robot)
+        answer = await held.robot.stop()
         if not open_before and grade(answer).stopped is True:
             break
         if open_before:

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
+import threading
 import time
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
-from strands_robots.dashboard.feed import FleetFeed
-from strands_robots.dashboard.fleet_model import FleetModel
+from strands_robots.dashboard.feeds import Feeds
+from strands_robots.dashboard.fleet_model import FleetModel, key_of
+from strands_robots.fleet.fleet_verdict import NetworkVerdict
 from strands_robots.fleet.stop_button import StopButton
 from strands_robots.safety.answers import Answer
 from strands_robots.safety.controller import UNCONFIRMED_S, Progress, StopReport
+from strands_robots.safety.orders import new_epoch
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.safety.statements import Proof
 from strands_robots.safety.stop_notes import stop_notes
 from strands_robots.safety.stop_roster import StopOutcome
 from strands_robots.utils import plain_text
 
-REASON = "STOP on the operator's page"
 NOTES_MAX = 16
 SILENT_S = 0.9
 """A network whose robots were all silent for longer may be gone."""
@@ -27,20 +29,17 @@ class FleetStop:
     """STOP on all networks at once; the answers go into the model.
 
     The networks' controllers send on connections and threads of their own. A press runs until every expected robot has
-    answered, and a further one meanwhile is part of it.
+    answered, and a further one meanwhile is part of it. On a network that comes later it leaves as
+    :class:`~strands_robots.fleet.stop_button.StopButtons` says.
     """
 
-    def __init__(self, model: FleetModel, feeds: Iterable[FleetFeed]) -> None:
-        self._model = model
-        self._feeds = tuple(feeds)
-        self._buttons = {
-            feed.network: StopButton(feed.controller, _expected(model, feed.network), REASON) for feed in self._feeds
-        }
-        self._some: dict[tuple[str, Scope], StopButton] = {}
+    def __init__(self, model: FleetModel, feeds: Feeds) -> None:
+        self._model, self._feeds, self._buttons = model, feeds, feeds.buttons
+        self._not_left: Mapping[str, NetworkVerdict] = {}
         self._seen: dict[tuple[str, Scope], tuple[object, bool, frozenset[str]]] = {}
         self._pressed_at: float | None = None
         self._by = ""
-        self._for: tuple[Scope, tuple[StopButton, ...]] = (EVERY_ROBOT, ())
+        self._for: tuple[Scope, Collection[StopButton]] = (EVERY_ROBOT, ())
 
     def press(self, who: str = "") -> None:
         """Stop every robot of every network; returns at once.
@@ -48,18 +47,19 @@ class FleetStop:
         Args:
             who: of whose robot the button was, for the timeline; a robot's own button stops all robots, too.
         """
-        for button in self._buttons.values():
-            button.press()
-        self._pressed_at, self._by, self._for = time.time(), who, (EVERY_ROBOT, ())
+        self._press(EVERY_ROBOT, (), who)
+        unsent = self._feeds.unsent
+        if unsent:
+            threading.Thread(target=self._name_missed, args=(unsent,), name="missed robots", daemon=True).start()
 
-    def press_one(self, network: str, robot: str) -> None:
-        """Stop and lock one robot; returns at once. Every robot where it is none."""
-        feeds = [each for each in self._feeds if each.network == network]
+    def press_one(self, robot: str) -> None:
+        """Stop and lock every robot of an id, or all where there is none."""
         scope = Scope.named([robot])
-        if not feeds or scope.everything:
+        having = [name for name in self._feeds.senders if self._model.row(key_of(name, robot)) is not None]
+        if not having or scope.everything:
             self.press(robot)
         else:
-            self._press_some(feeds, scope, robot)
+            self._press(scope, having, robot)
 
     def press_cell(self, cell: str) -> None:
         """Stop and lock the robots of a cell and those without one; returns at once.
@@ -69,41 +69,42 @@ class FleetStop:
         scope = Scope.read({"cell": cell})
         if scope.everything or all(row.cell != scope.cell for row in self._model.rows()):
             self.press(cell)
-            return
-        feeds = [each for each in self._feeds if self._model.expected(each.network, scope)]
-        self._press_some(feeds or self._feeds, scope, cell)
+        else:
+            self._press(scope, [name for name in self._feeds.senders if self._model.expected(name, scope)], cell)
 
-    def _press_some(self, feeds: Iterable[FleetFeed], scope: Scope, who: str) -> None:
-        pressed = []
-        for feed in feeds:
-            button = self._some.get((feed.network, scope))
-            if button is None:
-                button = StopButton(feed.controller, _expected(self._model, feed.network, scope), REASON, scope)
-                self._some = {**self._some, (feed.network, scope): button}
-            button.press()
-            pressed.append(button)
-        self._pressed_at, self._by, self._for = time.time(), who, (scope, tuple(pressed))
+    def _press(self, scope: Scope, networks: Collection[str], who: str) -> None:
+        self._buttons.press(scope, networks)
+        self._pressed_at, self._by, self._for = time.time(), who, (scope, self._buttons.latest.values())
+        self._not_left = {}
 
-    def close(self) -> None:
-        """Give up a stop that waits for the link."""
-        for button in (*self._buttons.values(), *self._some.values()):
-            button.close()
+    def _name_missed(self, unsent: Mapping[str, Callable[[], NetworkVerdict]]) -> None:
+        """Show the robots of the roster on networks on which a stop of all did not leave."""
+        about = {"id": new_epoch(), "at": self._pressed_at, "state": "silent", "ms": None, "signed": False}
+        for name, not_left in unsent.items():
+            verdict = not_left()
+            # Of a network whose roster cannot be read it is not known whether a robot is there.
+            if verdict.outcome is not None and not verdict.outcome.size:
+                continue
+            self._not_left = {**self._not_left, name: verdict}
+            for robot in () if verdict.outcome is None else verdict.outcome.report.silent:
+                self._model.verdict(name, robot, {**about, "why": f"the stop did not leave: {verdict.absent}"[:300]})
 
     @property
     def running(self) -> bool:
         """True while a stop waits for answers."""
-        return any(button.running for button in (*self._buttons.values(), *self._some.values()))
+        running = {network for (network, _), each in self._buttons.every.items() if each.running}
+        # Without a link, and without a robot of it, there is nothing to wait for.
+        return bool(running) and not running.isdisjoint(self._links())
 
     def refresh(self) -> None:
         """Put the answers that came since into the model; called repeatedly."""
-        everything = {(network, EVERY_ROBOT): button for network, button in self._buttons.items()}
-        for (network, scope), button in {**everything, **self._some}.items():
-            button.review()
+        self._buttons.review()
+        for (network, scope), button in self._buttons.every.items():
             running, progress, report = button.running, button.progress, button.report
             outcome = button.outcome
             latest = report if report is not None and not running else progress
             wider = EVERY_ROBOT if latest is not None and latest.widened else scope
-            expected = frozenset(_expected(self._model, network, wider)())
+            expected = frozenset(wider.only or self._model.expected(network, wider))
             seen = (latest, running, expected)
             if latest is None or self._seen.get((network, scope)) == seen:
                 continue
@@ -114,21 +115,41 @@ class FleetStop:
 
     def state(self) -> dict[str, Any]:
         """Return whether a stop would leave now, and how the latest one goes on."""
-        now = self._model.clock()
+        now, links = self._model.clock(), self._links()
         heard = [row.heard for row in self._model.rows() if row.heard is not None]
         silent_s = round(now - max(heard), 2) if heard else None
-        links = {feed.network: feed.controller.link_up for feed in self._feeds}
+        not_left = {name: each for name, each in self._not_left.items() if name not in self._feeds.senders}
+        rosters = {name: _roster(each) for name, each in self._measured().items()}
+        rosters |= {name: {"ok": False, "sentence": each.sentence, "notes": []} for name, each in not_left.items()}
         return {
             "type": "link",
             "links": links,
+            "missing": self._feeds.missing,
             "silent_s": silent_s,
-            "can_stop": all(links.values()) and (silent_s is None or silent_s <= SILENT_S),
+            "can_stop": bool(links) and all(links.values()) and (silent_s is None or silent_s <= SILENT_S),
             "running": self.running,
-            "roster": {name: _roster(each.outcome) for name, each in self._buttons.items() if each.outcome is not None},
+            "roster": rosters,
             "pressed_at": self._pressed_at,
             "pressed_by": self._by,
             "pressed_for": self._pressed_for(),
         }
+
+    def _links(self) -> dict[str, bool]:
+        """Return by network whether a stop would leave.
+
+        A network without a link and without a robot is left out.
+        """
+        up = {name: each.link_up for name, each in self._feeds.senders.items()}
+        if all(up.values()):
+            return up
+        having = self._model.networks()
+        return {name: is_up for name, is_up in up.items() if is_up or name in having}
+
+    def _measured(self) -> dict[str, StopOutcome]:
+        """Return the outcomes of the latest stop of all, where there are robots."""
+        found = {name: each.outcome for (name, scope), each in self._buttons.every.items() if scope.everything}
+        outcomes = {name: each for name, each in found.items() if each is not None}
+        return {name: each for name, each in outcomes.items() if each.size or each.problems} or outcomes
 
     def _pressed_for(self) -> str:
         """Return the scope of the latest press; empty for every robot.
@@ -195,7 +216,3 @@ def _roster(outcome: StopOutcome) -> dict[str, Any]:
         "sentence": outcome.sentence,
         "notes": [plain_text(each, 300) for each in stop_notes(outcome)[:NOTES_MAX]],
     }
-
-
-def _expected(model: FleetModel, network: str, scope: Scope = EVERY_ROBOT) -> Callable[[], Collection[str]]:
-    return lambda: scope.only or model.expected(network, scope)

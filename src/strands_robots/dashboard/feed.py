@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from strands_robots.dashboard.fleet_model import FleetModel, key_of
-from strands_robots.dashboard.verb_forms import forms_of
+from strands_robots.dashboard.verb_forms import forms_of_verbs
 from strands_robots.envelope import Envelope, is_error
 from strands_robots.errors import RefusalError
 from strands_robots.fleet.adapter import DEVICE_CONNECT, EVERY, FoundRobot, NetworkAdapter, RobotEvent
@@ -21,6 +21,7 @@ from strands_robots.fleet.lockout_report import Resumed
 from strands_robots.fleet.refusals import answered
 from strands_robots.fleet.robot_task import task_of
 from strands_robots.safety.identity import KeyFileError
+from strands_robots.serving.advertised import RobotDescription
 
 logger = logging.getLogger(__name__)
 
@@ -58,23 +59,22 @@ CAMERAS_MAX, CAMERA_NAME_MAX = 32, 128
 
 
 class FleetFeed:
-    """Robots of one network, and the sender of its emergency stops.
+    """Robots of one network.
 
     ``call`` and ``stop`` run on the caller's event loop, everything else on a loop of the feed's own.
 
     Args:
         model: takes what the robots say.
         there: a joined network.
-        signing_key: signs emergency stops; then only enrolled robots can confirm one.
 
     Attributes:
         network: the name of the network in the page's messages.
-        controller: sends its emergency stops.
+        there: as given.
     """
 
-    def __init__(self, model: FleetModel, there: NetworkAdapter, signing_key: Any = None) -> None:
-        self.network = KEYS.get(there.name, there.name)
-        self._model, self._there = model, there
+    def __init__(self, model: FleetModel, there: NetworkAdapter) -> None:
+        self.network = page_name(there.name)
+        self._model, self.there = model, there
         self._names: set[str] = set()
         self._passed: set[str] = set()
         self._strangers: set[str] = set()
@@ -93,9 +93,6 @@ class FleetFeed:
         for pool in (self._searcher, self._describers):
             self._stack.callback(pool.shutdown, wait=False, cancel_futures=True)
         try:
-            self.controller = self._stack.enter_context(
-                there.standing(signing_key, lambda: model.expected(self.network))
-            )
             thread = LoopThread(f"dashboard-{self.network}")
             self._stack.callback(thread.close)
             self._stack.callback(there.subscribe(EVERY, self._take))
@@ -106,15 +103,29 @@ class FleetFeed:
 
     async def call(self, robot: str, verb: str, params: Mapping[str, Any], seconds: float) -> Envelope:
         """Call a verb; every failure is an answer of status error."""
-        return await answered(self._there.call_async(robot, verb, params, seconds))
+        return await answered(self.there.call_async(robot, verb, params, seconds))
 
     async def stop(self, robot: str) -> Envelope:
         """End a robot's motion without a lockout, as after a jog; graded, never raises."""
-        return await self._there.stop_async(robot, STOP_S)
+        return await self.there.stop_async(robot, STOP_S)
+
+    def bears(self, robot: str) -> bool:
+        """Return whether a robot of this id is known on the network; asks no one."""
+        try:
+            return self.there.bears(robot)
+        except RefusalError:
+            return False
+
+    def session(self, robot: str) -> object:
+        """Return what differs once another robot may answer to this id; asks no one."""
+        try:
+            return self.there.session(robot)
+        except RefusalError:
+            return None
 
     async def look_closer(self, robot: str) -> None:
         """Read the limits and the cameras of a robot, and its idle joints."""
-        reads = self._there.reads
+        reads = self.there.reads
         asked = (reads["features"], "listCameras", reads["state"])
         features, cameras, state = await asyncio.gather(*(self.call(robot, verb, {}, READ_S) for verb in asked))
         found = cameras.get("cameras")
@@ -127,7 +138,7 @@ class FleetFeed:
     def resume(self, robots: list[str], signer: Any, seconds: float) -> dict[str, Resumed]:
         """Free robots with the operator's key; blocks, and returns each outcome."""
         try:
-            return self._there.resume(self._there.lockouts(robots, seconds), signer, seconds)
+            return self.there.resume(self.there.lockouts(robots, seconds), signer, seconds)
         except (KeyFileError, RefusalError) as exc:
             return dict.fromkeys(robots, (False, exc.why if isinstance(exc, RefusalError) else str(exc)))
 
@@ -140,7 +151,7 @@ class FleetFeed:
     def _take(self, event: RobotEvent) -> None:
         name = event.robot
         if name not in self._names:
-            if len(self._strangers) < STRANGERS_MAX and not self._there.bears(name):
+            if len(self._strangers) < STRANGERS_MAX and not self.there.bears(name):
                 self._strangers.add(name)
             return
         if event.alive:
@@ -168,7 +179,7 @@ class FleetFeed:
         """Begin what is due: a search, and a question to each robot."""
         now = time.monotonic()
         waited = now - self._searched
-        new = {*self._there.announced()} - self._names - self._passed
+        new = {*self.there.announced()} - self._names - self._passed
         soon = not self._found or self._strangers
         if (new and self._found) or waited > (SEARCH_SOON_S if soon else SEARCH_AGAIN_S):
             self._searched = now if self._begin("search", "", self._search) else self._searched
@@ -195,7 +206,7 @@ class FleetFeed:
     async def _search(self, _: str) -> None:
         self._strangers.clear()
         self._found = False
-        found = await asyncio.get_running_loop().run_in_executor(self._searcher, self._there.find, SEARCH_S)
+        found = await asyncio.get_running_loop().run_in_executor(self._searcher, self.there.find, SEARCH_S)
         for each in found:
             # A world has one card, with all of its robots.
             if not each.world:
@@ -213,26 +224,28 @@ class FleetFeed:
             self._described.discard(robot.id)
         # A robot that was asked has said more than it announces.
         if robot.id not in self._described:
-            self._describe(robot.id, self._there.announced_functions(robot.id))
+            self._describe(robot.id, self.there.announced_functions(robot.id))
 
     def _describe(self, name: str, functions: object) -> None:
         row = self._model.row(key_of(self.network, name))
         # The same functions again are compared, which is faster than to make their forms.
         if row is not None and not (row.forms and functions == self._functions.get(name)):
             self._functions[name] = functions
-            forms = forms_of(functions) if isinstance(functions, list | tuple) else ()
-            self._model.update(self.network, name, forms=forms)
+            description = RobotDescription.of(functions)
+            forms, known = forms_of_verbs(description.verbs.values()), isinstance(functions, list | tuple)
+            lacking = ", ".join(f"no {each}" for each in description.lacking) if known else ""
+            self._model.update(self.network, name, forms=forms, lacking=lacking)
 
     async def _ask_verbs(self, name: str) -> None:
         loop = asyncio.get_running_loop()
-        functions = await loop.run_in_executor(self._describers, self._there.describe, name)
+        functions = await loop.run_in_executor(self._describers, self.there.describe, name)
         self._described.add(name)
         self._describe(name, functions)
 
     async def _ask(self, name: str) -> None:
         answered = self._answered.get(name)
         async with self._limits[answered]:
-            report = await self._there.lockout_async(name, ASK_S)
+            report = await self.there.lockout_async(name, ASK_S)
         if self._model.row(key_of(self.network, name)) is None:
             self._forget(name)
             return
@@ -249,7 +262,7 @@ class FleetFeed:
         for part, joints in list(robots.items())[:PARTS_MAX] if isinstance(robots, Mapping) else ():
             if isinstance(joints, Mapping):
                 self._model.observe(self.network, name, joints, str(part))
-        if not self._there.announces_verbs and not (answered and name in self._described):
+        if not self.there.announces_verbs and not (answered and name in self._described):
             # Only one that answers is asked. One that was silent may be another program by now.
             self._begin("verbs", name, self._ask_verbs)
 
@@ -284,6 +297,11 @@ class LoopThread:
         self.loop.call_soon_threadsafe(self.loop.stop)
         self._thread.join(5.0)
         self.loop.close()
+
+
+def page_name(network: str) -> str:
+    """Return the name that a network has in the page's messages."""
+    return KEYS.get(network, network)
 
 
 def poll_interval(robots: int) -> float:

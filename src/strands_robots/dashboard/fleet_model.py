@@ -10,15 +10,15 @@ import json
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import chain
 from typing import Any
 
 from strands_robots.dashboard.history import OVERLAP_S, WINDOW_S, History, plain_values
-from strands_robots.device_connect.telemetry import numbers
 from strands_robots.envelope import jsonable
 from strands_robots.fleet.lockout_report import LockoutReport
+from strands_robots.policies.base import plain_numbers
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.utils import plain_text
 
@@ -36,6 +36,10 @@ JOINTS_MAX = 64
 CONTROL_EVENTS = frozenset({"controlTaken", "controlExpired", "control taken here"})
 CONTROL_TOLD_S = 3.0
 """Seconds after such an event in which a status with another holder tells nothing new."""
+
+UNSETTLED = frozenset({"not_stopped", "alarm", "refused", "unknown", "claimed"})
+UNANSWERED_S = 1.0
+"""Seconds after a stop in which a robot on a second network may still answer it."""
 
 Joints = dict[str, float]
 
@@ -55,6 +59,9 @@ class RobotRow:
         messages: signs of life since the last sample of the history, and ``gap_s`` the longest time between two.
         units: unit of each joint's position, as its features name it; ``limits`` are in the same.
         forms: its verbs, as :func:`~strands_robots.dashboard.verb_forms.forms_of` describes them.
+        lacking: what a device that is none of ours does not have: a lockout, a lease, a stop.
+        hidden: another row shows the same robot.
+        namesake: another robot of this id has a row, too.
         changed: number of the model's last change of something that the page shows at once.
         ticked: the same for what it shows twice a second.
     """
@@ -77,6 +84,9 @@ class RobotRow:
     control_told_at: float = float("-inf")
     check_in: dict[str, Any] | None = None
     forms: tuple[Mapping[str, Any], ...] = ()
+    lacking: str = ""
+    hidden: bool = False
+    namesake: bool = False
     limits: dict[str, tuple[float, float]] = field(default_factory=dict)
     units: dict[str, str] = field(default_factory=dict)
     cameras: tuple[str, ...] = ()
@@ -117,6 +127,8 @@ class RobotRow:
             "link_ms": None if self.link_ms is None else round(self.link_ms, 1),
             "pictures": "getPicture" in verbs,
             "expected": self.expected,
+            "lacking": self.lacking,
+            "namesake": self.namesake,
         }
 
     def text(self) -> str:
@@ -138,6 +150,7 @@ class FleetModel:
         self.history = History()
         self._lock = threading.Lock()
         self._rows: dict[str, RobotRow] = {}
+        self._keys_of: dict[str, tuple[str, ...]] = {}
         self._timeline: deque[tuple[int, str]] = deque(maxlen=TIMELINE_MAX)
         self._number = 0
         self._gone: deque[tuple[int, str]] = deque(maxlen=TIMELINE_MAX)
@@ -205,7 +218,7 @@ class FleetModel:
 
     def observe(self, network: str, name: str, joints: Mapping[str, Any], part: str = "") -> None:
         """Take the joints of a robot, or of one robot of a world."""
-        found = dict(list(numbers(joints).items())[:JOINTS_MAX])
+        found = dict(list(plain_numbers(joints).items())[:JOINTS_MAX])
         if not found:
             return
         with self._lock:
@@ -310,6 +323,9 @@ class FleetModel:
             row = self._rows.get(entry["key"])
             if row is not None and event in CONTROL_EVENTS:
                 row.control_told_at = self.clock()
+            if row is not None and row.hidden:
+                # The row that is shown tells the same.
+                return
             number = self._next()
             self._timeline.append((number, json.dumps({**entry, "n": number}, allow_nan=False, default=str)))
 
@@ -329,12 +345,41 @@ class FleetModel:
             if row is None or (row.heard is not None and self.clock() - row.heard < longer_than_s):
                 return False
             del self._rows[key]
+            self._keys_of[row.id] = tuple(each for each in self._keys_of[row.id] if each != key)
             self.history.forget(key)
             self._gone.append((self._next(), key))
             self._note_expected(row.network)
             return True
 
+    def arrange(self, hidden: Collection[str], namesakes: Collection[str]) -> None:
+        """Set which rows are hidden, and which have the id of another robot's."""
+        with self._lock:
+            for key, row in self._rows.items():
+                now = (key in hidden, key in namesakes)
+                if now != (row.hidden, row.namesake):
+                    row.hidden, row.namesake = now
+                    row.changed = self._next()
+                    if row.hidden:
+                        self._gone.append((row.changed, key))
+
     # Read by the pages.
+
+    def on_several_networks(self) -> dict[str, tuple[RobotRow, ...]]:
+        """Return the rows of each id that is on several networks."""
+        with self._lock:
+            return {
+                name: tuple(self._rows[key] for key in keys) for name, keys in self._keys_of.items() if len(keys) > 1
+            }
+
+    def silent(self, row: RobotRow) -> bool:
+        """Return whether a robot was not heard for longer than it may be."""
+        return row.heard is None or self.clock() - row.heard > self.history.silent_s
+
+    def unsettled(self, row: RobotRow) -> bool:
+        """Return whether a row says what must be seen: a bad answer to a stop, a doubt."""
+        stop = row.stop or {}
+        late = stop.get("state") == "silent" and self.clock() - row.stop_at > UNANSWERED_S
+        return bool(row.alarm or row.doubt or late or stop.get("state") in UNSETTLED or "alarm" in stop)
 
     def expected(self, network: str, scope: Scope = EVERY_ROBOT) -> tuple[str, ...]:
         """Return the robots that must answer a stop of all or of a cell; takes no lock.
@@ -343,6 +388,11 @@ class FleetModel:
         """
         rows = self._expected.get(network, ())
         return tuple(name for name, cell in rows if cell is None or scope.covers(name, {cell} - {""}))
+
+    def networks(self) -> Collection[str]:
+        """Return the networks that have a row."""
+        with self._lock:
+            return {row.network for row in self._rows.values()}
 
     def row(self, key: str) -> RobotRow | None:
         """Return the row of a robot, or None."""
@@ -365,10 +415,11 @@ class FleetModel:
             rows = [
                 row.text()
                 for row in self._rows.values()
-                if row.changed > since or (ticks_since is not None and row.ticked > ticks_since)
+                if not row.hidden and (row.changed > since or (ticks_since is not None and row.ticked > ticks_since))
             ]
             entries = [text for number, text in self._timeline if number > since]
-            gone = [key for number, key in self._gone if number > since]
+            # A row that was hidden, or forgotten, may be shown again.
+            gone = [key for number, key in self._gone if number > since and not self._shows(key)]
             now = self.clock()
             if not rows and not entries and not gone:
                 return self._number, ""
@@ -456,7 +507,12 @@ class FleetModel:
         if row is None and len(self._rows) < ROBOTS_MAX and name:
             row = self._rows[key] = RobotRow(key, network, name[:NAME_MAX])
             row.changed = self._next()
+            self._keys_of[row.id] = (*self._keys_of.get(row.id, ()), key)
         return row
+
+    def _shows(self, key: str) -> bool:
+        row = self._rows.get(key)
+        return row is not None and not row.hidden
 
     def _note_expected(self, network: str) -> None:
         names = tuple((row.id, row.cell) for row in self._rows.values() if row.network == network and row.expected)

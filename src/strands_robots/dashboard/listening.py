@@ -9,8 +9,8 @@ import ssl
 from dataclasses import dataclass
 from pathlib import Path
 
+from strands_robots.certificates import CA_CERT, CA_KEY, init, issue
 from strands_robots.dashboard.access import OPERATOR, ROLES, VIEWER, Access, loopback_origins, new_token
-from strands_robots.mesh.keys import CA_CERT, CA_KEY, init, issue
 from strands_robots.state_files import state_dir
 from strands_robots.utils import ValidationError, missing_extra, shown
 
@@ -54,7 +54,7 @@ class RemoteAddress:
 
 
 def remote_address(address: str, port: int) -> RemoteAddress:
-    """Return the address with a certificate of ``mesh keys init`` and ``issue``.
+    """Return the address with a certificate of an authority of its own.
 
     Raises:
         ValidationError: ``address`` is no address or name of this machine, means all of them, or is where the page

@@ -20,6 +20,7 @@ from strands_robots.dashboard.driving import HandControl
 from strands_robots.dashboard.feed import FleetFeed
 from strands_robots.dashboard.fleet_model import FleetModel
 from strands_robots.dashboard.operator_key import KeyRefusedError, OperatorKey
+from strands_robots.dashboard.page_robots import PageRobot, PageRobots
 from strands_robots.dashboard.pictures import SMALL, SMALL_HZ, Pictures
 from strands_robots.dashboard.verb_forms import LEFT_OUT
 from strands_robots.envelope import Envelope, error, is_error, jsonable, text_of
@@ -66,7 +67,7 @@ class Shared:
     """
 
     model: FleetModel
-    feeds: Mapping[str, FleetFeed]
+    robots: PageRobots
     operator_key: OperatorKey
     source: str
     signed: bool
@@ -91,10 +92,16 @@ class PageSession:
         self._control = HandControl(self.tell)
         self._waiting: asyncio.Queue[dict[str, Any]] = asyncio.Queue(WAITING_MAX)
         self._watched, self._joints_at = "", 0.0
+        self._forms: list[Any] | None = None
         self._looking: asyncio.Task[None] | None = None
         self._calls: set[asyncio.Task[None]] = set()
         self._thumbnails: dict[str, asyncio.Task[None]] = {}
         self._sending = asyncio.Lock()
+
+    @property
+    def in_use(self) -> set[str]:
+        """Keys of the robots that the page looks at or holds."""
+        return {self._watched, *self._control.held}
 
     def tell(self, message: dict[str, Any]) -> None:
         """Queue a message for the page; one that reads nothing loses the newest."""
@@ -128,7 +135,6 @@ class PageSession:
             "signed": server.signed,
             "source": server.source,
             "starting": server.starting,
-            "networks": [feed.network for feed in server.feeds.values()],
         }
 
     async def _send(self, message: Mapping[str, Any]) -> None:
@@ -166,6 +172,7 @@ class PageSession:
                 await self._send(self._waiting.get_nowait())
             if self._watched and tick % JOINTS_TICKS == 0:
                 await self._send_joints()
+                self._tell_new_forms()
             await asyncio.sleep(TICK_S)
 
     async def _send_joints(self) -> None:
@@ -223,18 +230,6 @@ class PageSession:
             }
         )
 
-    def _feed(self, key: str) -> tuple[FleetFeed, str]:
-        """Return the feed and the id of a robot.
-
-        Raises:
-            ValidationError: no such robot.
-        """
-        row = self._server.model.row(key)
-        feed = None if row is None else self._server.feeds.get(row.network)
-        if row is None or feed is None:
-            raise ValidationError(f"No robot {shown(key)} is known.")
-        return feed, row.id
-
     def _may_drive(self) -> None:
         if self._role != OPERATOR:
             raise ValidationError("A viewer may look and stop; moving a robot needs the role operator.")
@@ -242,7 +237,7 @@ class PageSession:
     # What a page asks for.
 
     def _watch(self, key: str) -> None:
-        self._watched, self._joints_at = key, 0.0
+        self._watched, self._joints_at, self._forms = key, 0.0, None
         if self._looking is not None:
             self._looking.cancel()
         self._looking = asyncio.create_task(self._look(key)) if key else None
@@ -254,19 +249,19 @@ class PageSession:
         while True:
             why = NOT_KNOWN
             with contextlib.suppress(ValidationError):
-                feed, robot = self._feed(key)
+                robot = self._server.robots.of(key)
                 if not looked:
                     self._tell_details(key)
-                    await feed.look_closer(robot)
+                    await robot.feed.look_closer(robot.id)
                     self._tell_details(key, looked=True)
-                why = await self._no_pose(key, feed, robot)
+                why = await self._no_pose(key, robot)
                 looked = why != NOT_KNOWN
             if why != told:
                 self.tell({"type": "pose", "key": key, "why": why})
             told = why
             await asyncio.sleep(UNKNOWN_AGAIN_S if why == NOT_KNOWN else POSE_AGAIN_S)
 
-    async def _no_pose(self, key: str, feed: FleetFeed, robot: str) -> str:
+    async def _no_pose(self, key: str, robot: PageRobot) -> str:
         """Return why no pose of a robot can be drawn, after drawing one; else empty."""
         row = self._server.model.row(key)
         if row is None or not row.forms:
@@ -275,14 +270,21 @@ class PageSession:
             return ""
         if all(form["name"] != "getPose" for form in row.forms):
             return "it has no arm that reports joint angles in degrees."
-        drawn = await self._server.pictures.poses.picture(feed, robot)
+        drawn = await self._server.pictures.poses.picture(robot.feed, robot.id)
         return text_of(drawn) if is_error(drawn) else ""
 
     def _tell_details(self, key: str, *, looked: bool = False) -> None:
         """Tell what is known; ``looked`` once the robot itself was asked."""
         details = self._server.model.details(key)
         if details is not None:
+            self._forms = details["forms"]
             self.tell({**details, "looked": looked})
+
+    def _tell_new_forms(self) -> None:
+        """Tell the details again of a robot that has described its verbs since."""
+        row = self._server.model.row(self._watched)
+        if row is not None and self._forms is not None and [*row.forms] != self._forms:
+            self._tell_details(self._watched)
 
     def _jog(self, key: str, message: Message) -> None:
         row = self._server.model.row(key)
@@ -302,9 +304,9 @@ class PageSession:
 
     async def _send_thumbnails(self, key: str) -> None:
         with contextlib.suppress(ValidationError, WebSocketDisconnect, RuntimeError):
-            feed, robot = self._feed(key)
+            robot = self._server.robots.of(key)
             head = key.encode()
-            frames = self._server.pictures.camera(feed, robot, "", SMALL, SMALL_HZ)
+            frames = self._server.pictures.camera(robot.feed, robot.id, "", SMALL, SMALL_HZ)
             async with contextlib.aclosing(frames):
                 async for frame in frames:
                     async with self._sending:
@@ -314,23 +316,23 @@ class PageSession:
         verb, params = text("verb", message.get("verb"), longest=100), message.get("params")
         if verb in STOPS:
             # Before anything else of the message is looked at.
-            stopped, name = self._feed(key)
+            stopped = self._server.robots.of(key)
             # Its next stretch may be on the way to a robot that stands between two of them.
             self._control.release(key, "it was halted")
-            answer = await stopped.stop(name)
-            self._note_halt(stopped.network, name, grade(answer).stopped)
+            answer = await stopped.stop()
+            self._note_halt(stopped.feed.network, stopped.id, grade(answer).stopped)
             return answer
         if not isinstance(params, dict):
             raise ValidationError(f"params must be an object, not {shown(params)}.")
-        feed, robot = self._feed(key)
-        row = self._server.model.row(key)
+        robot, row = self._server.robots.of(key), self._server.model.row(key)
         form = next((each for each in row.forms if each["name"] == verb), None) if row is not None else None
         if form is None or verb in LEFT_OUT:
             raise ValidationError(f"verb must be one of this robot's, not {shown(verb)}.")
-        if form["kind"] != "read":
+        moves = form["kind"] != "read"
+        if moves:
             self._may_drive()
             params = {**params, **self._control.lease(key)}
-        return await feed.call(robot, verb, params, CALL_S + WAIT_S + form["lasts_s"])
+        return await robot.call(verb, params, CALL_S + WAIT_S + form["lasts_s"], moves=moves)
 
     def _note_halt(self, network: str, robot: str, stopped: bool | None) -> None:
         client = self._socket.client
@@ -341,16 +343,15 @@ class PageSession:
 
     async def _take_control(self, key: str, message: Message) -> Envelope:
         self._may_drive()
-        feed, robot = self._feed(key)
-        signer = None
+        robot, signer = self._server.robots.of(key), None
         if message.get("passphrase"):
             signer = await self._opened_key(message)
         part = message.get("part", "")
-        answer = await self._control.take(key, feed, robot, part=part if isinstance(part, str) else "", signer=signer)
+        answer = await self._control.take(key, robot, part=part if isinstance(part, str) else "", signer=signer)
         held = self._control.holds(key)
         if held and "taken_from" in answer:
             facts = {"from": answer["taken_from"], "signed": answer["signed"]}
-            self._server.model.note(feed.network, robot, "control taken here", facts)
+            self._server.model.note(robot.feed.network, robot.id, "control taken here", facts)
         self.tell({"type": "control", "key": key, "held": held, "text": text_of(answer)})
         return answer
 
@@ -364,9 +365,10 @@ class PageSession:
         signer = await self._opened_key(message)
         keys = message.get("keys")
         wanted: dict[str, tuple[FleetFeed, list[str]]] = {}
-        for each in keys if isinstance(keys, list) else []:
-            feed, robot = self._feed(str(each))
-            wanted.setdefault(feed.network, (feed, []))[1].append(robot)
+        for shown_key in keys if isinstance(keys, list) else []:
+            for each in self._server.robots.twins(str(shown_key)):
+                robot = self._server.robots.of(each)
+                wanted.setdefault(robot.feed.network, (robot.feed, []))[1].append(robot.id)
         if not wanted:
             raise ValidationError("keys must name at least one robot.")
         outcomes: dict[str, Any] = {}
@@ -385,7 +387,7 @@ class PageSession:
 
     def _unheard(self, feed: FleetFeed) -> Unheard:
         """Return the robots of the roster not heard lately; it reads the disk."""
-        model, network = self._server.model, feed.controller.network
+        model, network = self._server.model, self._server.robots.network_key(feed)
         since = model.clock() - FORGET_S
         heard = {row.id for row in model.rows() if row.network == feed.network and (row.heard or since) > since}
         return Unheard() if network is None else unheard_now(network, heard)
@@ -396,8 +398,8 @@ class PageSession:
         return await asyncio.to_thread(self._server.operator_key.open, message.get("passphrase"))
 
     async def _look_closer(self, key: str, message: Message) -> Envelope:
-        feed, robot = self._feed(key)
-        await feed.look_closer(robot)
+        robot = self._server.robots.of(key)
+        await robot.feed.look_closer(robot.id)
         return {"status": "success", "content": [{"text": "Its limits, units and cameras were read."}]}
 
     async def _forget(self, key: str, message: Message) -> Envelope:

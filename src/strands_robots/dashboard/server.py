@@ -9,7 +9,7 @@ import logging
 import math
 import socket
 import time
-from collections.abc import AsyncIterator, Callable, Iterable, Mapping
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +25,12 @@ from strands_robots import audit
 from strands_robots.audit.journal import NAME as AUDIT_FILE
 from strands_robots.dashboard.access import Access, Guard, is_local
 from strands_robots.dashboard.emergency import FleetStop
-from strands_robots.dashboard.feed import FleetFeed, poll_interval
+from strands_robots.dashboard.feed import poll_interval
+from strands_robots.dashboard.feeds import Feeds
 from strands_robots.dashboard.fleet_model import FleetModel
 from strands_robots.dashboard.history import SAMPLE_S, SILENT_S
 from strands_robots.dashboard.operator_key import OperatorKey
+from strands_robots.dashboard.page_robots import PageRobots
 from strands_robots.dashboard.page_session import PageSession, Shared
 from strands_robots.dashboard.pictures import BOUNDARY, mjpeg
 
@@ -46,7 +48,7 @@ LINK_S = 0.2
 LINK_LOOK_S = 0.04
 """Seconds between two looks whether a stop would leave; a change is told at once."""
 
-REFRESH_S = 0.02
+REFRESH_S, LOOK_S = 0.02, 0.25
 AUDIT_S = 1.0
 AUDIT_BYTES = 256 * 2**10
 SAMPLED_AT_ONCE = 10
@@ -63,7 +65,7 @@ class Dashboard:
 
     Args:
         model: the fleet.
-        feeds: of the networks, which this closes at its end.
+        feeds: of its networks, which this closes at its end.
         access: who may open a page.
         operator_key: frees robots and takes control.
         source: the caller that robots see.
@@ -74,7 +76,7 @@ class Dashboard:
     def __init__(
         self,
         model: FleetModel,
-        feeds: Iterable[FleetFeed],
+        feeds: Feeds,
         access: Access,
         operator_key: OperatorKey | None = None,
         *,
@@ -83,10 +85,10 @@ class Dashboard:
         starting: tuple[str, ...] = (),
     ) -> None:
         self.model = model
-        self.feeds: Mapping[str, FleetFeed] = {feed.network: feed for feed in feeds}
+        self.feeds, self.robots = feeds, PageRobots(model, feeds)
         self.access = access
-        self.stop = FleetStop(model, self.feeds.values())
-        self._shared = Shared(model, self.feeds, operator_key or OperatorKey(None), source, signed, starting)
+        self.stop = FleetStop(model, feeds)
+        self._shared = Shared(model, self.robots, operator_key or OperatorKey(None), source, signed, starting)
         self._sessions: dict[str, PageSession] = {}
 
     def app(self) -> ASGIApp:
@@ -103,9 +105,8 @@ class Dashboard:
 
     def close(self) -> None:
         """Give up a running stop and leave the networks."""
-        self.stop.close()
-        for feed in self.feeds.values():
-            feed.close()
+        self.robots.close()
+        self.feeds.close()
 
     def end_pictures(self) -> None:
         """End every stream of pictures; on the server's loop."""
@@ -114,7 +115,7 @@ class Dashboard:
     @contextlib.asynccontextmanager
     async def _lifespan(self, _: Starlette) -> AsyncIterator[None]:
         tasks = [asyncio.create_task(self._refresh()), asyncio.create_task(self._follow_audit())]
-        tasks.append(asyncio.create_task(self._sample()))
+        tasks += [asyncio.create_task(self._sample()), asyncio.create_task(self._look())]
         try:
             yield
         finally:
@@ -129,6 +130,15 @@ class Dashboard:
             except Exception:
                 logger.exception("The answers to a stop could not be read.")
             await asyncio.sleep(REFRESH_S if self.stop.running else 5 * REFRESH_S)
+
+    async def _look(self) -> None:
+        """Find which rows are of one robot."""
+        while True:
+            try:
+                self.robots.look({key for each in self._sessions.values() for key in each.in_use})
+            except Exception:
+                logger.exception("Robots that are on several networks could not be looked at.")
+            await asyncio.sleep(LOOK_S)
 
     async def _sample(self) -> None:
         """Take a sample of every robot's joints, lag and load, a few robots at a time."""
@@ -207,7 +217,7 @@ class Dashboard:
                     row = self.model.row(only) if isinstance(only, str) and cell is None else None
                     button = who or "all robots"
                     if row is not None:
-                        self.stop.press_one(row.network, row.id)
+                        self.stop.press_one(row.id)
                         button = f"{row.id} alone"
                     elif isinstance(cell, str) and only is None:
                         self.stop.press_cell(cell[:128])

@@ -45,8 +45,12 @@ _NUMBERS = ("number", "integer")
 
 def forms_of(functions: Iterable[Mapping[str, Any]]) -> tuple[dict[str, Any], ...]:
     """Return the forms of a robot's functions, as it describes them on its network."""
-    verbs = (each for each in RobotDescription.of(list(functions)).verbs.values() if each.name not in LEFT_OUT)
-    return tuple(_form(each) for each in islice(verbs, FORMS_MAX))
+    return forms_of_verbs(RobotDescription.of(list(functions)).verbs.values())
+
+
+def forms_of_verbs(verbs: Iterable[AdvertisedVerb]) -> tuple[dict[str, Any], ...]:
+    """Return the forms of a robot's verbs."""
+    return tuple(_form(each) for each in islice((each for each in verbs if each.name not in LEFT_OUT), FORMS_MAX))
 
 
 def _form(verb: AdvertisedVerb) -> dict[str, Any]:

@@ -12,8 +12,8 @@ from strands_robots.bus_access import read_joints
 from strands_robots.contract import RUNNING, RolloutEvent, adapt, body_of
 from strands_robots.device_connect._compat import Labels, emit
 from strands_robots.device_connect.base_driver import Activity, RobotDriver, stated_type
-from strands_robots.device_connect.telemetry import numbers
 from strands_robots.envelope import fields_of
+from strands_robots.policies.base import plain_numbers
 from strands_robots.safety.approval import Approval
 from strands_robots.safety.authorization import Authorization
 from strands_robots.serving.leave import Command
@@ -126,7 +126,7 @@ class RobotDeviceDriver(RobotDriver):
         told = {
             "task_status": state,
             "instruction": str(facts.get("instruction", "")),
-            "step_count": int(numbers(facts).get("step_count", 0)),
+            "step_count": int(plain_numbers(facts).get("step_count", 0)),
         }
         return Activity(state in RUNNING, told)
 
@@ -159,7 +159,9 @@ class RobotDeviceDriver(RobotDriver):
                 follows_instruction=event.follows_instruction,
             )
         elif event.kind == "step":
-            await self.streamStep(step=event.step, observation=numbers(event.observation), action=numbers(event.action))
+            await self.streamStep(
+                step=event.step, observation=plain_numbers(event.observation), action=plain_numbers(event.action)
+            )
         else:
             await self.taskComplete(
                 instruction=event.instruction,

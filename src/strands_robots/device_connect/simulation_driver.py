@@ -12,8 +12,8 @@ from strands_robots import settings
 from strands_robots.contract import Haltable, RolloutEvent
 from strands_robots.device_connect._compat import Labels, emit
 from strands_robots.device_connect.base_driver import Activity, RobotDriver, stated_type
-from strands_robots.device_connect.telemetry import numbers
 from strands_robots.envelope import Envelope, fields_of
+from strands_robots.policies.base import plain_numbers
 from strands_robots.safety.approval import Approval
 from strands_robots.safety.authorization import Authorization
 from strands_robots.safety.stopping import StopVerdict
@@ -157,9 +157,9 @@ class SimulationDeviceDriver(RobotDriver):
         running = {str(row.get("robot", "")): {k: v for k, v in row.items() if k != "robot"} for row in rows}
         robots = facts.get("robots")
         self._observed = {
-            str(name): numbers(joints) for name, joints in (robots.items() if isinstance(robots, Mapping) else ())
+            str(name): plain_numbers(joints) for name, joints in (robots.items() if isinstance(robots, Mapping) else ())
         }
-        told = numbers({key: facts.get(key) for key in ("sim_time", "step_count")})
+        told = plain_numbers({key: facts.get(key) for key in ("sim_time", "step_count")})
         return Activity(
             bool(running),
             {
@@ -204,8 +204,8 @@ class SimulationDeviceDriver(RobotDriver):
         elif event.kind == "step":
             await self.streamStep(
                 step=event.step,
-                observation=numbers(event.observation),
-                action=numbers(event.action),
+                observation=plain_numbers(event.observation),
+                action=plain_numbers(event.action),
                 robot_name=event.robot,
             )
         else:

@@ -8,10 +8,9 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable
 
 from strands_robots.contract import RolloutEvent
-from strands_robots.policies import base
 from strands_robots.serving.rate_limiter import RateLimiter
 
 logger = logging.getLogger(__name__)
@@ -24,15 +23,6 @@ CATCH_UP = 50.0
 
 CATCH_UP_AT_START = 2.0
 """The same for a loop that has just started."""
-
-
-def numbers(values: object) -> dict[str, float]:
-    """Return the finite numbers of a mapping; ``{"position": x}`` counts as ``x``."""
-    if not isinstance(values, Mapping):
-        return {}
-    return base.numbers(
-        {str(name): value.get("position") if isinstance(value, Mapping) else value for name, value in values.items()}
-    )
 
 
 def step_limiter(hz: float, clock: Callable[[], float] = time.monotonic) -> RateLimiter:

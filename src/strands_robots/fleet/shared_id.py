@@ -9,7 +9,7 @@ import time
 from collections.abc import Collection, Mapping, Sequence
 from types import MappingProxyType
 
-from strands_robots.errors import AmbiguousRobotError, NoSuchRobotError, RefusalError
+from strands_robots.errors import AmbiguousRobotError, NoAnswerError, NoSuchRobotError, RefusalError, UnreachableError
 from strands_robots.fleet.adapter import NetworkAdapter
 from strands_robots.fleet.side_by_side import side_by_side
 from strands_robots.safety.statements import Purpose, own_key
@@ -20,19 +20,25 @@ ASK_S = 5.0
 DECIDED_S = 10.0
 """Seconds for which a decision counts: another process may take the id unseen."""
 
+SILENT = b""
+"""Stands for the key of a robot that does not answer."""
+
 
 class SharedId:
     """Decides which network has the robot that motions of one id go to.
 
     A robot that is served on both networks signs on both with the key of its machine. A decision counts for
-    :data:`DECIDED_S` seconds, unless a session ends or robots are looked for again.
+    :data:`DECIDED_S` seconds, unless a session ends or robots are looked for again. A robot that falls silent on one
+    network stays the robot of its key.
 
     Attributes:
         decided: the network of the last decision; None without one.
+        key: the key that signed on all of its networks, so that they have one robot; None where they do not.
     """
 
     def __init__(self) -> None:
         self.decided: NetworkAdapter | None = None
+        self.key: bytes | None = None
         self._lock = threading.Lock()
         self._asked: tuple[object, ...] = ()
         self._asked_at = -math.inf
@@ -53,14 +59,30 @@ class SharedId:
             if old or asked != self._asked or self.decided not in bearers:
                 signed = side_by_side(lambda each: _signing_key(robot, each), bearers)
                 keys = {each: key for each, (there, key) in zip(bearers, signed, strict=True) if there}
-                self.decided = _proven(robot, keys, set(absent.values()))
+                one = None if absent else self._of_one(keys)
+                self.decided = one or _enrolled(robot, keys, set(absent.values()))
                 # A robot that did not answer, or not signed, is asked again.
                 self._asked, self._asked_at = (asked if self.decided is not None else ()), time.monotonic()
             return self.decided
 
+    def _of_one(self, keys: Mapping[NetworkAdapter, bytes | None]) -> NetworkAdapter | None:
+        """Return the network of a robot that one key proves; None for several robots."""
+        shown = {*keys.values()} - {SILENT}
+        if len(keys) == 1:
+            return next(iter(keys))
+        if len(shown) == 1 and SILENT not in keys.values():
+            self.key = next(iter(shown))
+        elif shown - {self.key}:
+            self.key = None
+        return next((each for each, key in keys.items() if key and key == self.key), None)
+
 
 def decided(
-    shared_id: SharedId, robot: str, verb: str, bearers: Sequence[NetworkAdapter], absent: Mapping[str, bytes]
+    shared_id: SharedId,
+    robot: str,
+    verb: str,
+    bearers: Sequence[NetworkAdapter],
+    absent: Mapping[str, bytes] = MappingProxyType({}),
 ) -> NetworkAdapter:
     """Return the network that a motion goes to.
 
@@ -81,30 +103,32 @@ def decided(
     return network
 
 
-def _proven(
+def _enrolled(
     robot: str, keys: Mapping[NetworkAdapter, bytes | None], absent: Collection[bytes]
 ) -> NetworkAdapter | None:
-    """Return the network whose robot's key proves it.
+    """Return the network whose robot signs with an enrolled key.
 
     Args:
         robot: the id.
         keys: that signed the answer on each network that has the robot, the one to prefer first.
         absent: keys that are enrolled on networks which are not joined.
     """
-    bearers = [*keys]
-    if not absent and (len(bearers) == 1 or (bearers and None not in keys.values() and len({*keys.values()}) == 1)):
-        return bearers[0]
-    enrolled = [each for each, key in keys.items() if key is not None and key in {each.enrolled_key(robot), *absent}]
+    enrolled = [each for each, key in keys.items() if key and key in {each.enrolled_key(robot), *absent}]
     return enrolled[0] if enrolled and len({keys[each] for each in enrolled}) == 1 else None
 
 
 def _signing_key(robot: str, network: NetworkAdapter) -> tuple[bool, bytes | None]:
-    """Return whether the robot is there, and the key that signs a fresh answer."""
+    """Return whether the robot is there, and the key that signs a fresh answer.
+
+    The key is None for none, and :data:`SILENT` without an answer.
+    """
     nonce = secrets.token_hex(16)
     try:
         answer = network.call(robot, network.reads["status"], {"nonce": nonce}, ASK_S)
     except NoSuchRobotError:
         return False, None
+    except (NoAnswerError, UnreachableError):
+        return True, SILENT
     except RefusalError:
         return True, None
     statement = answer.get("statement")

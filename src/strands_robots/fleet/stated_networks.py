@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
@@ -74,7 +75,7 @@ def networks_of(
         absent[MESH] = f"the connection profile {profile.label} has none"
     elif mesh is None and stated is None and find_spec("zenoh") is None:
         absent[MESH] = "the extra mesh is not installed"
-    elif MESH in unasked:
+    elif MESH in unasked and not _on_a_mesh():
         # Its code is not loaded: most machines have no mesh.
         if stays or not (why := no_hub()):
             networks.append(cast("NetworkAdapter", LocalMesh(source, console=console)))
@@ -117,6 +118,12 @@ def networks_for_stop(
         networks.keys[left_out] = partial(_unusable, unfit)
         return networks
     raise unfit
+
+
+def _on_a_mesh() -> bool:
+    """Return whether this process is on a mesh: it can join no other one."""
+    session = sys.modules.get("strands_robots.mesh.session")
+    return session is not None and session.opened_with() is not None
 
 
 def _states_mesh() -> bool:

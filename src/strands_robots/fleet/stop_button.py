@@ -253,21 +253,23 @@ class StopButtons:
     @property
     def running(self) -> bool:
         """True while a stop waits for answers."""
-        return any(each.running for each in self._every())
+        return any(each.running for each in self.every.values())
+
+    @property
+    def every(self) -> dict[tuple[str, Scope], StopButton]:
+        """All buttons, by network and scope."""
+        with self._lock:
+            return self._buttons.copy()
 
     def review(self) -> None:
         """Take what robots have said since the stops ended."""
-        for each in self._every():
+        for each in self.every.values():
             each.review()
 
     def close(self) -> None:
         """Give up stops that wait for the link."""
-        for each in self._every():
+        for each in self.every.values():
             each.close()
-
-    def _every(self) -> list[StopButton]:
-        with self._lock:
-            return list(self._buttons.values())
 
     def _button(self, network: str, scope: Scope) -> StopButton:
         if (network, scope) not in self._buttons:

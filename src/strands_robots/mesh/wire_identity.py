@@ -18,15 +18,15 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from strands_robots import settings
+from strands_robots.certificates import cryptography
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.mesh import wire
 from strands_robots.mesh.throttle import RecentKeys
 from strands_robots.mesh.transport.zenoh_config import Posture, TlsCredentials
-from strands_robots.utils import ValidationError, canonical_json, identifier, missing_extra, shown
+from strands_robots.utils import ValidationError, canonical_json, identifier, shown
 
 if TYPE_CHECKING:
     from cryptography import x509
@@ -245,23 +245,6 @@ def _unknown_policy(stated: str) -> str:
     """``1``; the cache limits the warning to one for each text."""
     logger.warning("STRANDS_MESH_REQUIRE_SIGNED_IDENTITY=%s is none of 1, 0 and auto; taken as 1.", shown(stated))
     return "1"
-
-
-@lru_cache(maxsize=1)
-def cryptography() -> SimpleNamespace:
-    """Load the parts of the ``cryptography`` package that are needed here.
-
-    Raises:
-        MissingExtraError: the package is not installed.
-    """
-    try:
-        from cryptography import exceptions, x509  # noqa: PLC0415 - optional, loaded when used
-        from cryptography.hazmat.primitives import hashes, serialization  # noqa: PLC0415 - as above
-        from cryptography.hazmat.primitives.asymmetric import ec, ed25519, padding, rsa  # noqa: PLC0415 - as above
-    except ImportError:
-        raise missing_extra("A certificate of the mesh", "mesh") from None
-    modules = (exceptions, x509, hashes, serialization, ec, ed25519, padding, rsa)
-    return SimpleNamespace(**{module.__name__.rpartition(".")[2]: module for module in modules})
 
 
 def _shape(sig: object) -> dict[str, Any]:

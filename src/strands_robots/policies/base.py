@@ -119,6 +119,15 @@ def numbers(observation: Mapping[str, object]) -> dict[str, float]:
     return finite
 
 
+def plain_numbers(values: object) -> dict[str, float]:
+    """Return the finite numbers of a mapping; ``{"position": x}`` counts as ``x``."""
+    if not isinstance(values, Mapping):
+        return {}
+    return numbers(
+        {str(name): value.get("position") if isinstance(value, Mapping) else value for name, value in values.items()}
+    )
+
+
 def is_velocity(key: str) -> bool:
     """Return True for an action key that is a velocity."""
     return key.endswith((".vel", "_vel", ".velocity"))

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import pytest
 from fixtures.command_line import Machine
+from fixtures.mesh_peer import share_console_key
 from fixtures.page_site import PageServer, browser, chromium, shows
 from fixtures.served_page import ServedPage
 from fixtures.stop_robots import robots
 from fixtures.waiting import eventually
 
 from strands_robots.device_connect.backends import LinkConfig, loopback_config
+from strands_robots.fleet.adapter import DEVICE_CONNECT
 
 ARMS = ("arm-1", "arm-2", "arm-3")
 
@@ -43,13 +45,17 @@ class Cell:
         # The arms count as hardware: a caller is allowed, and its verbs are approved.
         self.settings = {
             "STRANDS_STATE_DIR": str(state),
+            "STRANDS_MESH_PORT": self.machine.environment["STRANDS_MESH_PORT"],
             "DEVICE_CONNECT_RPC_ALLOW": "dashboard",
-            "STRANDS_ROBOT_COMMAND_ALLOW": "execute,moveJoints,acquireControl",
+            "STRANDS_ROBOT_COMMAND_ALLOW": "execute,start,moveJoints,acquireControl,wipe",
         }
+        for each in (state, own):
+            share_console_key(each)
 
-    def serve_arms(self, *names: str, **settings: str) -> Any:
+    def serve_arms(self, *names: str, networks: Sequence[str] = (DEVICE_CONNECT,), **settings: str) -> Any:
         """Arms in a process of their own, ready to be stopped."""
-        arms = robots(self.link, *(names or ARMS), environment={**self.settings, **settings})
+        environment = {**self.settings, **settings}
+        arms = robots(self.link, *(names or ARMS), environment=environment, networks=networks)
         self.stack.callback(arms.close)
         eventually(lambda: arms.ask("ready"), what="the robots' e-stop links")
         return arms

@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from fixtures.page_driving import open_robot, verb_form
+from fixtures.page_driving import card, open_robot, verb_form
+from fixtures.page_site import picture
 from fixtures.served_page import FORMS, ServedPage
 from fixtures.waiting import eventually
 
@@ -56,6 +57,17 @@ def test_own_verb_is_filled_in_within_its_bounds_and_sent_with_its_types(page: A
     form.get_by_role("button", name="Run").click()
     eventually(lambda: served.feed.asked("brewCoffee"), what="the call")
     assert served.feed.asked("brewCoffee")[0] == {"cups": 2, "sugar": 0.5, "strength": "strong"}
+
+
+def test_device_of_others_says_on_the_page_what_it_lacks(page: Any, served: ServedPage) -> None:
+    lacking = "no lockout, no lease, no stop"
+    served.robot("kettle", locked=None, lacking=lacking, forms=OWN_FORMS)
+    card(page, "kettle").locator(".lock", has_text=lacking).wait_for(timeout=30_000)
+    assert "nobody holds control" not in card(page, "kettle").inner_text()
+    card(page, "kettle").locator("a.name").click()
+    page.locator("#robot .lock", has_text=lacking).wait_for(timeout=30_000)
+    picture(page, "bare-device")
+    verb_form(page, "brewCoffee")
 
 
 def test_own_verb_is_plain_text_and_says_that_it_is_the_robots(page: Any, served: ServedPage) -> None:

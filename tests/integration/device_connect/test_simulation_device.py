@@ -116,10 +116,10 @@ def test_stream_loses_no_step(fleet: FleetClient) -> None:
 
 
 def joints(fleet: FleetClient) -> dict[str, float]:
-    from strands_robots.device_connect.telemetry import numbers  # noqa: PLC0415 - beside its only use
+    from strands_robots.policies.base import plain_numbers  # noqa: PLC0415 - beside its only use
 
     robots: dict[str, Any] = fleet.call("sim-1", "getStatus")["robots"]
-    return numbers(robots["left"].get("joints", robots["left"]))
+    return plain_numbers(robots["left"].get("joints", robots["left"]))
 
 
 def largest_change(now: dict[str, float], then: dict[str, float]) -> float:

@@ -20,8 +20,8 @@ from strands_robots.cli.demo.output import DemoScreen
 from strands_robots.cli.demo.processes import Agent, AgentEvent, EventStream, RobotProcess
 from strands_robots.cli.output import CliError, first_line, label, plain, table
 from strands_robots.cli.watch import joints_table
-from strands_robots.device_connect.telemetry import numbers
 from strands_robots.fleet.joint_features import joint_limits
+from strands_robots.policies.base import plain_numbers
 from strands_robots.safety.controller import SafetyController
 from strands_robots.safety.ed25519 import keygen, load_signing_key
 from strands_robots.safety.resume import sign
@@ -229,7 +229,7 @@ class DriveSteps:
         started = time.monotonic()
         with self._screen.live() as frame:
             for event in stream.follow(within):
-                told = numbers(event.payload.get("action")) if event.name == "streamStep" else {}
+                told = plain_numbers(event.payload.get("action")) if event.name == "streamStep" else {}
                 if told:
                     self.report.setpoints.append((event.at, told))
                 joints = _joints(event)
@@ -276,7 +276,7 @@ class DriveSteps:
 
     def _robot_joints(self) -> Joints:
         robots = self._agent.call(self._peer, "getStatus").get("robots")
-        return numbers(next(iter(robots.values()), {})) if isinstance(robots, dict) else {}
+        return plain_numbers(next(iter(robots.values()), {})) if isinstance(robots, dict) else {}
 
 
 class SafetySteps:
@@ -423,8 +423,8 @@ def _extents(each: Mapping[str, Any]) -> str:
 
 def _joints(event: AgentEvent) -> Joints:
     if event.name == "observationUpdate":
-        return numbers(event.payload.get("joints"))
-    return numbers(event.payload.get("observation")) if event.name == "streamStep" else {}
+        return plain_numbers(event.payload.get("joints"))
+    return plain_numbers(event.payload.get("observation")) if event.name == "streamStep" else {}
 
 
 def _span(values: list[float]) -> float:

@@ -1,7 +1,7 @@
 // A grid of the cameras of all robots that have one, twelve at a time, one picture a second each.
 import { el, setAttr, setText } from "./dom.js";
 import { Filter } from "./filter.js";
-import { byName, kindText } from "./fleet.js";
+import { byName, kindText, nameText } from "./fleet.js";
 import { H } from "./history-strings.js";
 
 const TILES = 12, OLD_MS = 5000, AGAIN_MS = 10_000;
@@ -16,6 +16,7 @@ class Tile {
 
   show(row) {
     const key = row ? row.key : "";
+    setText(this.name, row ? nameText(row) : "");
     if (key === this.key) return;
     this.key = key;
     this.at = 0;
@@ -25,7 +26,6 @@ class Tile {
     this.picture.alt = row ? H.picture(row.id) : "";
     // Tiles keep their places; one without a robot is only not seen.
     setAttr(this.node, "data-empty", row ? "no" : "yes");
-    setText(this.name, row ? row.id : "");
     if (row) this.name.href = `#/robot/${encodeURIComponent(key)}`; else this.name.removeAttribute("href");
   }
 

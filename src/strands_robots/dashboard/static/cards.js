@@ -1,7 +1,7 @@
 // A card for each robot. Cards keep their size and their place: one that comes takes a free place, one that goes leaves
 // its own, and they are sorted anew only when somebody asks for it.
 import { el, setAttr, setLine, setText } from "./dom.js";
-import { ageText, byName, controlText, kindText, lockText, taskText, verdictText, verdictTone } from "./fleet.js";
+import { ageText, byName, controlText, kindText, lockText, nameText, taskText, verdictText, verdictTone } from "./fleet.js";
 import { Filter } from "./filter.js";
 import { Halt } from "./halt.js";
 import { S } from "./strings.js";
@@ -33,7 +33,7 @@ class Card {
 
   show(fleet, row) {
     this.halt.of(row);
-    setLine(this.name, row.id);
+    setLine(this.name, nameText(row));
     setLine(this.kind, kindText(row));
     setLine(this.task, taskText(row));
     setAttr(this.task, "data-on", fleet.moving(row) ? "yes" : "no");

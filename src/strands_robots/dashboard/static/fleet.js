@@ -91,7 +91,11 @@ export function verdictTone(stop) {
   return { stopped: "good", claimed: "warn", waiting: "warn", heard_only: "quiet" }[stop.state] || "bad";
 }
 
+// Two robots of one id are told apart by their networks.
+export function nameText(row) { return row.namesake ? `${row.id} (${S.network[row.network] || row.network})` : row.id; }
+
 export function lockText(row) {
+  if (row.lacking && row.locked === null) return row.lacking;
   if (row.locked === null) return `${S.lockUnknown}${row.doubt ? `: ${row.doubt}` : ""}`;
   if (!row.locked) return S.free;
   const first = row.lockouts[0];
@@ -121,5 +125,5 @@ export function ageText(fleet, row) {
 
 export function controlText(fleet, row) {
   if (fleet.mine.has(row.key)) return S.heldHere;
-  return row.control.held ? S.heldBy(row.control.holder, row.control.kind) : S.notHeld;
+  return row.control.held ? S.heldBy(row.control.holder, row.control.kind) : row.lacking ? "" : S.notHeld;
 }

@@ -15,7 +15,7 @@ export class Halt {
     if (row.key !== this.key) this.say("", "quiet");
     this.key = row.key;
     setAttr(this.button, "aria-label", S.haltOne(row.id));
-    setAttr(this.button, "title", S.haltWhy(row.id));
+    setAttr(this.button, "title", row.namesake ? S.haltNamesakes(row.id) : S.haltWhy(row.id));
   }
 
   say(text, tone) {

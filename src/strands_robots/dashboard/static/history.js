@@ -3,7 +3,7 @@ import { Chart } from "./chart.js";
 import { el, own, setAttr, setText } from "./dom.js";
 import { bothJson, chartsCsv, save, statesCsv } from "./export.js";
 import { Filter } from "./filter.js";
-import { byName, kindText } from "./fleet.js";
+import { byName, kindText, nameText } from "./fleet.js";
 import { H } from "./history-strings.js";
 import { clipped, drawAxis, Lane } from "./lanes.js";
 
@@ -215,7 +215,9 @@ export class HistoryView {
     drawAxis(this.axis, from, to, offset, this.stops.filter(([event]) => event === "STOP pressed").map(([, at]) => at * 1000));
     for (const key of this.visible) {
       const row = this.fleet.rows.get(key);
-      if (row) this.lanes.get(key).draw(this.tracks.get(key), from, to, offset, this.fleet.attention(row) === 0, this.stops.filter(([event, , halted]) => event === "halted here" && halted === key).map(([, at]) => at));
+      if (!row) continue;
+      this.lanes.get(key).name(nameText(row));
+      this.lanes.get(key).draw(this.tracks.get(key), from, to, offset, this.fleet.attention(row) === 0, this.stops.filter(([event, , halted]) => event === "halted here" && halted === key).map(([, at]) => at));
     }
   }
 
@@ -242,7 +244,7 @@ export class HistoryView {
 
   drawCharts() {
     const row = this.key && this.fleet.rows.get(this.key);
-    setText(this.chartsTitle, H.charts(row ? row.id : ""));
+    setText(this.chartsTitle, H.charts(row ? nameText(row) : ""));
     const found = this.columns();
     this.files.querySelector("[data-file=charts]").disabled = !(row && this.series);
     setText(this.loadNote, this.series ? this.loadStated ? H.loadKnown : H.loadUnknown : "");

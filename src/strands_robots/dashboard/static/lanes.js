@@ -40,6 +40,11 @@ export class Lane {
     this.id = row.id;
   }
 
+  name(text) {
+    this.id = text;
+    setText(this.button, text);
+  }
+
   // Times are seconds of the server's clock.
   draw(track, from, to, wallOffset, red, halts) {
     const last = track && track.as.length ? track.as[track.as.length - 1] : "";

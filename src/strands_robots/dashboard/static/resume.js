@@ -1,6 +1,6 @@
 // Resume stands far from STOP, in words and in place, and asks for the passphrase each time. It opens over the page.
 import { el, setText } from "./dom.js";
-import { byName } from "./fleet.js";
+import { byName, nameText } from "./fleet.js";
 import { S } from "./strings.js";
 
 export class Resume {
@@ -26,7 +26,7 @@ export class Resume {
   draw() {
     const locked = this.locked(), hello = this.hello;
     this.area.hidden = locked.length === 0 && !this.node.open;
-    setText(this.which, locked.length ? S.resumeWhich(locked.map((row) => row.id).slice(0, 40).join(", ")) : S.resumeNone);
+    setText(this.which, locked.length ? S.resumeWhich(locked.map(nameText).slice(0, 40).join(", ")) : S.resumeNone);
     const why = !hello ? "" : hello.role !== "operator" ? S.viewer : !hello.local ? S.resumeRemote : !hello.operator_key ? S.resumeNoKey : "";
     setText(this.hint, why || (hello && hello.starting.length ? S.resumeDemo : ""));
     this.form.hidden = why !== "" || !hello;

@@ -1,7 +1,7 @@
 // One robot: cameras, joints, driving by hand, its verbs and its timeline.
 import { el, setAttr, setLine, setShown, setText } from "./dom.js";
 import { Drive } from "./drive.js";
-import { ageText, kindText, lockText, taskText, verdictText, verdictTone } from "./fleet.js";
+import { ageText, kindText, lockText, nameText, taskText, verdictText, verdictTone } from "./fleet.js";
 import { Halt } from "./halt.js";
 import { Joints } from "./joints.js";
 import { Pictures } from "./pictures.js";
@@ -106,9 +106,9 @@ export class RobotView {
     const row = this.row();
     if (!row) { setLine(this.title, this.key.slice(this.key.indexOf(":") + 1)); return; }
     this.halt.of(row);
-    setLine(this.title, row.id);
+    setLine(this.title, nameText(row));
     setLine(this.kind, kindText(row));
-    for (const [button, says] of [[this.stop, S.stopOne(row.id)], [this.stopAlone, S.stopAlone(row.id)]]) {
+    for (const [button, says] of [[this.stop, S.stopOne(row.id)], [this.stopAlone, S.stopAlone(row.id) + (row.namesake ? ` ${S.alsoNamesakes}` : "")]]) {
       setAttr(button, "aria-label", says);
       setAttr(button, "title", says);
     }

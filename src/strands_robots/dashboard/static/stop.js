@@ -1,6 +1,6 @@
 // STOP. The big button and the space bar mean one thing, always: stop every robot. Nothing on this page changes that.
 import { el, setAttr, setText } from "./dom.js";
-import { byName, verdictText, verdictTone } from "./fleet.js";
+import { byName, nameText, verdictText, verdictTone } from "./fleet.js";
 import { S } from "./strings.js";
 
 const ORDER = ["not_stopped", "alarm", "refused", "unknown", "silent", "claimed", "waiting", "stopped", "heard_only"];
@@ -20,6 +20,7 @@ export class Stop {
     this.button = document.getElementById("stop");
     this.said = document.getElementById("stop-said");
     this.alarm = document.getElementById("alarm");
+    this.missing = document.getElementById("missing");
     this.head = el("p", { class: "stop-head", "data-tone": "quiet", tabindex: 0 });
     this.list = el("ul", { class: "answers" });
     this.notes = el("div");
@@ -51,12 +52,17 @@ export class Stop {
     if (this.channel.refused) return S.badToken;
     if (!this.channel.alive) return S.noServer;
     if (!this.link) return S.connecting;
-    if (Object.values(this.link.links).some((up) => !up)) return S.noNetwork;
+    const links = Object.entries(this.link.links), down = links.filter(([, up]) => !up).map(([name]) => S.network[name] || name);
+    if (down.length === links.length) return [S.noNetwork, this.gone()].filter(Boolean).join(" ");
+    if (down.length) return [S.noAnswerOf(down.join(", ")), this.gone()].filter(Boolean).join(" ");
     // The time stands still: a text that counts would be read out again and again.
     if (this.link.can_stop) this.silentSince = 0;
     else this.silentSince = this.silentSince || Date.now() - (this.link.silent_s || 0) * 1000;
     return this.silentSince ? S.silentNetwork(S.when(new Date(this.silentSince))) : "";
   }
+
+  // The networks that the server could not join, with the reasons.
+  gone() { return this.link ? Object.entries(this.link.missing).map(([name, why]) => S.networkMissing(S.network[name] || name, why)).join(" ") : ""; }
 
   look() {
     this.channel.renewIfSilent(3000);
@@ -64,6 +70,8 @@ export class Stop {
     const problem = [this.problem(), this.notSent, late ? S.sentUnconfirmed : ""].filter(Boolean).join(" ");
     setText(this.alarm, problem);
     this.alarm.hidden = problem === "";
+    setText(this.missing, problem ? "" : this.gone());
+    this.missing.hidden = this.missing.textContent === "";
     document.body.dataset.canStop = problem === "" ? "yes" : "no";
     const link = document.getElementById("link");
     setText(link, this.channel.alive ? S.connected : this.channel.refused ? S.notAdmitted : S.connecting);
@@ -76,14 +84,14 @@ export class Stop {
     const latest = this.link ? this.link.pressed_at : this.pressedAt;
     this.pressedAt = latest;
     const ready = answers.length === 0 && document.body.dataset.canStop === "yes" ? this.fleet.rows.size : 0;
-    const rosters = latest && this.link && !this.link.running ? Object.values(this.link.roster || {}) : [];
+    const rosters = latest && this.link && !this.link.running ? Object.entries(this.link.roster) : [];
     this.pressedFor = this.link ? this.link.pressed_for : this.pressedFor;
-    const signature = JSON.stringify([ready, latest, this.pressedFor, rosters, this.link && this.link.running, answers.map((row) => [row.key, row.stop])]);
+    const signature = JSON.stringify([ready, latest, this.pressedFor, rosters, this.link && this.link.running, answers.map((row) => [row.key, row.stop, row.namesake])]);
     if (signature === this.signature) return;
     this.signature = signature;
     const groups = new Map(ORDER.map((state) => [state, []]));
     for (const row of answers) (groups.get(row.stop.state) || groups.get("unknown")).push(row);
-    const bad = ORDER.slice(0, -2).some((state) => groups.get(state).length) || answers.some((row) => row.stop.alarm) || rosters.some((each) => !each.ok);
+    const bad = ORDER.slice(0, -2).some((state) => groups.get(state).length) || answers.some((row) => row.stop.alarm) || rosters.some(([, each]) => !each.ok);
     const running = this.link && this.link.running;
     const someFreed = answers.some((row) => row.stop.freed), freed = answers.length > 0 && !bad && !running && answers.every((row) => row.stop.freed);
     const counts = ORDER.filter((state) => groups.get(state).length).map((state) => count(state, groups.get(state))).join(", ");
@@ -97,7 +105,9 @@ export class Stop {
     this.head.replaceChildren(el("strong", { text: latest ? `${S.pressed(S.when(new Date(latest * 1000)), this.pressedFor)}: ` : "" }), summary);
     // Once all are free the cards say the rest.
     this.drawAnswers(freed ? [] : ORDER.flatMap((state) => groups.get(state)).slice(0, NAMES_MAX));
-    const notes = el("div", {}, ...rosters.flatMap((each) => [each.sentence, ...each.notes]).map((text) => el("p", { class: "small", text })));
+    // What is true of every network is said once.
+    const said = rosters.flatMap(([name, each]) => [rosters.length > 1 ? `${S.network[name] || name}: ${each.sentence}` : each.sentence, ...each.notes]);
+    const notes = el("div", {}, ...[...new Set(said)].map((text) => el("p", { class: "small", text })));
     this.notes.replaceWith(notes);
     this.notes = notes;
   }
@@ -110,15 +120,16 @@ export class Stop {
     for (const row of rows.sort((a, b) => byName.compare(a.id, b.id))) {
       let item = this.items.get(row.key);
       if (!item) {
-        const words = el("span");
-        item = { words, node: el("li", { "data-key": row.key }, el("strong", { text: row.id }), " ", words) };
+        const words = el("span"), name = el("strong");
+        item = { words, name, node: el("li", { "data-key": row.key }, name, " ", words) };
         this.items.set(row.key, item);
       }
       if (item.node === at) at = at.nextSibling; else this.list.insertBefore(item.node, at);
       const text = verdictText(row.stop);
       setAttr(item.node, "data-tone", verdictTone(row.stop));
       setAttr(item.node, "data-state", row.stop.state);
-      setAttr(item.node, "title", `${row.id} ${text}`);
+      setAttr(item.node, "title", `${nameText(row)} ${text}`);
+      setText(item.name, nameText(row));
       setText(item.words, text);
     }
   }
@@ -127,6 +138,6 @@ export class Stop {
 function count(state, rows) {
   const text = `${rows.length} ${S.counts[state]}`;
   if (["stopped", "heard_only", "waiting"].includes(state)) return text;
-  const names = rows.map((row) => row.id).sort(byName.compare);
+  const names = rows.map(nameText).sort(byName.compare);
   return `${text}: ${names.slice(0, NAMED_MAX).join(", ")}${names.length > NAMED_MAX ? " ..." : ""}`;
 }

@@ -9,6 +9,7 @@ export const S = {
   stopOne: (id) => `STOP. All robots stop; ${id} has to answer.`,
   stopOneShort: "STOP all",
   stopAlone: (id) => `STOP this one: emergency stop of ${id} alone. Bare devices and robots of earlier releases stop as well. If ${id} is not there, all robots stop.`,
+  alsoNamesakes: "Robots of this id on other networks stop as well.",
   stopAloneShort: "STOP this one",
   stopCell: (cell) => `STOP this cell: emergency stop of the robots of ${cell}, and of every robot without a cell. If none of them is there, all robots stop.`,
   stopCellShort: "STOP this cell",
@@ -16,6 +17,7 @@ export const S = {
   halt: "\u25a0\u00a0Halt",
   haltOne: (id) => `Halt ${id}`,
   haltWhy: (id) => `Halt ${id}: ends its motion. No other robot stops, and nothing is locked.`,
+  haltNamesakes: (id) => `Halt ${id}: ends the motion of all robots of this id. Nothing is locked.`,
   halting: "Halting...",
   halted: (at, ms) => `Halted at ${at}, in ${ms} ms.`,
   notHalted: (text) => `NOT HALTED: press STOP. ${text}`,
@@ -27,6 +29,9 @@ export const S = {
     "NOT CONNECTED. This page cannot stop any robot now. Use the hardware emergency stop, or run `strands-robots estop` in a terminal.",
   noNetwork:
     "THE NETWORK DOES NOT ANSWER. A stop may not arrive. Use the hardware emergency stop. A press here is sent as soon as the network is back.",
+  noAnswerOf: (network) =>
+    `${network.toUpperCase()} DOES NOT ANSWER. A stop may not arrive at its robots. Use the hardware emergency stop. A press here is sent as soon as it is back.`,
+  networkMissing: (network, why) => `${network} is missing: ${why.replace(/\.$/, "")}. Its robots are shown once it is there.`,
   silentNetwork: (t) =>
     `NO ROBOT HAS BEEN HEARD SINCE ${t}. A stop may not arrive. Use the hardware emergency stop; press STOP as well.`,
   notSent: "NOT SENT: the page is not connected to its server. Use the hardware emergency stop.",
@@ -73,7 +78,7 @@ export const S = {
   worst: (n) => ` \u00b7 ${n} ${n === 1 ? "needs" : "need"} attention`,
   none: "No robot has been found yet. Serve one in a terminal: strands-robots serve so100",
   starting: "is starting...",
-  kinds: { strands_sim: "simulated", strands_robot: "robot", mobile_base: "mobile base" },
+  kinds: { strands_sim: "simulated", sim: "simulated", strands_robot: "robot", mobile_base: "mobile base" },
   noMatch: "No robot matches.",
   locked: "LOCKED",
   lockedBy: (who, when) => `LOCKED by ${who} since ${when}`,

@@ -21,7 +21,7 @@ export class Timeline {
 
   wanted(each) {
     const text = this.filter.value.trim().toLowerCase(), row = this.fleet.rows.get(this.robot);
-    return (!row || each.key === this.robot || each.robot === row.id || each.robot === "") &&
+    return (!row || each.key === this.robot || (each.audit && each.robot === row.id) || each.robot === "") &&
       (this.which.value === "all" || (this.which.value === "audit") === each.audit) &&
       (!text || `${each.event} ${eventText(each.event)} ${each.robot} ${JSON.stringify(each.facts)}`.toLowerCase().includes(text));
   }

@@ -61,28 +61,22 @@ def _of_one(mesh: Mesh, robot: str, on_event: OnEvent, *, states: bool) -> dict[
 
     last = [_condition(mesh.get_peer(robot))]
 
+    def state(_key: str, message: Mapping[str, Any]) -> None:
+        if message.get("peer_id") == robot:
+            on_event(RobotEvent(robot, "state", message, joints=_positions(message), task=_task(message)))
+
     def presence(_key: str, message: Mapping[str, Any]) -> None:
         row = mesh.get_peer(robot) if message.get("robot_id") == robot else None
         if row is not None and last[0] != (now := _condition(row)):
             last[0] = now
             on_event(RobotEvent(robot, "presence", message, task=task_of(row)))
 
-    def state(_key: str, message: Mapping[str, Any]) -> None:
-        if message.get("peer_id") == robot:
-            on_event(RobotEvent(robot, "state", message, joints=_positions(message), task=_task(message)))
-
     receivers = {
         topics.stream(robot): (STREAM, _named(STREAM, on_event)),
         topics.safety_event(robot): ("safety_event", _named("safety_event", on_event)),
+        topics.presence(robot): ("presence", presence),
     }
-    # A heartbeat tells the end of a task to whom receives no states.
-    besides = {topics.state(robot): ("state", state)} if states else {topics.presence(robot): ("presence", presence)}
-    return receivers | besides
-
-
-def _condition(row: Mapping[str, Any] | None) -> object:
-    """Return the task and the lockouts that a heartbeat tells, without the step."""
-    return None if row is None else ({**task_of(row), "step": None}, row.get("locked"), row.get("epochs"))
+    return {**receivers, topics.state(robot): ("state", state)} if states else receivers
 
 
 def _recorded(robot: str, on_event: OnEvent) -> dict[str, tuple[str, OnMessage]]:
@@ -127,6 +121,11 @@ def _task(message: Mapping[str, Any]) -> dict[str, Any] | None:
     if not isinstance(task, Mapping) or (isinstance(degraded, Mapping) and "task" in degraded):
         return None
     return task_of({**task, "task_status": task.get("status"), "step_count": task.get("steps")})
+
+
+def _condition(row: Mapping[str, Any] | None) -> object:
+    """Return the task and the lockouts that a heartbeat tells, without the step."""
+    return None if row is None else ({**task_of(row), "step": None}, row.get("locked"), row.get("epochs"))
 
 
 def _of_all(mesh: Mesh, on_event: OnEvent) -> dict[str, tuple[str, OnMessage]]:
