@@ -28,7 +28,7 @@ from strands_robots.safety.controller import OnProgress
 from strands_robots.safety.identity import SigningIdentity
 from strands_robots.safety.lockout import Lockout
 from strands_robots.safety.network_key import NetworkKey
-from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope
+from strands_robots.safety.scope import EVERY_ROBOT, KnownRobots, Remembers, Scope
 from strands_robots.safety.silence import Sending
 from strands_robots.safety.statements import Purpose
 from strands_robots.safety.statements import signed as signed_by
@@ -93,7 +93,7 @@ class ScriptedNetwork:
         self.estops: list[tuple[str, Scope, str]] = []
         self.locked: dict[str, str] = {}
         self.silent: list[str] = []
-        self.remembered = False
+        self.known_elsewhere: KnownRobots | None = None
         self.signers: list[Any] = []
         self.keys: dict[str, SigningIdentity] = {}
         self.children: dict[str, str] = {}
@@ -108,6 +108,11 @@ class ScriptedNetwork:
         if self.unreachable:
             raise UnreachableError(self.unreachable)
         self.joined = True
+
+    @property
+    def remembered(self) -> bool:
+        """A robot of the last emergency stop's scope is known on some network."""
+        return self.known_elsewhere is not None and self.known_elsewhere.known
 
     def sign_with(self, key: SigningIdentity) -> None:
         """Have every robot sign its status."""
@@ -239,7 +244,7 @@ class ScriptedNetwork:
     ) -> StopOutcome:
         self.estops.append((reason, scope, estop_id))
         self.signers.append(signing_key)
-        self.remembered = remembers is not None and remembers(scope)
+        self.known_elsewhere = None if remembers is None else KnownRobots(scope, remembers)
         if self.unreachable:
             raise UnreachableError(self.unreachable)
         answers = {name: self.stop(name) or error("none") for name in self.robots if scope.covers(name, frozenset())}

@@ -6,6 +6,7 @@ import asyncio
 import threading
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -16,10 +17,20 @@ from strands_robots import errors
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.fleet import joining
 from strands_robots.fleet import networks as module
-from strands_robots.fleet.adapter import DEVICE_CONNECT, FIND_S, MESH, STOP_S, FoundRobot, NetworkAdapter
+from strands_robots.fleet.adapter import (
+    DEVICE_CONNECT,
+    FIND_S,
+    MESH,
+    STOP_S,
+    FoundRobot,
+    NetworkAdapter,
+    NetworkBusyError,
+)
 from strands_robots.fleet.all_stops import estop_all, stop_all
 from strands_robots.fleet.fleet import Fleet
 from strands_robots.fleet.networks import Networks
+from strands_robots.safety.roster import Roster, RosterRow
+from strands_robots.safety.sightings import Known
 
 
 class SlowNetwork(ScriptedNetwork):
@@ -541,3 +552,123 @@ def test_search_that_fails_on_one_network_gives_the_robots_of_the_other(
 
 def _alive(name: str) -> list[threading.Thread]:
     return [each for each in threading.enumerate() if each.name == name]
+
+
+class TestBusy:
+    """A network that takes connections and has not answered in time, as on a loaded machine."""
+
+    @pytest.fixture
+    def tries(self, near: ScriptedNetwork, far: SlowNetwork, monkeypatch: pytest.MonkeyPatch) -> list[int]:
+        """The attempts to join the mesh, of which the third one succeeds."""
+        far.may_open.set()
+        tries: list[int] = []
+        joined = far.open
+
+        def opened() -> None:
+            tries.append(1)
+            if len(tries) < 3:
+                raise NetworkBusyError("it hangs")
+            joined()
+
+        monkeypatch.setattr(far, "open", opened)
+        return tries
+
+    @pytest.mark.parametrize("stop", [stop_all, lambda networks: estop_all(networks, "test")])
+    def test_stop_is_not_kept_from_it(
+        self, stop: Any, tries: list[int], near: ScriptedNetwork, far: SlowNetwork
+    ) -> None:
+        networks = Networks([near, far])
+        assert stop(networks).ok
+        assert sorted(far.stopped) == ["arm-2", "both"]
+        networks.close()
+
+    def test_stop_of_one_robot_is_not_kept_from_it(
+        self, tries: list[int], near: ScriptedNetwork, far: SlowNetwork
+    ) -> None:
+        networks = Networks([near, far])
+        assert sorted(networks.stop("both")) == [DEVICE_CONNECT, MESH]
+        networks.close()
+
+    def test_search_does_not_try_it_again(self, tries: list[int], near: ScriptedNetwork, far: SlowNetwork) -> None:
+        with Networks([near, far]) as networks:
+            networks.find()
+            assert (len(tries), networks.absent) == (1, {MESH: "it hangs"})
+
+    def test_it_is_named_once_it_was_tried_long_enough(
+        self, tries: list[int], near: ScriptedNetwork, far: SlowNetwork, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(module, "BUSY_S", 0.0)
+        with Networks([near, far], unasked={MESH}) as networks:
+            assert stop_all(networks).ok
+            assert (len(tries), networks.absent) == (2, {MESH: "it hangs"})
+            # The next stop tries it once more.
+            assert stop_all(networks).ok
+            assert networks.absent == {}
+
+
+def test_robot_that_is_silent_on_a_network_that_remembers_it_is_named_by_a_stop(
+    near: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    far, rows = ScriptedNetwork(MESH, {}), [RosterRow("arm-1", Known.ENROLLED)]
+    monkeypatch.setattr(Roster, "of", lambda network, *_: Roster(network, tuple(rows) if network == far.key else ()))
+    networks = Networks([near, far])
+    answers = networks.stop("arm-1")
+    assert {name: said["stopped"] for name, said in answers.items()} == {DEVICE_CONNECT: True, MESH: None}
+    far.unreachable = "cable"
+    gone = Networks([near, far])
+    assert "cable" in str(gone.stop("arm-1")[MESH]["content"])
+    # One that said that it left may be the robot that answered.
+    rows[:] = [RosterRow("arm-1", Known.ENROLLED, departed=True)]
+    assert list(networks.stop("arm-1")) == [DEVICE_CONNECT]
+
+
+def test_stop_of_a_name_that_no_network_knows_has_one_answer(near: ScriptedNetwork) -> None:
+    networks = Networks([near, ScriptedNetwork(MESH, {})])
+    assert list(networks.stop("nobody")) == [DEVICE_CONNECT]
+    networks.close()
+    assert networks.stop("arm-1") == {DEVICE_CONNECT: error(module.CLOSED, stopped=None)}
+
+
+class TestStopLink:
+    """Emergency stops that have a connection of their own."""
+
+    @pytest.mark.parametrize("opened", [True, False])
+    def test_emergency_stop_waits_for_no_joining(self, near: ScriptedNetwork, far: SlowNetwork, opened: bool) -> None:
+        far.has_stop_link = True
+        networks = Networks([near, far])
+        if opened:
+            networks.open()
+        verdict = estop_all(networks, "test")
+        assert verdict.ok
+        assert near.locked["both"] == far.locked["both"] == verdict.estop_id
+        assert not far.joined
+        far.may_open.set()
+        networks.close()
+
+    def test_network_on_which_it_did_not_leave_and_that_has_no_robot_is_named_alone(
+        self, near: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        far = ScriptedNetwork(MESH, {})
+        far.has_stop_link = True
+        sent = far.emergency_stop
+
+        def unsent(*given: Any, **options: Any) -> Any:
+            outcome = sent(*given, **options)
+            report = replace(outcome.report, link=False)
+            return replace(outcome, report=report, problems=("the broker is gone",))
+
+        monkeypatch.setattr(far, "emergency_stop", unsent)
+        networks = Networks([near, far])
+        verdict = estop_all(networks, "test")
+        assert verdict.ok
+        assert [each.network for each in verdict.unreached] == [MESH]
+        assert networks.absent == {MESH: "the broker is gone"}
+        far.silent.append("arm-9")
+        assert estop_all(networks, "test").missing == ("arm-9",)
+
+    def test_named_robot_must_answer_where_it_is_and_is_told_once(self, near: ScriptedNetwork) -> None:
+        far = ScriptedNetwork(MESH, {"arm-2": OURS})
+        verdict = estop_all(Networks([near, far]), "test", named=["arm-1", "arm-2", "arm-9"])
+        assert verdict.missing == ("arm-9",)
+        assert {each.network: list(each.silent) for each in verdict.networks} == {DEVICE_CONNECT: ["arm-9"], MESH: []}
+        assert verdict["arm-1"].stopped and verdict["arm-2"].stopped

@@ -4,19 +4,24 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, ClassVar
 
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from fixtures.waiting import eventually
 from tests.fleet.scripted import ScriptedNetwork, key_of
 
 from strands_robots import errors
 from strands_robots.envelope import error, success
 from strands_robots.fleet import Fleet
 from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
+from strands_robots.fleet.all_stops import estop_all
 from strands_robots.fleet.enrollment import Enrolled, enrolled_robots
 from strands_robots.fleet.lockout_report import LockoutReport
+from strands_robots.fleet.networks import Networks
+from strands_robots.safety.answers import Answer
+from strands_robots.safety.controller import Progress
 from strands_robots.safety.identity import ROBOTS, KeyFile
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.roster import Roster, RosterRow
@@ -111,11 +116,52 @@ def test_stop_of_a_robot_of_one_network_does_not_become_one_of_all_on_another(
 ) -> None:
     stop = fleet.estop(only="arm-1")
     assert near.estops[0][1] == far.estops[0][1] == Scope.named(["arm-1"])
-    assert (near.remembered, far.remembered) == (True, True)
+    eventually(lambda: near.remembered and far.remembered, what="the robot, which is known on one network")
     assert {name: verdict.stopped for name, verdict in stop.items()} == {"arm-1": True}
     assert stop.ok
     fleet.estop(only=["nowhere"])
     assert (near.remembered, far.remembered) == (False, False)
+
+
+def test_named_robot_that_a_network_which_is_being_joined_remembers_is_known(
+    near: ScriptedNetwork, far: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    row, may_open = RosterRow("arm-7", Known.ENROLLED), threading.Event()
+    opened = far.open
+
+    def opens_late() -> None:
+        assert may_open.wait(30)
+        opened()
+
+    monkeypatch.setattr(far, "open", opens_late)
+    third = key_of("third")
+    monkeypatch.setattr(Roster, "of", lambda network, *_: Roster(network, (row,) if network == third else ()))
+    # Also one that is a name alone.
+    with Networks([near, far], {"third": "no peer"}, {"third": lambda: third}) as networks:
+        stopping = threading.Thread(target=lambda: estop_all(networks, "", scope=Scope.named(["arm-7"])))
+        stopping.start()
+        try:
+            eventually(lambda: near.remembered, what="the robot, which is remembered on another network")
+        finally:
+            may_open.set()
+            stopping.join(30)
+
+
+def test_named_robot_that_answers_on_another_network_is_known(
+    near: ScriptedNetwork, far: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its network neither remembers nor has found it."""
+
+    def answers(*_: Any, on_progress: Callable[[Progress], None], **__: Any) -> Any:
+        said = Answer("arm-7", True, 0.0, "stopped")
+        on_progress(Progress("0" * 32, {"arm-7": said}, (), True, 1.0))
+        eventually(lambda: far.remembered, what="the robot, which has answered")
+        raise OSError("no outcome")
+
+    monkeypatch.setattr(near, "emergency_stop", answers)
+    with Networks([near, far]) as networks:
+        estop_all(networks, "", scope=Scope.named(["arm-7"]))
+        assert far.remembered
 
 
 def test_named_robot_that_is_nowhere_is_missing(fleet: Fleet) -> None:

@@ -34,7 +34,6 @@ from strands_robots.utils import ValidationError, near, port, redacted
 
 if TYPE_CHECKING:
     from strands_robots.device_connect.backends import LinkConfig
-    from strands_robots.fleet.adapter import NetworkAdapter
     from strands_robots.fleet.networks import Networks
     from strands_robots.mesh import Mesh
 
@@ -202,27 +201,6 @@ class Network:
         except UnreachableError as refusal:
             raise CliError(plain(f"The network does not carry this: {refusal.why}", 2000), Exit.SILENT) from refusal
 
-    @contextmanager
-    def adapter(self, source: str) -> Iterator[NetworkAdapter]:
-        """Connect to Device Connect for the length of the block.
-
-        Raises:
-            CliError: it cannot be reached, or fails in use.
-        """
-        link = self.link()
-        from device_connect_edge.messaging import MessagingError  # noqa: PLC0415 - loaded when a network is used
-
-        from strands_robots.device_connect import FleetClient  # noqa: PLC0415 - as above
-        from strands_robots.fleet.device_connect.network import DeviceConnectNetwork  # noqa: PLC0415 - as above
-
-        try:
-            with FleetClient(link, source) as fleet:
-                yield DeviceConnectNetwork.joined(fleet)
-        except MessagingError as exc:
-            raise CliError(f"The network does not carry this: {exc}", Exit.SILENT) from exc
-        except UnreachableError as refusal:
-            raise CliError(plain(f"The network does not carry this: {refusal.why}", 2000), Exit.SILENT) from refusal
-
     def other_user(self, networks: Networks) -> str:
         """Return who else serves robots where those of this machine meet, or ""."""
         devices = any(each.name == DEVICE_CONNECT for each in networks.stated)
@@ -295,19 +273,6 @@ def _mesh_beside(profile: FleetProfile) -> Mapping[str, str]:
     return {"STRANDS_MESH": "false"} if stated is None else stated
 
 
-@contextmanager
-def joined_mesh(source: str, peer_type: str) -> Iterator[NetworkAdapter]:
-    """Join the native mesh under a fresh id while the block runs.
-
-    Raises:
-        CliError: it cannot be joined.
-    """
-    from strands_robots.fleet.mesh.network import MeshNetwork  # noqa: PLC0415 - loaded when a network is used
-
-    with mesh_peer(None, temporary_mesh_id(source), peer_type) as mesh, closing(MeshNetwork.joined(mesh)) as network:
-        yield network
-
-
 def say_missing(screen: Screen, networks: Networks) -> None:
     """Name the networks that were asked for and cannot be reached."""
     for name, why in networks.missing.items():
@@ -336,7 +301,7 @@ def answering(there: Networks, robot: str, verb: str) -> Iterator[None]:
         if several:
             reason += " Give one of them another id; --mesh means the one on the mesh."
         elif isinstance(refusal, NoSuchRobotError):
-            reason += "" if refusal.remedy else _near_robots(there, robot)
+            reason += "" if refusal.remedy else near_robots(there, robot)
             reason += "".join(f" Not reached: {name}, {why.rstrip('.')}." for name, why in there.missing.items())
         elif isinstance(refusal, ArgumentsError) and not answer:
             code = Exit.USAGE
@@ -347,7 +312,7 @@ def answering(there: Networks, robot: str, verb: str) -> Iterator[None]:
         raise CliError(plain(reason, 2000), code, **fields) from refusal
 
 
-def _near_robots(there: Networks, robot: str) -> str:
+def near_robots(there: Networks, robot: str) -> str:
     """Return a sentence with the ids that resemble an absent one."""
     try:
         names = there.find(1.0)

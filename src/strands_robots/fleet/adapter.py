@@ -9,6 +9,7 @@ from enum import Enum
 from typing import TYPE_CHECKING, Any, Protocol
 
 from strands_robots.envelope import Envelope
+from strands_robots.errors import UnreachableError
 from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope
 
 if TYPE_CHECKING:
@@ -29,6 +30,10 @@ CLOSED = "the fleet was closed before it answered"
 
 STOP_S = 5.0
 """Seconds in which a robot has to answer a stop."""
+
+
+class NetworkBusyError(UnreachableError):
+    """Something takes connections there and has not answered in time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,7 +143,7 @@ class NetworkAdapter(Protocol):
         """Join the network.
 
         Raises:
-            UnreachableError: it cannot be reached.
+            UnreachableError: it cannot be reached; :class:`NetworkBusyError` where it may be reached later.
         """
 
     def find(self, timeout: float = FIND_S) -> list[FoundRobot]:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import logging
+import threading
+import time
 from collections.abc import Callable, Collection, Sequence
+from functools import partial
 from typing import Any
 
 from strands_robots.envelope import Envelope, error, success
@@ -11,7 +14,7 @@ from strands_robots.errors import UnreachableError
 from strands_robots.fleet.adapter import STOP_S, NetworkAdapter
 from strands_robots.fleet.fleet_verdict import FleetVerdict, NetworkVerdict
 from strands_robots.fleet.networks import CLOSED, Networks
-from strands_robots.fleet.side_by_side import side_by_side
+from strands_robots.fleet.side_by_side import on_own_thread, side_by_side
 from strands_robots.fleet.stop_answers import not_reached, roster_verdict
 from strands_robots.safety.controller import Progress
 from strands_robots.safety.network_key import NetworkKey
@@ -22,6 +25,9 @@ from strands_robots.safety.stopping import StopVerdict
 from strands_robots.utils import plain_text
 
 logger = logging.getLogger(__name__)
+
+KNOWN_S, LOOK_S = 2.5, 0.01
+"""Seconds in which a robot that is named becomes known, the discovery of a network included; and between two looks."""
 
 OnNetworkProgress = Callable[[str, Progress], None]
 """Takes the name of a network and the answers on it so far."""
@@ -74,13 +80,28 @@ def estop_all(
         deadline_s: seconds until silence is silence, as :meth:`NetworkAdapter.emergency_stop` has it.
         on_progress: called on a thread of the stop; it returns at once.
     """
-    epoch = estop_id or new_epoch()
+    epoch, over, answered = estop_id or new_epoch(), threading.Event(), set[str]()
+    keys: list[Callable[[], NetworkKey]] = [
+        *(partial(getattr, each, "key") for each in networks.stated),
+        *networks.keys.values(),
+    ]
 
     def remembers(meant: Scope) -> bool:
         # Of the robots that a stop means none need be on each network; only where none is on any all are stopped.
-        if any(networks.bearers(name) for name in meant.only):
-            return True
-        return any(_remembered(each, meant) for each in networks.stated)
+        # A network that is still being joined has its roster, and a disk that hangs hides no other one.
+        rosters, until = [on_own_thread(partial(_remembered, each, meant)) for each in keys], time.monotonic() + KNOWN_S
+        while time.monotonic() < until:
+            if meant.only & answered or any(map(networks.bearers, meant.only)):
+                return True
+            if any(each.done() and each.result() for each in rosters):
+                return True
+            if over.wait(LOOK_S):
+                break
+        return False
+
+    def progressed(network: NetworkAdapter, progress: Progress) -> None:
+        answered.update(progress.answered)
+        on_progress(network.name, progress)
 
     def stopped(network: NetworkAdapter) -> NetworkVerdict:
         outcome = network.emergency_stop(
@@ -91,7 +112,7 @@ def estop_all(
             remembers=remembers,
             named=named,
             deadline_s=deadline_s,
-            on_progress=lambda progress: on_progress(network.name, progress),
+            on_progress=partial(progressed, network),
         )
         # A link that is down where devices could be looked for is one to which no robot is connected.
         why = "" if outcome.report.link else "; ".join(outcome.problems)
@@ -99,7 +120,10 @@ def estop_all(
             networks.absent[network.name] = why
         return NetworkVerdict(network.name, outcome, absent=why)
 
-    verdicts = _told_once(_on_each(networks, stopped, apart=True), {*scope.only, *named})
+    try:
+        verdicts = _told_once(_on_each(networks, stopped, apart=True), {*scope.only, *named})
+    finally:
+        over.set()
     reached, unreached = _parted(networks, verdicts)
     meant = {**dict.fromkeys(known if scope.everything else scope.only), **dict.fromkeys(named)}
     return FleetVerdict(reached, epoch, tuple(meant), ignored, unreached)
@@ -165,7 +189,7 @@ def _on_each(networks: Networks, stop: Callable[[NetworkAdapter], NetworkVerdict
     """
 
     def stopped(network: NetworkAdapter) -> Stopped:
-        if not (apart and network.has_stop_link) and (why := networks.awaited(network)):
+        if not (apart and network.has_stop_link) and (why := networks.awaited(network, stops=True)):
             return not_left(network.name, lambda: network.key, why), False
         try:
             verdict = stop(network)
@@ -205,12 +229,15 @@ def _parted(networks: Networks, verdicts: Sequence[Stopped]) -> tuple[list[Netwo
     return counted, gone
 
 
-def _remembered(network: NetworkAdapter, meant: Scope) -> bool:
+def _remembered(key: Callable[[], NetworkKey], meant: Scope) -> bool:
     """Return whether this machine remembers a robot that a scope means on a network."""
     try:
-        return robots_known_at(lambda: network.key)(meant)
+        return robots_known_at(key)(meant)
     except UnreachableError:
         # The mesh of a profile that could not be joined has no name.
+        return False
+    except Exception as exc:  # noqa: BLE001 - the other networks are known all the same
+        logger.critical("A roster cannot be read, so none of its robots counts as known: %s", exc)
         return False
 
 

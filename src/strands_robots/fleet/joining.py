@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections.abc import Callable
 
 from strands_robots.errors import UnreachableError
-from strands_robots.fleet.adapter import NetworkAdapter
+from strands_robots.fleet.adapter import NetworkAdapter, NetworkBusyError
 from strands_robots.utils import plain_text
 
 logger = logging.getLogger(__name__)
@@ -44,8 +45,9 @@ class Joining:
         self.attempted = threading.Event()
         self.why = ""
         self.unexpected: BaseException | None = None
+        self._busy_since: float | None = None
         self._again, self._changed, self._before = again, changed, before
-        self._lock = threading.Lock()
+        self._lock, self._insisting = threading.Lock(), threading.Lock()
         self._closing, self.over = threading.Event(), threading.Event()
         self._begun = self._up = False
 
@@ -69,6 +71,14 @@ class Joining:
             logger.debug("%s is joined on the thread of its caller.", self.network.name)
             self._again = False
         self._run()
+
+    def insist(self, seconds: float) -> None:
+        """Try a busy network again: at least once, and for so long since it was found busy."""
+        with self._insisting:
+            while (since := self._busy_since) is not None and not self._again and not self._closing.is_set():
+                self._attempt()
+                if time.monotonic() >= since + seconds:
+                    return
 
     def close(self) -> None:
         """Leave the network; one that is being joined is left once it is."""
@@ -99,6 +109,7 @@ class Joining:
             self.network.open()
         except UnreachableError as exc:
             self.why = exc.why or "it gave no reason"
+            self._busy_since = (self._busy_since or time.monotonic()) if isinstance(exc, NetworkBusyError) else None
         except (KeyboardInterrupt, SystemExit) as exc:
             self.why = type(exc).__name__
             raise
@@ -108,7 +119,7 @@ class Joining:
                 logger.exception("%s cannot be joined.", self.network.name)
             self.unexpected, self.why = exc, plain_text(f"{type(exc).__name__}: {exc}")
         else:
-            self.why, self.unexpected = "", None
+            self.why, self.unexpected, self._busy_since = "", None, None
             with self._lock:
                 self._up = not self._closing.is_set()
             if not self._up:

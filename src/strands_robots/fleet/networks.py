@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+BUSY_S = 3.0
+"""Seconds in which a stop tries to join a network that takes connections and does not answer."""
+
 SHARED_IDS_MAX = 1024
 """Ids on several networks of which the decided network is remembered."""
 
@@ -179,16 +182,19 @@ class Networks:
             raise UnreachableError(self.absences or CLOSED)
         return joined
 
-    def awaited(self, network: NetworkAdapter) -> str:
+    def awaited(self, network: NetworkAdapter, *, stops: bool = False) -> str:
         """Wait for the first attempt to join; return why it is not joined, or "".
 
-        The attempt is made here where none was begun.
+        The attempt is made here where none was begun. For a stop, a network that is busy is tried again: on a loaded
+        machine it may answer late.
         """
         joining = next((each for each in self._attempts() if each.network is network), None)
         if joining is None:
             return CLOSED
         joining.begin(here=not self._stays)
         joining.attempted.wait()
+        if stops:
+            joining.insist(BUSY_S)
         return "" if joining.up else joining.why or CLOSED
 
     @property
@@ -560,7 +566,7 @@ class Networks:
         def stopped(network: NetworkAdapter) -> Envelope | None:
             try:
                 # Each stop leaves as soon as its network is up.
-                if not self.awaited(network):
+                if not self.awaited(network, stops=True):
                     return network.stop(robot, timeout, robot_name, insist=insist)
             except Exception as exc:  # noqa: BLE001 - a stop that fails is a verdict, whatever it raised
                 return _failed(exc)

@@ -29,11 +29,11 @@ class SharedId:
 
     A robot that is served on both networks signs on both with the key of its machine. A decision counts for
     :data:`DECIDED_S` seconds, unless a session ends or robots are looked for again. A robot that falls silent on one
-    network stays the robot of its key.
+    network stays the robot of the key that it showed on all of them.
 
     Attributes:
         decided: the network of the last decision; None without one.
-        key: the key that signed on all of its networks, so that they have one robot; None where they do not.
+        key: the key that signed on all networks, so that they have one robot; None for several, or before that.
     """
 
     def __init__(self) -> None:
@@ -59,30 +59,24 @@ class SharedId:
             if old or asked != self._asked or self.decided not in bearers:
                 signed = side_by_side(lambda each: _signing_key(robot, each), bearers)
                 keys = {each: key for each, (there, key) in zip(bearers, signed, strict=True) if there}
-                one = None if absent else self._of_one(keys)
-                self.decided = one or _enrolled(robot, keys, set(absent.values()))
+                self.decided = self._of_one(keys, absent.values()) or _proven(robot, keys, set(absent.values()))
                 # A robot that did not answer, or not signed, is asked again.
                 self._asked, self._asked_at = (asked if self.decided is not None else ()), time.monotonic()
             return self.decided
 
-    def _of_one(self, keys: Mapping[NetworkAdapter, bytes | None]) -> NetworkAdapter | None:
-        """Return the network of a robot that one key proves; None for several robots."""
+    def _of_one(self, keys: Mapping[NetworkAdapter, bytes | None], absent: Collection[bytes]) -> NetworkAdapter | None:
+        """Return the network of the robot that one key proves; None for several."""
         shown = {*keys.values()} - {SILENT}
-        if len(keys) == 1:
-            return next(iter(keys))
-        if len(shown) == 1 and SILENT not in keys.values():
-            self.key = next(iter(shown))
+        if len(shown) == 1 < len(keys) and SILENT not in keys.values():
+            (self.key,) = shown
         elif shown - {self.key}:
             self.key = None
-        return next((each for each, key in keys.items() if key and key == self.key), None)
+        known = None if absent and self.key not in absent else self.key
+        return next((each for each, key in keys.items() if known is not None and key == known), None)
 
 
 def decided(
-    shared_id: SharedId,
-    robot: str,
-    verb: str,
-    bearers: Sequence[NetworkAdapter],
-    absent: Mapping[str, bytes] = MappingProxyType({}),
+    shared_id: SharedId, robot: str, verb: str, bearers: Sequence[NetworkAdapter], absent: Mapping[str, bytes]
 ) -> NetworkAdapter:
     """Return the network that a motion goes to.
 
@@ -103,16 +97,18 @@ def decided(
     return network
 
 
-def _enrolled(
+def _proven(
     robot: str, keys: Mapping[NetworkAdapter, bytes | None], absent: Collection[bytes]
 ) -> NetworkAdapter | None:
-    """Return the network whose robot signs with an enrolled key.
+    """Return the network whose robot's key proves it.
 
     Args:
         robot: the id.
         keys: that signed the answer on each network that has the robot, the one to prefer first.
         absent: keys that are enrolled on networks which are not joined.
     """
+    if len(keys) == 1 and not absent:
+        return next(iter(keys))
     enrolled = [each for each, key in keys.items() if key and key in {each.enrolled_key(robot), *absent}]
     return enrolled[0] if enrolled and len({keys[each] for each in enrolled}) == 1 else None
 
@@ -120,7 +116,7 @@ def _enrolled(
 def _signing_key(robot: str, network: NetworkAdapter) -> tuple[bool, bytes | None]:
     """Return whether the robot is there, and the key that signs a fresh answer.
 
-    The key is None for none, and :data:`SILENT` without an answer.
+    It is :data:`SILENT` where none comes.
     """
     nonce = secrets.token_hex(16)
     try:

@@ -13,7 +13,8 @@ from strands_robots import settings
 from strands_robots._mesh_switch import mesh_env_request
 from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH, NetworkAdapter
 from strands_robots.fleet.link_flags import LinkFlags
-from strands_robots.fleet.mesh.local import LocalMesh, local_key, no_hub
+from strands_robots.fleet.mesh.discovery import no_hub
+from strands_robots.fleet.mesh.local import LocalMesh, local_key
 from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.profiles import FleetProfile
 from strands_robots.safety.network_key import NetworkKey

@@ -82,7 +82,7 @@ class WatchedRobots:
         self._robots = {name: last for name, last in self._robots.items() if now - self.seen_at(last) < GONE_S}
 
     def poll(self, network: NetworkAdapter) -> None:
-        """Poll the robots of a joined network on a thread until :meth:`close`."""
+        """Poll the robots of a network on a thread, until :meth:`close`."""
         threading.Thread(target=self._poll, args=(network,), name="watched robots", daemon=True).start()
 
     def close(self) -> None:

@@ -15,7 +15,7 @@ from typing import Any
 from strands_robots.mesh import console_keys, session, topics, wire
 from strands_robots.mesh.context import Context
 from strands_robots.mesh.older_peers import ASK_AGAIN_S, COMMANDS_S
-from strands_robots.mesh.registry import attribute
+from strands_robots.mesh.registry import Attribution, attribute
 from strands_robots.mesh.security import validate_command
 from strands_robots.mesh.transport import Sample, TransportError
 from strands_robots.safety.sightings import sightings
@@ -247,6 +247,10 @@ class Requester:
         if turn is None:
             return
         why = self._hijack_reason(sample, reply, turn)
+        if why == Attribution.UNKNOWN.value and turn.command and kind_of_action(turn.command) is Kind.STOP:
+            # A stop leaves before peers are known, so that its first answer may come before the peer's presence.
+            logger.debug("An answer of %s, which is not known yet, does not count.", shown(reply.responder_id))
+            return
         if why is not None:
             logger.warning("A reply in the name of %s was refused: %s.", shown(reply.responder_id), why)
             context.audit("response_hijack_rejected", reply.responder_id, turn_id=reply.turn_id, reason=why)

@@ -146,7 +146,7 @@ def test_network_without_a_robot_spoils_no_verdict(cell: Any, network: str) -> N
     environment = cell.machine.environment
     environment["STRANDS_MESH_PORT"] = cell.settings["STRANDS_MESH_PORT"] = environment["STRANDS_DC_PORT"]
     arms = cell.serve_arms("arm-1", networks=[network])
-    page = cell.open(cell.serve_page(), robots=1)
+    page = cell.open(cell.serve_page("--mesh"), robots=1)
     eventually(lambda: page.evaluate(LINKS) == ["dc", "mesh"], 30.0, "both networks")
     arms.ask("move")
     page.keyboard.press("Space")
@@ -179,19 +179,30 @@ def test_page_starts_without_its_broker_and_a_press_leaves_there_once_it_comes(c
 def test_robots_of_the_roster_on_a_network_that_is_gone_are_named_by_a_stop(cell: Any) -> None:
     server = cell.stack.enter_context(NatsServer())
     cell.link = LinkConfig(transport="nats", connect=(server.url,))
-    cell.serve_arms("arm-1")
-    cell.serve_arms("sim-1", networks=[MESH])
+    arms, sim = cell.serve_arms("arm-1"), cell.serve_arms("sim-1", networks=[MESH])
     before = cell.serve_page("--nats", server.url)
     cell.open(before, robots=2)
     before.close()
     server.kill()
     page = cell.open(cell.serve_page("--nats", server.url), robots=1)
     page.locator("#missing").wait_for(timeout=60_000)
+    arms.ask("move")
     page.keyboard.press("Space")
     answer(page, "sim-1", "stopped", "mesh")
-    assert "the stop did not leave" in str(answer(page, "arm-1", "silent").get_attribute("title"))
-    page.locator("#stop-said", has_text="It did not leave on device_connect").wait_for(timeout=30_000)
+    answer(page, "arm-1", "silent")
+    page.locator("#alarm", has_text="DEVICE CONNECT DOES NOT ANSWER").wait_for(timeout=30_000)
+    assert "nothing listens there" in page.locator("#alarm").inner_text()
     picture(page, "stop-without-device-connect")
+    server.start()
+    answer(page, "arm-1", "stopped")
+    eventually(lambda: not moving(arms), what="the arm stands")
+    sim.kill()
+    page = cell.open(cell.serve_page("--nats", server.url), robots=1)
+    page.keyboard.press("Space")
+    answer(page, "arm-1", "stopped")
+    assert "the stop did not leave: no mesh answers" in answer(page, "sim-1", "silent", "mesh").get_attribute("title")
+    page.locator("#stop-said", has_text="mesh: It did not leave on mesh").wait_for(timeout=30_000)
+    picture(page, "stop-without-the-mesh")
 
 
 def test_mesh_that_comes_later_is_shown_and_the_page_is_not_its_hub(cell: Any) -> None:

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import math
+import socket
 import time
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
+
+from strands_robots import settings
 
 if TYPE_CHECKING:
     from strands_robots.mesh import Mesh
 
 LOOK_S = 0.05
+
+CONNECT_S = 0.2
+"""Seconds in which the hub takes a connection."""
 
 CALLER = "tool"
 """Type of a peer of ours that calls robots and has none."""
@@ -86,3 +92,12 @@ def is_in_reach(mesh: Mesh, peer: str) -> bool:
     """Return whether a peer is in reach."""
     row = mesh.get_peer(peer)
     return row is not None and bool(row["reachable"])
+
+
+def no_hub() -> str:
+    """Return why this machine has no mesh, or "" where it may have one."""
+    port = settings.integer("STRANDS_MESH_PORT")
+    # Not by create_connection, which loads the tables of international names.
+    with socket.socket() as probe:
+        probe.settimeout(CONNECT_S)
+        return f"no mesh answers on 127.0.0.1:{port}" if probe.connect_ex(("127.0.0.1", port)) else ""

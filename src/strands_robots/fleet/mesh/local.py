@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import json
-import socket
+import time
 from typing import TYPE_CHECKING, Any
 
 from strands_robots import settings
 from strands_robots.errors import UnreachableError
-from strands_robots.fleet.adapter import MESH
+from strands_robots.fleet.adapter import MESH, NetworkBusyError
+from strands_robots.fleet.mesh.discovery import no_hub
 from strands_robots.safety import network_key
 from strands_robots.safety.network_key import NetworkKey
 
 if TYPE_CHECKING:
     from strands_robots.fleet.mesh.network import MeshNetwork
-
-CONNECT_S = 0.2
-"""Seconds in which the hub takes a connection."""
 
 ANSWER_S = 0.3
 """Seconds in which it answers."""
@@ -32,7 +30,7 @@ class LocalMesh:
 
     Args:
         source: the first part of this peer's id.
-        console: as :class:`MeshNetwork` has it.
+        console: it is a safety controller, whose id is ``source``.
     """
 
     name = MESH
@@ -46,9 +44,11 @@ class LocalMesh:
     def open(self) -> None:
         """Join; raise :class:`UnreachableError` where the mesh has no peer."""
         if self._found is None:
-            # A port with certificates is none of Device Connect's.
-            if why := no_hub() or ("" if settings.raw("STRANDS_MESH_TLS_CA") else no_peers()):
+            if why := no_hub():
                 raise UnreachableError(why)
+            # A port with certificates is none of Device Connect's.
+            if why := "" if settings.raw("STRANDS_MESH_TLS_CA") else no_peers():
+                raise NetworkBusyError(why) if why == _hangs() else UnreachableError(why)
             from strands_robots.fleet.mesh.network import MeshNetwork  # noqa: PLC0415 - loaded when it is used
 
             self._found = MeshNetwork(self._source, console=self._console)
@@ -75,15 +75,6 @@ def local_key() -> NetworkKey:
     return NetworkKey.of(network_key.MESH, [f"tcp/127.0.0.1:{settings.integer('STRANDS_MESH_PORT')}"])
 
 
-def no_hub() -> str:
-    """Return why this machine has no mesh, or "" where it may have one."""
-    port = settings.integer("STRANDS_MESH_PORT")
-    # Not by create_connection, which loads the tables of international names.
-    with socket.socket() as probe:
-        probe.settimeout(CONNECT_S)
-        return f"no mesh answers on 127.0.0.1:{port}" if probe.connect_ex(("127.0.0.1", port)) else ""
-
-
 def no_peers() -> str:
     """Return why no peer of the mesh is reached by its port on this machine, or "".
 
@@ -102,9 +93,16 @@ def no_peers() -> str:
     try:
         with zenoh.open(zenoh.Config.from_json5(json.dumps(config))) as session:
             publisher = session.declare_publisher(BROADCAST)
+            asked = time.monotonic()
             # The hub answers in order: before it answers this question it has named the subscribers.
             list(session.liveliness().get(BROADCAST, timeout=ANSWER_S))
             # The stub has it as a bool.
-            return "" if publisher.matching_status.matching else absent  # type: ignore[attr-defined]
+            if publisher.matching_status.matching:  # type: ignore[attr-defined]
+                return ""
+            return absent if time.monotonic() - asked < ANSWER_S else _hangs()
     except zenoh.ZError:
-        return absent
+        return _hangs()
+
+
+def _hangs() -> str:
+    return f"127.0.0.1:{settings.integer('STRANDS_MESH_PORT')} takes connections, and no mesh answers there in time"

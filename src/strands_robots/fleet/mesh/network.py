@@ -22,11 +22,21 @@ from strands_robots.errors import (
     UnknownVerbError,
     UnreachableError,
 )
-from strands_robots.fleet.adapter import CLOSED, FIND_S, MESH, STOP_S, Detail, FoundRobot, OnEvent, ReceivedCall
+from strands_robots.fleet.adapter import (
+    CLOSED,
+    FIND_S,
+    MESH,
+    STOP_S,
+    Detail,
+    FoundRobot,
+    NetworkBusyError,
+    OnEvent,
+    ReceivedCall,
+)
 from strands_robots.fleet.lockout_report import LockoutReport, Resumed
 from strands_robots.fleet.mesh.controller import MeshController
 from strands_robots.fleet.mesh.descriptions import functions_of, functions_of_each, functions_of_kind
-from strands_robots.fleet.mesh.discovery import CALLER, awaited, discover, has_robot, in_reach, is_in_reach
+from strands_robots.fleet.mesh.discovery import CALLER, awaited, discover, has_robot, in_reach, is_in_reach, no_hub
 from strands_robots.fleet.mesh.events import follow
 from strands_robots.fleet.mesh.lockouts import ask_peers, lockable_peers, resume_peers
 from strands_robots.fleet.mesh.requests import PeerRequests
@@ -114,6 +124,7 @@ class MeshNetwork:
         from strands_robots.mesh import session  # noqa: PLC0415 - the network is loaded when it is used
         from strands_robots.mesh.core import Mesh, Parts  # noqa: PLC0415 - as above
         from strands_robots.mesh.transport import TransportError  # noqa: PLC0415 - as above
+        from strands_robots.mesh.transport.zenoh_config import stated_endpoints  # noqa: PLC0415 - as above
         from strands_robots.mesh.wire_identity import IdentityError, visitor_id  # noqa: PLC0415 - as above
 
         try:
@@ -125,7 +136,8 @@ class MeshNetwork:
                 mesh.close()
                 raise
         except (TransportError, IdentityError, MissingExtraError, ValueError) as exc:
-            raise UnreachableError(plain_text(str(exc))) from exc
+            busy = isinstance(exc, TransportError) and not any(stated_endpoints()) and not no_hub()
+            raise (NetworkBusyError if busy else UnreachableError)(plain_text(str(exc))) from exc
         return mesh
 
     @property
