@@ -353,7 +353,7 @@ async def pages() -> Row:
     name, model = "r" * 120, 'a "model" ' * 6
     ids = [f"{name}{number:03}" for number in range(ROBOTS)]
     found = {each: (FoundRobot(each, "strands_robot" * 3, model, status="available"), None) for each in ids}
-    networks: Any = SimpleNamespace(find=lambda: found, announced=tuple)
+    networks: Any = SimpleNamespace(find=lambda: found, announced=tuple, missing={})
     access = ClientAccess(Caller(networks), approves=False, show_picture=lambda jpeg: "")
     standing = StandingController("bench", networks)
     server = build(lambda context: access, RobotResources(networks), Approvals(), standing)

@@ -169,6 +169,17 @@ async def test_motion_of_an_id_on_two_networks_goes_to_neither_and_its_stop_to_b
     assert "arm-1 on mesh" in text_of(stopped)
 
 
+async def test_stop_names_the_network_that_is_not_reached() -> None:
+    near = FakeNetwork()
+    near.unreachable = "no broker"
+    with Networks([near], stays=True) as networks:
+        client = Caller(networks)
+        for answer in (await client.stop("arm-1"), await client.stop(""), await client.emergency_stop("test")):
+            assert is_error(answer), answer
+            assert answer["stopped"] is not True
+            assert "no broker" in text_of(answer)
+
+
 @pytest.mark.parametrize(
     "published, bound",
     [

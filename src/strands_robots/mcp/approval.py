@@ -31,7 +31,9 @@ from mcp.types import (
 from pydantic import BaseModel, Field
 
 from strands_robots.envelope import Envelope, error, is_error
+from strands_robots.errors import ApprovalError
 from strands_robots.fleet.adapter import ReceivedCall
+from strands_robots.fleet.refusals import refusal_of
 from strands_robots.mcp.access import ClientAccess
 from strands_robots.mcp.caller import Caller
 from strands_robots.mcp.results import jpeg_of, result
@@ -104,7 +106,8 @@ class Approvals:
         if answered is not None:
             return result(await self._granted(access, wish) if answered else _declined(robot, verb))
         answer = await wish.run()
-        if not (is_error(answer) and _unapproved(answer, robot, await access.caller.received(robot, verb, wish.sent))):
+        refused = is_error(answer) and isinstance(refusal_of(robot, verb, answer), ApprovalError)
+        if not refused or not _unapproved(answer, robot, await access.caller.received(robot, verb, wish.sent)):
             return result(answer)
         question, encoded = await _question(access, robot, verb, params)
         image = [ImageContent(type="image", data=encoded, mime_type="image/jpeg")] if encoded else []
@@ -161,7 +164,7 @@ class Approvals:
 def _unapproved(answer: Envelope, robot: str, received: ReceivedCall) -> bool:
     """Return whether a motion was refused for lack of its operator's approval."""
     # A network may put the robot's id before it.
-    return is_error(answer) and str(answer.get("reason", "")).endswith(Approval.refusal(received.verb, robot))
+    return str(answer.get("reason", "")).endswith(Approval.refusal(received.verb, robot))
 
 
 async def _approved(context: Context[Any, Any], message: str) -> bool:

@@ -31,7 +31,7 @@ from strands_robots.mcp.approval import Approvals
 from strands_robots.mcp.caller import Caller
 from strands_robots.mcp.connections import CONNECTION, IDLE_S, BoundedServer, Capacity, Connections, listener
 from strands_robots.mcp.resources import RobotResources
-from strands_robots.mcp.server import GONE, MESSAGE_MAX, STOPS, build
+from strands_robots.mcp.server import GONE, MESSAGE_MAX, STOPS, THREADS, build
 from strands_robots.mcp.sessions import Sessions
 from strands_robots.mcp.standing import StandingController
 from strands_robots.mcp.tokens import Token, TokenFile
@@ -354,6 +354,7 @@ async def serve_http(
         ws="none",
     )
     loop = asyncio.get_running_loop()
+    loop.set_default_executor(ThreadPoolExecutor(THREADS, "mcp-search"))
     leaving: list[asyncio.Future[None]] = []
 
     def leave() -> None:

@@ -63,7 +63,8 @@ def add_reads(server: MCPServer[Any], access: AccessOf, standing: StandingContro
         context: Context[Any, Any], start: Annotated[Count, Field(description="next_start of a page")] = 0
     ) -> Result:
         """List the robots on the network, in pages: id, type, model, availability."""
-        found = await asyncio.to_thread(access(context).caller.networks.find)
+        networks = access(context).caller.networks
+        found = await asyncio.to_thread(networks.find)
         # A world stands for its robots.
         rows = [row(each) for _, (each, _) in sorted(found.items()) if not each.world]
         page = list[dict[str, str]]()
@@ -73,7 +74,8 @@ def add_reads(server: MCPServer[Any], access: AccessOf, standing: StandingContro
             page.append(each)
         end = start + len(page)
         more = {"next_start": end} if end < len(rows) else {}
-        return result(success(f"{len(page)} of {len(rows)} robots.", robots=page, total=len(rows), **more))
+        absent = {"absent": networks.missing} if networks.missing else {}
+        return result(success(f"{len(page)} of {len(rows)} robots.", robots=page, total=len(rows), **more, **absent))
 
     @server.tool(annotations=READ)
     async def describe_robot(context: Context[Any, Any], robot: Robot) -> Result:
