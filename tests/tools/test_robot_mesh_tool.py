@@ -384,6 +384,14 @@ class TestOfBothNetworks:
         rows = {row["id"]: row["network"] for row in robot_mesh(action="peers")["peers"]}
         assert rows == {"arm-1": "device_connect", "arm-2": "mesh", "both": "device_connect"}
 
+    def test_network_that_is_not_reached_is_named_beside_the_robots_of_the_other(self, far: ScriptedNetwork) -> None:
+        far.unreachable = "the cable is cut"
+        peers = robot_mesh(action="peers")
+        assert [row["id"] for row in peers["peers"]] == ["arm-1", "both"]
+        assert peers["absent"] == {"mesh": "the cable is cut"}
+        for answer in (peers, robot_mesh(action="call", target="arm-9", verb="brewCoffee")):
+            assert "Not reached: mesh, the cable is cut." in answer["content"][0]["text"]
+
     def test_robot_is_asked_and_moved_by_the_words_of_its_network(
         self, near: ScriptedNetwork, far: ScriptedNetwork
     ) -> None:

@@ -19,11 +19,10 @@ from typing import Any
 from strands_robots import settings
 from strands_robots.agent_tool import fitted, tool
 from strands_robots.envelope import Envelope, error, is_error, success, text_of
-from strands_robots.errors import RefusalError, StrandsRobotsError
+from strands_robots.errors import NoSuchRobotError, RefusalError, StrandsRobotsError
 from strands_robots.fleet.adapter import STOP_S, FoundRobot
 from strands_robots.fleet.all_stops import answer_of, estop_all, stop_all
 from strands_robots.fleet.callers import TOOL
-from strands_robots.fleet.fleet_verdict import FleetVerdict
 from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.profiles import profile_for
 from strands_robots.fleet.refusals import said
@@ -135,9 +134,17 @@ def _peers(there: Networks) -> Envelope:
         with suppress(RefusalError):
             functions |= network.describe_each([name for name, (_, its) in found.items() if its is network])
     rows = [_row(each, network.name, functions.get(name)) for name, (each, network) in sorted(found.items())]
-    if not rows:
-        return error(f"No robot answered. {there.stale}".strip(), peers=[])
-    return success(f"{len(rows)} robots: {', '.join(sorted(found))}. {there.stale}".strip(), peers=rows)
+    missing = there.missing
+    fields: dict[str, Any] = {"peers": rows, **({"absent": missing} if missing else {})}
+    who = f"{len(rows)} robots: {', '.join(sorted(found))}." if rows else "No robot answered."
+    told = " ".join(filter(None, [who, there.stale, _not_reached(missing)]))
+    return success(told, **fields) if rows else error(told, **fields)
+
+
+def _not_reached(missing: Mapping[str, str]) -> str:
+    """Return a sentence on the stated networks that are not there, or ""."""
+    named = "; ".join(f"{name}, {why.rstrip('.')}" for name, why in missing.items())
+    return f"Not reached: {named}." if named else ""
 
 
 def _status(there: Networks, robot: str) -> Envelope:
@@ -168,10 +175,11 @@ def _stop(target: object, arguments: object) -> dict[str, Any]:
         unread = "arguments is no object"
 
     def stopped(there: Networks) -> Envelope:
+        if not robot:
+            return answer_of(stop_all(there), there)
         return combined_verdict(by_bearer(robot, there.stop(robot, STOP_S, of_world.get("robot_name", ""))))
 
-    answer = _answer(stopped, stops=True) if robot else _all_stopped(stop_all)
-    return noted(answer, unknown, unread)
+    return noted(_answer(stopped, stops=True), unknown, unread)
 
 
 def _emergency_stop(instruction: object, arguments: object) -> dict[str, Any]:
@@ -182,14 +190,8 @@ def _emergency_stop(instruction: object, arguments: object) -> dict[str, Any]:
     unknown = unknown_arguments(len(given.keys() - {"only", "cell"}))
     if arguments and not given:
         unread = "arguments is no object"
-    answer = _all_stopped(lambda there: estop_all(there, why, scope=scope))
+    answer = _answer(lambda there: answer_of(estop_all(there, why, scope=scope), there), stops=True)
     return noted(answer, cut, unread, unknown)
-
-
-def _all_stopped(stop: Callable[[Networks], FleetVerdict]) -> Envelope:
-    """Return the answer to a stop of all; it names the robots of gone networks."""
-
-    return _answer(lambda there: answer_of(stop(there), there), stops=True)
 
 
 def _asked(work: Callable[[Networks], Envelope]) -> Envelope:
@@ -197,7 +199,10 @@ def _asked(work: Callable[[Networks], Envelope]) -> Envelope:
 
     def joined(there: Networks) -> Envelope:
         there.open()
-        return work(there)
+        try:
+            return work(there)
+        except NoSuchRobotError as refusal:
+            return error(f"{said(refusal)} {_not_reached(there.missing)}".rstrip())
 
     return _answer(joined, stops=False)
 
