@@ -236,7 +236,7 @@ class FleetSafety:
         for peer in not_stopped:
             logger.critical("%s did NOT stop on emergency stop %s.", peer, order.epoch)
         for peer in silent:
-            logger.critical("%s did not answer emergency stop %s.", peer, order.epoch)
+            logger.critical("%s did not answer emergency stop %s on the mesh.", peer, order.epoch)
         counts = {
             "responses_received": len(responses),
             "peers_not_stopped": len(not_stopped),

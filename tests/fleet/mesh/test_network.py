@@ -197,3 +197,24 @@ def test_stop_leaves_before_the_robot_is_known() -> None:
     answer = joined(mesh).stop("arm-1", 1.0)
     assert answer is not None and answer["stopped"] is True
     assert [command for _, command, _ in mesh.sent] == [{"action": "stop"}]
+
+
+def test_programs_without_a_robot_are_none_of_a_stop_unless_they_say_that_something_moves() -> None:
+    def broadcast(command: dict[str, Any], seconds: float) -> list[dict[str, Any]]:
+        stopped = {"desk": True, "robot-mesh-tool": True, "odd-tool": False, "arm-1": True}
+        return [
+            {
+                "responder_id": name,
+                "type": "response",
+                "result": {"status": "success" if still else "error", "stopped": still},
+            }
+            for name, still in stopped.items()
+        ]
+
+    caller = {"reachable": True, "age": 0.1}
+    types = {"desk": "controller", "robot-mesh-tool": "tool", "odd-tool": "tool"}
+    mesh = FakeMesh([row("arm-1"), *({"peer_id": name, "type": kind, **caller} for name, kind in types.items())], done)
+    mesh.broadcast = broadcast  # type: ignore[attr-defined]
+    answers, outcome = joined(mesh).stop_all()
+    assert {name: said["stopped"] for name, said in answers.items()} == {"arm-1": True, "odd-tool": False}
+    assert not {"desk", "robot-mesh-tool"} & {row.name for row in outcome.roster.rows}

@@ -12,8 +12,8 @@ if TYPE_CHECKING:
 
 LOOK_S = 0.05
 
-CALLER = "tool"
-"""Type of a peer of ours that calls robots and has none."""
+CALLER, CONSOLE = "tool", "controller"
+"""Types of peers of ours that call robots, or stop them, and have none."""
 
 
 def has_robot(row: Mapping[str, Any]) -> bool:
@@ -21,12 +21,14 @@ def has_robot(row: Mapping[str, Any]) -> bool:
     return "locked" in row or "tool_name" in row or "robot_kind" in row
 
 
-def must_answer(mesh: Mesh) -> list[str]:
-    """Return the peers in reach that have to answer a stop.
+def only_calls(row: Mapping[str, Any]) -> bool:
+    """Return whether a peer is a program that has no robot; such ones come and go."""
+    return row.get("type") in (CALLER, CONSOLE) and not has_robot(row)
 
-    Programs that only call robots come and go meanwhile.
-    """
-    return [row["peer_id"] for row in mesh.peers if row["reachable"] and (row.get("type") != CALLER or has_robot(row))]
+
+def must_answer(mesh: Mesh) -> list[str]:
+    """Return the peers in reach that have to answer a stop."""
+    return [row["peer_id"] for row in mesh.peers if row["reachable"] and not only_calls(row)]
 
 
 def in_reach(mesh: Mesh) -> list[str]:

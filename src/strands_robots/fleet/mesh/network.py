@@ -36,7 +36,7 @@ from strands_robots.fleet.adapter import (
 from strands_robots.fleet.lockout_report import LockoutReport, Resumed
 from strands_robots.fleet.mesh.controller import MeshController
 from strands_robots.fleet.mesh.descriptions import functions_of, functions_of_each, functions_of_kind
-from strands_robots.fleet.mesh.discovery import CALLER, awaited, discover, has_robot, in_reach, is_in_reach
+from strands_robots.fleet.mesh.discovery import CALLER, CONSOLE, awaited, discover, has_robot, in_reach, is_in_reach
 from strands_robots.fleet.mesh.events import follow
 from strands_robots.fleet.mesh.lockouts import ask_peers, lockable_peers, resume_peers
 from strands_robots.fleet.mesh.requests import PeerRequests
@@ -128,7 +128,7 @@ class MeshNetwork:
         from strands_robots.mesh.wire_identity import IdentityError, visitor_id  # noqa: PLC0415 - as above
 
         try:
-            name, kind = (self._source, "controller") if self._console else (visitor_id(self._source), CALLER)
+            name, kind = (self._source, CONSOLE) if self._console else (visitor_id(self._source), CALLER)
             mesh = Mesh(None, name, kind, parts=Parts(acquire=session.dial))
             try:
                 mesh.start()

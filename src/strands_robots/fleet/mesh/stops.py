@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection, Mapping
 from typing import TYPE_CHECKING, Any
 
 from strands_robots.envelope import Envelope, error, success
-from strands_robots.fleet.mesh.discovery import discover, must_answer
+from strands_robots.fleet.mesh.discovery import discover, must_answer, only_calls
 from strands_robots.fleet.mesh.standing import MeshReports, mesh_network
 from strands_robots.fleet.stop_answers import measured, unanswered
 from strands_robots.safety.orders import new_epoch
@@ -187,7 +187,10 @@ def _stop_all(
     reading.join(READ_WITHIN_S)
     keys.append(None)  # not read in time: no answer counts as proven
     roster.find(dict.fromkeys(seen, True), {name: next(iter(_cells(mesh, name)), "") for name in seen})
-    return {name: unanswered(name) for name in seen} | graded()
+    callers = {row["peer_id"] for row in mesh.peers if only_calls(row)}
+    # A program without a robot has nothing to stop; one that says that something moves is heard all the same.
+    robots = {name: said for name, said in graded().items() if name not in callers or said.get("stopped") is False}
+    return {name: unanswered(name) for name in seen} | robots
 
 
 def _cells(mesh: Mesh, peer: str) -> frozenset[str]:
