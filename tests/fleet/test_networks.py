@@ -658,7 +658,7 @@ class TestStopLink:
             return replace(outcome, report=report, problems=("the broker is gone",))
 
         monkeypatch.setattr(far, "emergency_stop", unsent)
-        networks = Networks([near, far])
+        networks = Networks([near, far], unasked={MESH})
         verdict = estop_all(networks, "test")
         assert verdict.ok
         assert [each.network for each in verdict.unreached] == [MESH]

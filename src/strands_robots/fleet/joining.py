@@ -73,7 +73,7 @@ class Joining:
         self._run()
 
     def insist(self, seconds: float) -> None:
-        """Try a busy network again: at least once, and for so long since it was found busy."""
+        """Try a busy network again, until so many seconds after it was found busy."""
         with self._insisting:
             while (since := self._busy_since) is not None and not self._again and not self._closing.is_set():
                 self._attempt()

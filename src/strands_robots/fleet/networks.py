@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar
 from strands_robots.envelope import Envelope, error
 from strands_robots.errors import NoSuchRobotError, RefusalError, UnreachableError
 from strands_robots.fleet.adapter import FIND_S, STOP_S, Detail, FoundRobot, NetworkAdapter, OnEvent
+from strands_robots.fleet.bearers import bears, reaches
 from strands_robots.fleet.joining import Joining
 from strands_robots.fleet.refusals import answered
 from strands_robots.fleet.side_by_side import on_own_thread, side_by_side, those
@@ -279,7 +280,7 @@ class Networks:
 
     def bearers(self, robot: str) -> list[NetworkAdapter]:
         """Return the networks on which a robot of this id is known; asks no one."""
-        return [each for each in self.joined if _bears(each, robot)]
+        return [each for each in self.joined if bears(each, robot)]
 
     def of(self, robot: str, verb: str = "", *, moves: bool = False) -> NetworkAdapter:
         """Return the network on which a robot is called.
@@ -300,7 +301,7 @@ class Networks:
             return network
         bearers = self.bearers(robot)
         if len(bearers) < len(joined):
-            bearers = those(lambda each: _reaches(each, robot), joined, every=moves)
+            bearers = those(lambda each: reaches(each, robot), joined, every=moves)
         if not bearers:
             remedy = near(robot, {name for each in joined for name in each.announced()}).strip()
             raise NoSuchRobotError(f"No robot {robot[:100]!r} is in reach", robot=robot, verb=verb, remedy=remedy)
@@ -505,7 +506,7 @@ class Networks:
             answers |= {joinings[each].network: _result(each) for each in done}
             rest = [joinings[each] for each in pending if joinings[each].up]
             if any(map(_graded, answers.values())) and not any(
-                each.network.tells_absence or _bears(each.network, robot) for each in rest
+                each.network.tells_absence or bears(each.network, robot) for each in rest
             ):
                 break
         said = {each: None if _absent(each, robot, answer) else answer for each, answer in answers.items()}
@@ -641,14 +642,6 @@ def _by_id(listed: Sequence[tuple[NetworkAdapter, list[FoundRobot]]]) -> dict[st
     return found
 
 
-def _bears(network: NetworkAdapter, robot: str) -> bool:
-    """Return whether a network has a robot now; False for a network that was left."""
-    try:
-        return network.bears(robot)
-    except RefusalError:
-        return False
-
-
 def _meant(arguments: Mapping[str, Any]) -> tuple[str, str]:
     """Return the robot of a world that a stop means, empty for all, and a note."""
     if not arguments:
@@ -672,7 +665,7 @@ def _graded(answer: Envelope | None) -> bool:
 
 def _absent(network: NetworkAdapter, robot: str, answer: Envelope | None) -> bool:
     """Return whether no robot of this id took a stop."""
-    return answer is None or (answer.get("in_reach") is False and not _bears(network, robot))
+    return answer is None or (answer.get("in_reach") is False and not bears(network, robot))
 
 
 def _failed(exc: BaseException) -> Envelope | None:
@@ -694,11 +687,3 @@ def _tell(listener: Callable[[NetworkAdapter], None], network: NetworkAdapter) -
         listener(network)
     except Exception:
         logger.exception("A listener failed for %s.", network.name)
-
-
-def _reaches(network: NetworkAdapter, robot: str) -> bool:
-    try:
-        return network.reaches(robot)
-    except RefusalError as exc:
-        logger.debug("%s: %s cannot be looked for: %s", network.name, robot, exc)
-        return False

@@ -76,7 +76,11 @@ class SharedId:
 
 
 def decided(
-    shared_id: SharedId, robot: str, verb: str, bearers: Sequence[NetworkAdapter], absent: Mapping[str, bytes]
+    shared_id: SharedId,
+    robot: str,
+    verb: str,
+    bearers: Sequence[NetworkAdapter],
+    absent: Mapping[str, bytes] = MappingProxyType({}),
 ) -> NetworkAdapter:
     """Return the network that a motion goes to.
 

@@ -1,0 +1,27 @@
+"""Presence of a robot on a network, also on one that was left meanwhile."""
+
+from __future__ import annotations
+
+import logging
+
+from strands_robots.errors import RefusalError
+from strands_robots.fleet.adapter import NetworkAdapter
+
+logger = logging.getLogger(__name__)
+
+
+def bears(network: NetworkAdapter, robot: str) -> bool:
+    """Return whether a network has a robot now; False for a network that was left."""
+    try:
+        return network.bears(robot)
+    except RefusalError:
+        return False
+
+
+def reaches(network: NetworkAdapter, robot: str) -> bool:
+    """Return whether a robot is in reach, which may be asked."""
+    try:
+        return network.reaches(robot)
+    except RefusalError as exc:
+        logger.debug("%s: %s cannot be looked for: %s", network.name, robot, exc)
+        return False
