@@ -388,6 +388,7 @@ def test_network_without_link_and_robot_is_waited_for_by_no_stop_and_alarms_no_o
 
 def test_network_that_is_joined_without_a_press_gets_none(networked: Callable[..., Networked]) -> None:
     page = networked()
+    eventually(lambda: page.model.row("dc:arm-1"), what="the robot")
     page.stop.press_one("arm-1")
     page.comes()
     page.refreshed()

@@ -13,11 +13,11 @@ from fixtures.waiting import until
 from tests.fleet.scripted import OURS, ScriptedNetwork
 
 from strands_robots.dashboard import page_robots
-from strands_robots.dashboard.feed import FleetFeed
 from strands_robots.dashboard.feeds import Feeds
 from strands_robots.dashboard.fleet_model import FleetModel
 from strands_robots.dashboard.page_robots import PageRobot, PageRobots
 from strands_robots.envelope import error, success
+from strands_robots.errors import NoAnswerError
 from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
 from strands_robots.fleet.networks import Networks
 from strands_robots.safety.identity import ROBOTS, KeyFile, SigningIdentity
@@ -28,10 +28,10 @@ SILENT_S = 0.6
 
 
 def fed(model: FleetModel, *networks: ScriptedNetwork) -> Feeds:
-    """Return the feeds of networks that are joined."""
-    feeds = Feeds(model, Networks(networks))
-    for each in networks:
-        feeds.add(FleetFeed(model, each))
+    """Return the feeds of networks, which are joined."""
+    joined = Networks(networks)
+    feeds = Feeds(model, joined)
+    joined.begin(here=True)
     return feeds
 
 
@@ -128,6 +128,41 @@ async def test_second_row_comes_back_and_moves_the_robot_where_the_first_is_sile
     ], "a silent network is not waited for"
     one.device_connect.mute.clear()
     await until(lambda: one.shown() == [FIRST], what="one row")
+
+
+async def test_other_robot_that_takes_the_id_is_not_moved_in_the_place_of_a_silent_one(
+    one: Page, keys: list[SigningIdentity]
+) -> None:
+    one.device_connect.mute.add("both")
+    await until(lambda: one.shown() == [FIRST, SECOND], what="both rows")
+    one.device_connect.answers["getStatus"] = NoAnswerError("it did not answer")
+    one.mesh.sign_with(keys[1])
+    one.mesh.sessions += 1
+    answer = await one.robot(SECOND).call("moveTo", {"x": 1.0}, 3.0, moves=True)
+    assert answer["code"] == page_robots.AMBIGUOUS
+    assert one.moved() == []
+
+
+async def test_robot_that_is_enrolled_on_an_absent_network_is_moved_by_its_key_alone(
+    keys: list[SigningIdentity],
+) -> None:
+    near, gone = ScriptedNetwork(DEVICE_CONNECT, {"both": OURS}), ScriptedNetwork(MESH, {})
+    gone.unreachable, gone.enrolled = "no hub", {"both": keys[0].public}
+    model, networks = FleetModel(), Networks([near, gone], stays=True)
+    feeds = Feeds(model, networks)
+    robots = PageRobots(model, feeds)
+    try:
+        feeds.begin()
+        await until(lambda: feeds.get("dc") and model.row(FIRST), what="its row")
+        near.sign_with(keys[1])
+        refused = await robots.of(FIRST).call("moveTo", {"x": 1.0}, 3.0, moves=True)
+        assert "it is enrolled on mesh, which is not joined" in refused["reason"]
+        near.sign_with(keys[0])
+        assert (await robots.of(FIRST).call("moveTo", {"x": 1.0}, 3.0, moves=True))["status"] == "success"
+    finally:
+        robots.close()
+        feeds.close()
+        networks.close()
 
 
 async def test_robot_that_is_silent_on_both_networks_keeps_one_row(one: Page) -> None:

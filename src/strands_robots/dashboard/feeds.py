@@ -39,12 +39,13 @@ class Feeds:
         signing_key: signs emergency stops; then only enrolled robots can confirm one.
 
     Attributes:
+        networks: as given.
         buttons: of the networks on which a stop can leave.
         senders: of emergency stops, by network.
     """
 
     def __init__(self, model: FleetModel, networks: Networks, signing_key: Any = None) -> None:
-        self._model, self._networks, self._signing_key = model, networks, signing_key
+        self._model, self.networks, self._signing_key = model, networks, signing_key
         self.buttons = StopButtons(REASON)
         self.senders: Mapping[str, StopSender] = {}
         self._feeds: Mapping[str, FleetFeed] = {}
@@ -54,11 +55,11 @@ class Feeds:
 
     def begin(self) -> None:
         """Begin to join the networks; returns at once."""
-        for each in self._networks.stated:
+        for each in self.networks.stated:
             if each.has_stop_link:
                 # A press then leaves on it before it is joined.
                 self._try(each, self._stand)
-        self._networks.begin()
+        self.networks.begin()
 
     def add(self, feed: FleetFeed) -> None:
         """Show the robots of a feed, which is closed with the others."""
@@ -67,7 +68,7 @@ class Feeds:
             if not closed:
                 # Whoever reads the old ones goes on with them.
                 feeds = {**self._feeds, feed.network: feed}
-                order = [page_name(each.name) for each in self._networks.stated]
+                order = [page_name(each.name) for each in self.networks.stated]
                 self._feeds = dict(sorted(feeds.items(), key=lambda each: (each[0] not in order, *each[:1])))
         if closed:
             feed.close()
@@ -89,8 +90,8 @@ class Feeds:
     @property
     def unsent(self) -> dict[str, Callable[[], NetworkVerdict]]:
         """Networks without a stop button, each with the verdict of a stop, once called."""
-        absences = {**self._networks.absent, **self._failed}
-        keys = self._networks.keys | {each.name: partial(_key, each) for each in self._networks.stated}
+        absences = {**self.networks.absent, **self._failed}
+        keys = self.networks.keys | {each.name: partial(_key, each) for each in self.networks.stated}
         without = {page_name(name): (name, key) for name, key in keys.items() if page_name(name) not in self.senders}
         return {
             page: partial(not_left, name, key, absences.get(name, JOINING)) for page, (name, key) in without.items()
@@ -99,7 +100,7 @@ class Feeds:
     @property
     def missing(self) -> dict[str, str]:
         """Reasons why networks that someone asked for have no feed."""
-        absences = {**self._networks.missing, **self._failed}.items()
+        absences = {**self.networks.missing, **self._failed}.items()
         return {page: why for name, why in absences if (page := page_name(name)) not in self._feeds}
 
     def close(self) -> None:

@@ -19,7 +19,8 @@ from strands_robots.dashboard.feeds import Feeds
 from strands_robots.dashboard.fleet_model import FleetModel, RobotRow, key_of
 from strands_robots.envelope import Envelope, error
 from strands_robots.errors import AmbiguousRobotError
-from strands_robots.fleet.shared_id import SharedId, decided
+from strands_robots.fleet.adapter import NetworkAdapter
+from strands_robots.fleet.shared_id import DECIDED_S, SharedId, decided
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.stopping import grade
 from strands_robots.utils import ValidationError, shown
@@ -109,18 +110,27 @@ class PageRobots:
 
     async def refusal(self, robot: PageRobot, verb: str) -> str:
         """Return why a motion is not sent to a robot, or ""."""
-        bearers = self._bearers(robot)
-        if len(bearers) < 2:
+        bearers, joining = self._bearers(robot), self._feeds.networks
+        several = len(bearers) > 1
+        if not several and len(joining.joined) == len(joining.stated):
             return ""
         proof = self._shared.setdefault(robot.id, _Shared()).proof
-        if proof.key is not None:
-            # A network on which the proven robot is silent is not waited for.
-            bearers = [each for each in bearers if each is robot.feed or self._alive(each, robot.id)]
-        networks = [each.there for each in bearers]
+        alive = [each.there for each in bearers if each is robot.feed or self._alive(each, robot.id)]
+
+        def choose() -> NetworkAdapter:
+            absent = joining.enrolled_on_absent(robot.id)
+            if not several and not absent:
+                return robot.feed.there
+            # A network on which the robot is silent is not waited for, as long as its key proves it.
+            proven = proof.key is not None and proof.decide(robot.id, alive, absent)
+            if proven and proof.key is not None:
+                return proven
+            return decided(proof, robot.id, verb, [each.there for each in bearers], absent)
+
         try:
-            network = await asyncio.to_thread(decided, proof, robot.id, verb, networks)
+            network = await asyncio.to_thread(choose)
         except AmbiguousRobotError as refused:
-            return f"{refused.why}. Give one of them another id."
+            return f"{refused.why}.{' Give one of them another id.' if several else ''}"
         if proof.key is not None or network is robot.feed.there:
             return ""
         return f"{verb} is not sent to {robot.feed.there.name}: the enrolled robot of this id is on {network.name}."
@@ -187,7 +197,7 @@ class PageRobots:
         if len(alive) < 2 or (shared.asking is not None and not shared.asking.done()):
             return
         sessions, now = [each.session(name) for each in alive], time.monotonic()
-        again = ASK_AGAIN_S if shared.proof.decided is None else float("inf")
+        again = ASK_AGAIN_S if shared.proof.decided is None else DECIDED_S
         if sessions == shared.sessions and now - shared.asked_at < again:
             return
         shared.sessions, shared.asked_at = sessions, now

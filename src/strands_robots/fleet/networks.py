@@ -321,7 +321,18 @@ class Networks:
 
     def decides(self, robot: str) -> bool:
         """Return whether a motion needs a decision which robot it is for; asks no one."""
-        return len(self.bearers(robot)) > 1 or bool(self._enrolled_on_absent(robot))
+        return len(self.bearers(robot)) > 1 or bool(self.enrolled_on_absent(robot))
+
+    def enrolled_on_absent(self, robot: str) -> dict[str, bytes]:
+        """Return the keys of an id that are enrolled on absent networks, by network."""
+        joined, keys = self.joined, dict[str, bytes]()
+        for each in self.stated:
+            if each not in joined:
+                # A mesh of this machine that is not there has none.
+                with suppress(RefusalError):
+                    if key := each.enrolled_key(robot):
+                        keys[each.name] = key
+        return keys
 
     def decided(self, robot: str) -> NetworkAdapter | None:
         """Return the network that was decided on, where it still has the robot."""
@@ -600,30 +611,19 @@ class Networks:
         """Return the network of a robot where it is known without a question."""
         joined = self.joined
         if len(joined) == 1 and all(each.attempted.is_set() for each in self._joinings):
-            return None if moves and self._enrolled_on_absent(robot) else joined[0]
+            return None if moves and self.enrolled_on_absent(robot) else joined[0]
         bearers = self.bearers(robot)
         return None if moves or not bearers else self._chosen(robot, "", bearers, moves=False)
 
     def _chosen(self, robot: str, verb: str, bearers: Sequence[NetworkAdapter], *, moves: bool) -> NetworkAdapter:
         if not moves:
             return self.decided(robot) or bearers[0]
-        absent = self._enrolled_on_absent(robot)
+        absent = self.enrolled_on_absent(robot)
         if len(bearers) == 1 and not absent:
             return bearers[0]
         from strands_robots.fleet.shared_id import decided  # noqa: PLC0415 - few ids are on two networks
 
         return decided(self._shared_id(robot), robot, verb, bearers, absent)
-
-    def _enrolled_on_absent(self, robot: str) -> dict[str, bytes]:
-        """Return the keys of an id that are enrolled on networks which are gone."""
-        joined, keys = self.joined, dict[str, bytes]()
-        for each in self.stated:
-            if each not in joined:
-                # A mesh of this machine that is not there has none.
-                with suppress(RefusalError):
-                    if key := each.enrolled_key(robot):
-                        keys[each.name] = key
-        return keys
 
     def _shared_id(self, robot: str) -> SharedId:
         from strands_robots.fleet.shared_id import SharedId  # noqa: PLC0415 - as above
