@@ -148,6 +148,26 @@ def test_stated_network_that_is_gone_fails_a_stop_though_no_robot_of_it_is_remem
             assert networks.missing == {MESH: "no route"}
 
 
+def test_network_of_this_machine_without_robots_need_not_list_them_beside_one_with_robots(
+    near: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    empty = ScriptedNetwork(MESH, {})
+    monkeypatch.setattr(ScriptedNetwork, "on_this_machine", property(lambda self: self is empty))
+    sent = empty.emergency_stop
+
+    def unlisted(*given: Any, **options: Any) -> Any:
+        return replace(sent(*given, **options), problems=("no list of them in time",))
+
+    monkeypatch.setattr(empty, "emergency_stop", unlisted)
+    with Networks([near, empty]) as networks:
+        networks.settled()
+        verdict = estop_all(networks, "test")
+        assert verdict.ok
+        assert [each.network for each in verdict.unreached] == [MESH]
+    with Networks([empty]) as networks:
+        assert not estop_all(networks, "test").ok
+
+
 def test_mesh_that_no_one_asked_for_fails_no_stop(near: ScriptedNetwork) -> None:
     far = ScriptedNetwork(MESH, {})
     far.unreachable = "no hub"

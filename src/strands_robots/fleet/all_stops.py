@@ -222,9 +222,12 @@ def _parted(networks: Networks, verdicts: Sequence[Stopped]) -> tuple[list[Netwo
     elsewhere = {each.name for each in networks.stated if networks.asks_for(each.name) and not each.on_this_machine}
     reached = any(left for _, left in verdicts)
     counted, gone = list[NetworkVerdict](), list[NetworkVerdict]()
+    populated = any(each.outcome is not None and each.outcome.size for each, _ in verdicts)
     for each, left in verdicts:
         # Of a network whose roster cannot be read it is not known whether a robot is there.
-        counts = left or not reached or each.network in elsewhere or each.outcome is None or each.outcome.size
+        counts = not reached or each.network in elsewhere or each.outcome is None or each.outcome.size
+        # Beside a network with robots, one of this machine without any need not list them in time.
+        counts = counts or (left and not populated)
         (counted if counts else gone).append(each)
     return counted, gone
 
