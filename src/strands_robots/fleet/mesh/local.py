@@ -16,7 +16,7 @@ from strands_robots.safety.network_key import NetworkKey
 if TYPE_CHECKING:
     from strands_robots.fleet.mesh.network import MeshNetwork
 
-ANSWER_S = 0.3
+ANSWER_S = 1.0
 """Seconds in which it answers."""
 
 BROADCAST = "strands/broadcast"
