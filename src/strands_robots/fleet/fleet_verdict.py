@@ -172,7 +172,9 @@ class FleetVerdict(Mapping[str, StopVerdict]):
     def __str__(self) -> str:
         said = [f"Ignored: {note}." for note in self.ignored]
         said += [f"{name} did not stop." for name, each in self._verdicts.items() if each.stopped is False]
-        said += [f"{name}: {why}." for name, each in self._verdicts.items() for why in each.unknown.values()]
+        said += [
+            f"{name}: {why.rstrip('.')}." for name, each in self._verdicts.items() for why in each.unknown.values()
+        ]
         several = len(self.reporting) > 1
         said += [f"{each.network}: {each.sentence}" if several else each.sentence for each in self.reporting]
         return " ".join(filter(None, said)) or "No robot is known."

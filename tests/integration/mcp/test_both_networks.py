@@ -198,6 +198,15 @@ def test_robot_of_no_network_is_refused_with_similar_names(agent: Agent) -> None
     assert "list_robots names those that there are." in refused["text"]
 
 
+def test_server_of_the_mesh_alone_has_no_device(site: McpSite, far: Far, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Its port is then the mesh's.
+    monkeypatch.setattr(site, "port", int(site.environment["STRANDS_MESH_PORT"]))
+    with RawServer(site, "--mesh") as server:
+        agent = Agent(server)
+        eventually(lambda: "far-1" in agent.listed, 30.0, what="the robots of the mesh")
+        assert "arm-1" not in agent.listed
+
+
 def test_mesh_that_comes_later_is_joined(site: McpSite, monkeypatch: pytest.MonkeyPatch) -> None:
     settings = {"STRANDS_MESH_PORT": str(free_port())}
     monkeypatch.setitem(site.environment, *settings.popitem())
