@@ -397,3 +397,19 @@ def test_disk_that_hangs_hides_no_verdict_of_another_network(
         assert waited == []
     finally:
         released.set()
+
+
+def test_robots_of_another_network_that_is_stopped_too_are_none_of_other_networks(
+    near: ScriptedNetwork, far: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows = {near.key: ("arm-1",), far.key: ("arm-2", "arm-3")}
+
+    def of(network: NetworkKey, *_: float) -> Roster:
+        # One more is enrolled for a third network.
+        elsewhere = 1 + sum(len(names) for key, names in rows.items() if key != network)
+        return Roster(network, tuple(RosterRow(name, Known.ENROLLED) for name in rows[network]), elsewhere=elsewhere)
+
+    monkeypatch.setattr(Roster, "of", of)
+    with Fleet([near, far]) as fleet:
+        for stop in (fleet.stop(), fleet.estop()):
+            assert [each.outcome.roster.elsewhere for each in stop.networks if each.outcome is not None] == [1, 1]

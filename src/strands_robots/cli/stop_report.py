@@ -111,9 +111,11 @@ def stop_table(rows: Mapping[str, Sequence[tuple[Any, ...]]], title: str = "", *
         timed: with the times of answers.
     """
     several = sum(map(bool, rows.values())) > 1
+    every = [(row[0], network, *row[1:]) for network, each in rows.items() for row in each]
+    # The mesh times no answer.
+    timed = timed and (not every or any(str(row[3]) for row in every))
     columns = ("robot", "network", "answer", "ms", "what it said")
     kept = [at for at, column in enumerate(columns) if (timed or column != "ms") and (several or column != "network")]
-    every = [(row[0], network, *row[1:]) for network, each in rows.items() for row in each]
     return table(title, [columns[at] for at in kept], [[row[at] for at in kept] for row in every])
 
 

@@ -6,6 +6,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Collection, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -19,7 +20,9 @@ from strands_robots.fleet.stop_answers import not_reached, roster_verdict
 from strands_robots.safety.controller import Progress
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.orders import new_epoch
+from strands_robots.safety.roster import RosterRow
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
+from strands_robots.safety.sightings import Known
 from strands_robots.safety.stop_roster import robots_known_at
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.utils import plain_text
@@ -202,7 +205,7 @@ def _on_each(networks: Networks, stop: Callable[[NetworkAdapter], NetworkVerdict
         (not_left(name, key, networks.absent.get(name, "it is not joined")), False)
         for name, key in networks.keys.items()
     ]
-    return stops
+    return _for_all(stops)
 
 
 def _told_once(verdicts: Sequence[Stopped], named: Collection[str]) -> list[Stopped]:
@@ -214,6 +217,26 @@ def _told_once(verdicts: Sequence[Stopped], named: Collection[str]) -> list[Stop
         for at in {*silent} - {*known}:
             dropped[at].add(name)
     return [(each.without(names), left) for (each, left), names in zip(verdicts, dropped, strict=True)]
+
+
+def _for_all(stops: Sequence[Stopped]) -> list[Stopped]:
+    """Return the verdicts; the stop was for the others' robots, too."""
+    outcomes = [each.outcome for each, _ in stops]
+    known = [frozenset(() if each is None else map(_sure, each.roster.rows)) - {""} for each in outcomes]
+
+    def told(place: int, each: NetworkVerdict) -> NetworkVerdict:
+        if each.outcome is None:
+            return each
+        roster, others = each.outcome.roster, frozenset[str]().union(*known[:place], *known[place + 1 :])
+        roster = replace(roster, elsewhere=max(0, roster.elsewhere - len(others)))
+        return replace(each, outcome=replace(each.outcome, roster=roster))
+
+    return [(told(place, each), left) for place, (each, left) in enumerate(stops)]
+
+
+def _sure(row: RosterRow) -> str:
+    """Return the name of a robot that is served here or enrolled, else ""."""
+    return row.name if row.processes or row.known is Known.ENROLLED else ""
 
 
 def _parted(networks: Networks, verdicts: Sequence[Stopped]) -> tuple[list[NetworkVerdict], list[NetworkVerdict]]:

@@ -13,6 +13,8 @@ from typing import ClassVar
 
 from strands_robots import settings
 from strands_robots.errors import UnreachableError
+from strands_robots.safety import network_key
+from strands_robots.safety.network_key import NetworkKey
 
 CONNECT_S = 0.2
 """Seconds in which the hub takes a connection."""
@@ -72,6 +74,11 @@ def put_settings(stated: Mapping[str, str]) -> None:
     """Put settings by variable, for this process and its children."""
     for name, value in stated.items():
         settings.put(name, value)
+
+
+def local_key() -> NetworkKey:
+    """Return the name of this machine's mesh, as ``mesh.session`` has it."""
+    return NetworkKey.of(network_key.MESH, [f"tcp/127.0.0.1:{settings.integer('STRANDS_MESH_PORT')}"])
 
 
 def no_hub() -> str:

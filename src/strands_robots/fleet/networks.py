@@ -7,7 +7,6 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
 from itertools import zip_longest
@@ -18,12 +17,13 @@ from strands_robots.errors import NoSuchRobotError, RefusalError, UnreachableErr
 from strands_robots.fleet.adapter import FIND_S, STOP_S, Detail, FoundRobot, NetworkAdapter, OnEvent
 from strands_robots.fleet.bearers import bears, reaches
 from strands_robots.fleet.joining import Joining
-from strands_robots.fleet.refusals import answered
 from strands_robots.fleet.side_by_side import on_own_thread, side_by_side, those
 from strands_robots.serving.known_verbs import READS, RESUMES, STOPS
 from strands_robots.utils import near, plain_text
 
 if TYPE_CHECKING:
+    from concurrent.futures import ThreadPoolExecutor
+
     from strands_robots.fleet.shared_id import SharedId
     from strands_robots.safety.network_key import NetworkKey
     from strands_robots.safety.stopping import StopVerdict
@@ -420,6 +420,8 @@ class Networks:
                     raise
             return await other.call_async(robot, verb, arguments, within)
 
+        from strands_robots.fleet.refusals import answered  # noqa: PLC0415 - a stop need not load it
+
         return await answered(called())
 
     async def describe_async(self, robot: str, within: float) -> FoundRobot:
@@ -438,6 +440,8 @@ class Networks:
 
     async def _off_loop(self, work: Callable[[], R]) -> R:
         """Return what ``work`` returns, on a thread that no stop needs."""
+        from concurrent.futures import ThreadPoolExecutor  # noqa: PLC0415 - a command need not load it
+
         with self._change:
             if self._closed:
                 raise UnreachableError(CLOSED)

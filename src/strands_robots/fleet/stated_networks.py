@@ -13,8 +13,7 @@ from strands_robots import settings
 from strands_robots._mesh_switch import mesh_env_request
 from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH, NetworkAdapter
 from strands_robots.fleet.link_flags import LinkFlags
-from strands_robots.fleet.mesh.local import LocalMesh, local_key
-from strands_robots.fleet.mesh_settings import no_hub
+from strands_robots.fleet.mesh_settings import local_key, no_hub
 from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.profiles import FleetProfile
 from strands_robots.safety.network_key import NetworkKey
@@ -79,6 +78,8 @@ def networks_of(
     elif MESH in unasked and not _on_a_mesh():
         # Its code is not loaded: most machines have no mesh.
         if stays or not (why := no_hub()):
+            from strands_robots.fleet.mesh.local import LocalMesh  # noqa: PLC0415 - as above
+
             networks.append(cast("NetworkAdapter", LocalMesh(source, console=console)))
         else:
             absent[MESH], keys[MESH] = why, local_key

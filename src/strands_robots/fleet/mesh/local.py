@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING, Any
 from strands_robots import settings
 from strands_robots.errors import UnreachableError
 from strands_robots.fleet.adapter import MESH, NetworkBusyError
-from strands_robots.fleet.mesh_settings import no_hub
-from strands_robots.safety import network_key
-from strands_robots.safety.network_key import NetworkKey
+from strands_robots.fleet.mesh_settings import local_key, no_hub
 
 if TYPE_CHECKING:
     from strands_robots.fleet.mesh.network import MeshNetwork
+    from strands_robots.safety.network_key import NetworkKey
 
 ANSWER_S = 1.0
 """Seconds in which it answers."""
@@ -68,11 +67,6 @@ class LocalMesh:
         if name == "_found" or self._found is None:
             raise UnreachableError("the mesh is not joined")
         return getattr(self._found, name)
-
-
-def local_key() -> NetworkKey:
-    """Return the name of this machine's mesh, as ``mesh.session`` has it."""
-    return NetworkKey.of(network_key.MESH, [f"tcp/127.0.0.1:{settings.integer('STRANDS_MESH_PORT')}"])
 
 
 def no_peers() -> str:
