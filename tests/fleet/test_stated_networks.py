@@ -24,6 +24,8 @@ def machine(monkeypatch: pytest.MonkeyPatch) -> None:
         ({}, {"mesh": True}, True),
         ({"STRANDS_MESH": "true"}, {}, True),
         ({"STRANDS_MESH_CONNECT": "tcp/192.0.2.1:7447"}, {}, True),
+        ({"STRANDS_MESH_MULTICAST": "true"}, {}, True),
+        ({"STRANDS_MESH_MULTICAST": "false"}, {}, False),
         ({"STRANDS_MESH": "false"}, {}, False),
         ({"STRANDS_MESH": "false"}, {"mesh": True}, True),
         ({"STRANDS_MESH_CONNECT": "tcp/192.0.2.1:7447"}, {"mesh": False}, False),

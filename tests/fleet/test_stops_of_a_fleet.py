@@ -243,6 +243,23 @@ def test_robot_that_stays_locked_on_one_network_is_not_free(
     assert outcome["both"] == (False, "no")
 
 
+@pytest.mark.parametrize("failing", ["near", "far"])
+def test_network_that_fails_midway_of_a_resume_hides_no_robot_that_was_freed(
+    fleet: Fleet, failing: str, near: ScriptedNetwork, far: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fleet.estop()
+    broken, sound = (near, far) if failing == "near" else (far, near)
+
+    def lost(*_: Any) -> Any:
+        raise errors.UnreachableError("the connection is lost")
+
+    monkeypatch.setattr(broken, "resume", lost)
+    outcome = fleet.resume("key")
+    told = (False, f"{broken.name} failed: the connection is lost")
+    alone = {"arm-1", "arm-2"} & sound.robots.keys()
+    assert outcome == dict.fromkeys(alone, (True, "free")) | dict.fromkeys(broken.robots, told)
+
+
 def test_resume_of_an_absent_robot_is_refused_and_frees_none(fleet: Fleet, near: ScriptedNetwork) -> None:
     fleet.estop()
     with pytest.raises(errors.NoSuchRobotError, match="nowhere"):

@@ -114,6 +114,16 @@ async def test_policy_that_is_out_of_sight_is_halted(name: str, lost: Exception)
     assert fleet.stop_count == 1
 
 
+async def test_robot_that_moved_to_the_other_network_meanwhile_gets_the_call_there() -> None:
+    left, joined = FakeNetwork(execute=LOST[1]), FakeNetwork(MESH, start=success("under way"))
+    client = client_of(left, joined)
+    left.bears = lambda robot: not left.calls  # type: ignore[method-assign]
+    joined.bears = lambda robot: bool(left.calls)  # type: ignore[method-assign]
+    joined.reaches = joined.bears  # type: ignore[method-assign]
+    assert not is_error(await client.call("arm-1", "execute", moves=True))
+    assert (left.verbs, joined.verbs) == (["execute"], ["start"])
+
+
 async def test_stop_of_a_lost_motion_is_repeated_until_it_is_confirmed() -> None:
     fleet = FakeNetwork(moveTo=RUNNING, wait=UnreachableError("the connection is lost"))
     fleet.stop_answers = [error("no link", stopped=None), success("Stopped.", stopped=True)]

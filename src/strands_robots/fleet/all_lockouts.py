@@ -6,13 +6,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from strands_robots.errors import NoSuchRobotError
+from strands_robots.errors import NoSuchRobotError, RefusalError
 from strands_robots.fleet.adapter import FIND_S, NetworkAdapter
 from strands_robots.fleet.enrollment import Enrolled, Enrolment, enroll, shown_key
 from strands_robots.fleet.lockout_report import LockoutReport, Resumed
 from strands_robots.fleet.networks import Networks
 from strands_robots.safety.identity import KeyFileError, fingerprint
 from strands_robots.safety.unheard import Unheard, unheard_now
+from strands_robots.utils import plain_text
 
 FAILED = "robots cannot be asked for their lockouts"
 
@@ -100,6 +101,8 @@ def resume_all(
 ) -> dict[str, Resumed]:
     """Clear the lockouts of these reports; return by id whether each robot is free.
 
+    No robot of a network that fails counts as free; what each says names the network and the reason.
+
     Args:
         reports: as :func:`ask_lockouts` gives them.
         signing_key: the operator's Ed25519 private key.
@@ -117,9 +120,13 @@ def resume_all(
         wanted = [each for each in of_network if not robots or each.name in robots]
         # A robot that is served on both was freed by the first: it refuses a second resume.
         twice = [each.name for each in wanted if each.name in outcomes]
-        anew = {each.name: each for each in network.lockouts(twice, seconds)} if twice else {}
-        now = [anew.get(each.name, each) for each in wanted]
-        for name, outcome in network.resume(now, signing_key, seconds).items():
+        try:
+            anew = {each.name: each for each in network.lockouts(twice, seconds)} if twice else {}
+            resumed = network.resume([anew.get(each.name, each) for each in wanted], signing_key, seconds)
+        except Exception as exc:  # noqa: BLE001 - what was freed on the other network is told all the same
+            why = exc.why if isinstance(exc, RefusalError) else plain_text(f"{type(exc).__name__}: {exc}")
+            resumed = dict.fromkeys((each.name for each in wanted), (False, f"{network.name} failed: {why}"))
+        for name, outcome in resumed.items():
             # Locked on one of two networks is locked.
             outcomes[name] = min(outcomes.get(name, outcome), outcome, key=lambda each: each[0])
     return outcomes

@@ -6,7 +6,7 @@ import asyncio
 import logging
 import threading
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from itertools import zip_longest
@@ -409,25 +409,29 @@ class Networks:
             if verb in STOPS and len(self.stated) > 1:
                 name, unread = _meant(arguments)
                 return _one_answer(robot, await self.stop_async(robot, within, name), unread)
-            network = await self.of_async(robot, verb, moves=moves)
-            try:
-                return await network.call_async(robot, verb, arguments, within)
-            except NoSuchRobotError:
-                other = await self._off_loop(partial(self.instead, robot, verb, network, moves=moves))
-                if other is None:
-                    raise
-            return await other.call_async(robot, verb, arguments, within)
+            return await self.called_on(
+                robot, verb, lambda network: network.call_async(robot, verb, arguments, within), moves=moves
+            )
 
         from strands_robots.fleet.refusals import answered  # noqa: PLC0415 - a stop need not load it
 
         return await answered(called())
 
-    async def describe_async(self, robot: str, within: float) -> FoundRobot:
-        """Return a robot with its functions, as it describes itself now.
+    async def called_on(
+        self, robot: str, verb: str, call: Callable[[NetworkAdapter], Awaitable[R]], *, moves: bool
+    ) -> R:
+        """Call on the network of a robot, or on that to which it has just moved."""
+        network = await self.of_async(robot, verb, moves=moves)
+        try:
+            return await call(network)
+        except NoSuchRobotError:
+            other = await self._off_loop(partial(self.instead, robot, verb, network, moves=moves))
+            if other is None:
+                raise
+        return await call(other)
 
-        Raises:
-            RefusalError: as :meth:`of`, or it does not answer.
-        """
+    async def describe_async(self, robot: str, within: float) -> FoundRobot:
+        """Return a robot as it describes itself now; raises as :meth:`of`."""
         return await (await self.of_async(robot)).describe_async(robot, within)
 
     async def of_async(self, robot: str, verb: str = "", *, moves: bool = False) -> NetworkAdapter:

@@ -34,7 +34,7 @@ def networks_of(
     """Return the networks of a caller, not joined yet.
 
     Device Connect is one where its extra is installed; the mesh where it is not switched off and has a hub on this
-    machine, a stated endpoint, or a profile. The caller only dials: it is never the hub.
+    machine, a stated endpoint, multicast, or a profile. The caller only dials: it is never the hub.
 
     Args:
         profile: a connection profile, or None.
@@ -133,6 +133,7 @@ def _states_mesh() -> bool:
     return (
         settings.raw("STRANDS_MESH_BACKEND").lower() != "zenoh"
         or bool(mesh_env_request())
+        or settings.boolean("STRANDS_MESH_MULTICAST")
         or any(settings.items(f"{whose}_{way}") for whose in ("STRANDS_MESH", "ZENOH") for way in ("CONNECT", "LISTEN"))
     )
 

@@ -115,8 +115,12 @@ class Caller:
     ) -> Envelope:
         """Call a verb; a refusal is an answer, one of ``lost`` is raised."""
         try:
-            network = await self.networks.of_async(robot, verb, moves=moves)
-            return await network.call_async(robot, _named_on(network, verb), params or {}, seconds)
+            return await self.networks.called_on(
+                robot,
+                verb,
+                lambda network: network.call_async(robot, _named_on(network, verb), params or {}, seconds),
+                moves=moves,
+            )
         except lost:
             raise
         except RefusalError as refusal:

@@ -109,7 +109,7 @@ class _Shared:
         """Take a reference as a caller without a robot, which never becomes the hub.
 
         Raises:
-            TransportError: the mesh is switched off, or there is no hub and no stated endpoint to reach.
+            TransportError: the mesh is switched off, or there is no hub, stated endpoint or multicast to reach it by.
             MissingExtraError: the transport's extra is not installed.
         """
         if mesh_env_request() is False:

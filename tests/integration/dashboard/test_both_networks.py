@@ -91,7 +91,7 @@ def test_robot_on_both_networks_has_one_row_and_a_second_one_where_the_first_is_
     eventually(lambda: keys(page) == ["dc:arm-1"], 30.0, "one row")
     server.kill()
     eventually(lambda: keys(page) == ["dc:arm-1", "mesh:arm-1"], 60.0, "its row of the mesh")
-    assert card(page, "arm-1", "mesh").locator(".name").inner_text() == "arm-1 (mesh)"
+    card(page, "arm-1", "mesh").locator(".name").get_by_text("arm-1 (mesh)").wait_for(timeout=30_000)
     picture(page, "one-robot-cut-off-on-one-network")
     open_robot(page, network="mesh")
     said = start(page, "start")

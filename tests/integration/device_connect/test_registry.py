@@ -113,9 +113,9 @@ def test_estop_without_names_names_every_robot_that_the_registry_lists(site: Sit
     site.move()
     code, said = site.machine.json("estop")
     assert not site.moving
-    assert sorted(said["stopped"]) == ["arm-1", "arm-2"]
-    # The bare device has a stop, and knows nothing of emergency stops.
-    assert (code, said["silent"]) == (3, ["bare-1"])
+    assert sorted(said["stopped"]) == EVERYONE
+    # The bare device knows nothing of emergency stops; a plain stop halts it.
+    assert (code, said["silent"], said["not_locked"]) == (3, [], ["bare-1"])
     assert site.machine.json("lockout")[1]["live"]["arm-1"]["locked"]
 
 

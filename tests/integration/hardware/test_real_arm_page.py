@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from fixtures.command_line import Machine
 from fixtures.feetech_bus import FeetechBus, arm_calibration
-from fixtures.page_feed import PageFeed
+from fixtures.page_feed import PageFeed, page_robot
 from fixtures.waiting import until
 from PIL import Image
 
@@ -45,10 +45,10 @@ class NetworkFeed(PageFeed):
 async def jogged(fleet: FleetClient, axis: str, moved: Callable[[], bool]) -> list[dict[str, Any]]:
     """Take control, hold a jog until it has moved the arm, let go; return what the page was told."""
     told: list[dict[str, Any]] = []
-    feed = NetworkFeed(fleet)
+    robot = page_robot(NetworkFeed(fleet), "arm-1")
     hand = HandControl(told.append)
     try:
-        taken = await hand.take("dc:arm-1", feed, "arm-1")
+        taken = await hand.take("dc:arm-1", robot)
         assert taken["status"] == "success", taken
 
         def ended() -> bool:

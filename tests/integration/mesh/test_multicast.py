@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import subprocess
+import sys
+from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -16,22 +18,47 @@ from strands_robots.mesh import keys
 pytestmark = pytest.mark.system
 
 
-def join(peer_id: str, robot: str, side: Side, folder: Path, stack: ExitStack) -> MeshPeer:
-    issued = keys.issue(folder / "keys", peer_id, (side.address,))
-    state = folder / peer_id
-    state.mkdir(mode=0o700)
-    settings = {"STRANDS_STATE_DIR": str(state), "STRANDS_MESH_MULTICAST": "true", **issued.settings()}
-    return stack.enter_context(MeshPeer(peer_id, robot, settings, side.within))
+CALLER = """
+from strands_robots import connect
+with connect() as fleet:
+    print(fleet["arm-1"].status()["status"])
+"""
 
 
-def test_multicast_finds_robots_on_two_machines_and_a_stop_reaches_them(tmp_path: Path) -> None:
+@pytest.fixture
+def lab(tmp_path: Path) -> Iterator[NetworkLab]:
     if why := missing():
         (pytest.fail if os.environ.get("CI") else pytest.skip)(why)
     keys.init(tmp_path / "keys")
-    with NetworkLab() as lab, ExitStack() as stack:
+    with NetworkLab() as lab:
         for side in (lab.here, lab.there):
             route = ["ip", "-n", side.namespace, "route", "add", "default", "dev", side.device]
             subprocess.run(route, check=True, capture_output=True)
+        yield lab
+
+
+def settings_of(peer_id: str, side: Side, folder: Path) -> dict[str, str]:
+    issued = keys.issue(folder / "keys", peer_id, (side.address,))
+    state = folder / peer_id
+    state.mkdir(mode=0o700)
+    return {"STRANDS_STATE_DIR": str(state), "STRANDS_MESH_MULTICAST": "true", **issued.settings()}
+
+
+def join(peer_id: str, robot: str, side: Side, folder: Path, stack: ExitStack) -> MeshPeer:
+    return stack.enter_context(MeshPeer(peer_id, robot, settings_of(peer_id, side, folder), side.within))
+
+
+def test_caller_on_a_machine_without_a_hub_finds_a_robot_by_multicast(lab: NetworkLab, tmp_path: Path) -> None:
+    with ExitStack() as stack:
+        join("arm-1", "arm", lab.here, tmp_path, stack)
+        settings = {**os.environ, **settings_of("console", lab.there, tmp_path)}
+        command = [*lab.there.within, sys.executable, "-c", CALLER]
+        said = subprocess.run(command, env=settings, capture_output=True, text=True, timeout=60, check=False)
+    assert said.stdout.split() == ["success"], said.stderr
+
+
+def test_multicast_finds_robots_on_two_machines_and_a_stop_reaches_them(lab: NetworkLab, tmp_path: Path) -> None:
+    with ExitStack() as stack:
         # On each machine the first process is the hub, and the second one its client.
         arm = join("arm-1", "arm", lab.here, tmp_path, stack)
         sim = join("sim-1", "world", lab.here, tmp_path, stack)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,6 +19,7 @@ from fixtures.zenoh_router import ZenohRouter
 from tests.integration.safety.conftest import Stage
 
 from strands_robots.device_connect.backends import LinkConfig, loopback_config
+from strands_robots.safety.sighting_file import SightingFile
 
 pytestmark = pytest.mark.system
 
@@ -66,6 +67,17 @@ def locked(child: Child, name: str, epoch: str) -> None:
     assert epochs(child, name) == [epoch], [each["event"] for each in child.ask("audit")[0]]
 
 
+@contextmanager
+def frozen(child: Child, seconds: float) -> Iterator[None]:
+    """Freeze a process for the block, and for so many seconds at least."""
+    child.signal(signal.SIGSTOP)
+    began = time.monotonic()
+    yield
+    # The length of the fault, not a wait for its end.
+    time.sleep(max(0.0, seconds - (time.monotonic() - began)))
+    child.signal(signal.SIGCONT)
+
+
 def stopped_once(site: Stage, *expected: str) -> str:
     """Stop by a controller that is gone before anybody is back; return the stop's id."""
     hand = site.controller()
@@ -76,10 +88,12 @@ def stopped_once(site: Stage, *expected: str) -> str:
 
 
 def met(site: Stage, *ids: str) -> None:
-    """Have every robot stopped once, so that all are reached, and freed again."""
+    """Have every robot stopped once, so that all are reached, and freed again; this machine remembers them."""
     hand = site.controller("probe")
     site.meet(hand, *ids)
     hand.close()
+    remembered = SightingFile(site.folder).served
+    eventually(lambda: {row.name for row in remembered()} >= set(ids), what="the memory of who is served")
 
 
 @pytest.mark.parametrize("frozen_s", [NOTICED_S, BEYOND_THE_LEASE_S], ids=["shortly", "beyond the lease"])
@@ -88,12 +102,8 @@ def test_robot_frozen_during_a_stop_is_locked_once_it_runs(site: Stage, frozen_s
     met(site, "arm-1", "arm-2")
     here.ask("clear"), away.ask("clear")
     away.ask("move")
-    away.signal(signal.SIGSTOP)
-    began = time.monotonic()
-    epoch = stopped_once(site, "arm-1")
-    # The length of the fault, not a wait for its end.
-    time.sleep(max(0.0, frozen_s - (time.monotonic() - began)))
-    away.signal(signal.SIGCONT)
+    with frozen(away, frozen_s):
+        epoch = stopped_once(site, "arm-1")
     locked(away, "arm-2", epoch)
     eventually(lambda: not away.ask("facts")["arm-2"]["moving"])
 
@@ -120,12 +130,11 @@ def test_answerer_that_was_killed_and_restarted_still_answers(site: Stage) -> No
     here, away = site.robots("arm-1"), site.robots("arm-2")
     met(site, "arm-1", "arm-2")
     here.ask("clear"), away.ask("clear")
-    away.signal(signal.SIGSTOP)
-    epoch = stopped_once(site, "arm-1")
-    here.kill()
-    again = site.robots("arm-1")
-    assert epochs(again, "arm-1") == [epoch]
-    away.signal(signal.SIGCONT)
+    with frozen(away, NOTICED_S):
+        epoch = stopped_once(site, "arm-1")
+        here.kill()
+        again = site.robots("arm-1")
+        assert epochs(again, "arm-1") == [epoch]
     locked(away, "arm-2", epoch)
 
 

@@ -5,8 +5,9 @@ Authorization and lockout are the follower's, wherever its leader is.
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +16,7 @@ from strands_robots.errors import NoAnswerError, NoSuchRobotError, RefusalError,
 from strands_robots.fleet.mesh.network import MeshNetwork
 from strands_robots.policies.base import Ranges, SpeedLimit, checked_action, numbers
 from strands_robots.teleoperators.leader import UNBOUNDED_PER_S, BoundedLeader, LeaderFinished, LeaderPolicy
-from strands_robots.utils import number, plain_text
+from strands_robots.utils import ValidationError, mapping, number, plain_text, shown, text
 
 if TYPE_CHECKING:
     from strands_robots.mesh import Mesh
@@ -48,14 +49,22 @@ class RemoteFollower:
         self.peer = peer
         await_peer(mesh, peer)
         features, state = self.ask("features"), self.ask("state")
-        robots = features.get("robots")
-        if isinstance(robots, Mapping) and robots:
-            name = next(iter(robots))
-            self.bounds = _ranges(robots[name].get("actuators") or {}, ())
-            self._joints = numbers((state.get("robots") or {}).get(name) or {})
-        else:
-            self.bounds = _ranges(features.get("ranges") or {}, features.get("action_features") or ())
-            self._joints = numbers(state.get("joints") or {})
+        try:
+            robots = _fields("robots", features.get("robots"))
+            if robots:
+                name = next(iter(robots))
+                self.bounds = _ranges(_fields("actuators", _fields(name, robots[name]).get("actuators")), ())
+                joints = _fields("robots", state.get("robots")).get(name)
+            else:
+                actions = features.get("action_features")
+                keys = actions if isinstance(actions, list) else _fields("action_features", actions)
+                self.bounds, joints = _ranges(_fields("ranges", features.get("ranges")), keys), state.get("joints")
+            reported = _fields("joints", joints)
+            self._joints = numbers(reported) | {
+                key: number(f"joints[{key!r}]", reported[key]) for key in self.bounds if key in reported
+            }
+        except ValidationError as exc:
+            raise RobotError(f"{peer} cannot be led by what it reports: {exc}") from None
         if not self.bounds:
             raise RobotError(f"{peer} reports no action key that could be led")
 
@@ -149,7 +158,9 @@ class LedPeer:
             return ""
         self._asked_at, peer = now, self._follower.peer
         try:
-            streams = self._follower.ask("teleop_status").get("streams") or []
+            streams = self._follower.ask("teleop_status").get("streams")
+            if not isinstance(streams, list) or not all(isinstance(each, Mapping) for each in streams):
+                raise RobotError(f"{peer} reports no list of streams")
         except RefusalError as silent:
             return f"{peer} is out of reach: {silent}" if now - self._answered_at > _SILENT_S else ""
         self._answered_at = time.monotonic()
@@ -269,10 +280,23 @@ def _stream_end(counters: Mapping[str, Any]) -> str:
     return next((text for name, text in _REASONS.items() if counters.get(name)), _STOPPED)
 
 
-def _ranges(known: Mapping[str, Any], keys: Any) -> Ranges:
-    unbounded = (float("-inf"), float("inf"))
-    ranges = dict.fromkeys([str(key) for key in keys] or [str(key) for key in known], unbounded)
+def _fields(name: str, value: object) -> Mapping[str, Any]:
+    """Return an object of a peer's answer; empty where the peer states none."""
+    return {} if value is None else mapping(name, value)
+
+
+def _ranges(known: Mapping[str, Any], keys: Iterable[object]) -> Ranges:
+    """Return the range of each key; null, or none, is no limit.
+
+    Raises:
+        ValidationError: a key is no text, or a range no pair of finite numbers with the lower one first.
+    """
+    ranges = dict.fromkeys([text("action key", key) for key in keys] or known, (-math.inf, math.inf))
     for key, pair in known.items():
-        if isinstance(pair, list | tuple) and len(pair) == 2:
-            ranges[str(key)] = (float(pair[0]), float(pair[1]))
+        if pair is not None:
+            if not isinstance(pair, list | tuple) or len(pair) != 2:
+                raise ValidationError(f"the range of {shown(key)} must be a pair of numbers, not {shown(pair)}.")
+            low = -math.inf if pair[0] is None else number(f"the lower end of {shown(key)}", pair[0])
+            high = math.inf if pair[1] is None else number(f"the upper end of {shown(key)}", pair[1], above=low)
+            ranges[key] = low, high
     return ranges

@@ -1,6 +1,7 @@
 """Robots on the native mesh, for the calling side.
 
-This peer has no robot and is never the mesh's hub: without a hub or a stated endpoint there is no mesh to join.
+This peer has no robot and is never the mesh's hub: it joins a mesh by a hub on this machine, a
+stated endpoint or multicast.
 """
 
 from __future__ import annotations

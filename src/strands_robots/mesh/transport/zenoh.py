@@ -270,6 +270,9 @@ class ZenohTransport(Transport):
         try:
             return self._open(zenoh_config.child(posture, self._id, DIAL_MS))
         except TransportError:
+            if posture.multicast:
+                # The hubs of other machines are found later, if at all.
+                return self._open(zenoh_config.explicit(posture, self._id))
             raise TransportError(f"no mesh answers on {posture.hub}.") from None
 
     def _watch_links(self, session: Any, *, of_hub: bool) -> None:
