@@ -18,6 +18,7 @@ from strands_robots.envelope import Envelope, error, success
 from strands_robots.fleet import joining
 from strands_robots.fleet import networks as module
 from strands_robots.fleet.adapter import (
+    CLOSED,
     DEVICE_CONNECT,
     FIND_S,
     MESH,
