@@ -86,8 +86,8 @@ def test_flags_for_another_command_name_the_profile(write: Write, monkeypatch: p
 def test_consent_and_tenant_are_the_profiles(write: Write) -> None:
     write('nats = "nats://192.0.2.1:4222"\ninsecure = true\ntenant = "lab"')
     network = Network(profile="lab")
-    assert network.opted_in
-    assert network.stated_tenant == "lab"
+    assert network.stated.opted_in
+    assert network.stated.stated_tenant == "lab"
     assert network.link().connect == ("nats://192.0.2.1:4222",)
 
 

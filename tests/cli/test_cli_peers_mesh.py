@@ -12,8 +12,8 @@ from fixtures.waiting import eventually
 from tests.cli.conftest import Run
 
 from strands_robots.cli import peers
+from strands_robots.cli.network import mesh_peer
 from strands_robots.fleet.adapter import FoundRobot
-from strands_robots.fleet.mesh.joining import joined_mesh
 from strands_robots.fleet.mesh.network import MeshNetwork
 from strands_robots.mesh import Mesh
 from strands_robots.mesh.session import clear_peers
@@ -27,7 +27,7 @@ def barista(monkeypatch: pytest.MonkeyPatch) -> Iterator[Barista]:
     monkeypatch.setattr(zenoh_config, "DISCOVERY_S", 0.1)
     clear_peers()
     robot = Barista()
-    with joined_mesh(robot, "bar-1", "robot"), joined_mesh(None, "looker", "tool") as looker:
+    with mesh_peer(robot, "bar-1", "robot"), mesh_peer(None, "looker", "tool") as looker:
         # All peers of one process share their list of peers.
         eventually(lambda: looker.get_peer("bar-1") is not None)
         yield robot

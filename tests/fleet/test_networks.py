@@ -18,6 +18,7 @@ from strands_robots.envelope import Envelope, error, success
 from strands_robots.fleet import joining
 from strands_robots.fleet import networks as module
 from strands_robots.fleet.adapter import (
+    CLOSED,
     DEVICE_CONNECT,
     FIND_S,
     MESH,
@@ -646,7 +647,7 @@ def test_stop_of_a_name_that_no_network_knows_has_one_answer(near: ScriptedNetwo
     networks = Networks([near, ScriptedNetwork(MESH, {})])
     assert list(networks.stop("nobody")) == [DEVICE_CONNECT]
     networks.close()
-    assert networks.stop("arm-1") == {DEVICE_CONNECT: error(module.CLOSED, stopped=None)}
+    assert networks.stop("arm-1") == {DEVICE_CONNECT: error(CLOSED, stopped=None)}
 
 
 class TestStopLink:

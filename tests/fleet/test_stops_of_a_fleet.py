@@ -17,12 +17,12 @@ from strands_robots.envelope import error, success
 from strands_robots.fleet import Fleet
 from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
 from strands_robots.fleet.all_stops import estop_all
-from strands_robots.fleet.enrollment import Enrolled, enrolled_robots
+from strands_robots.fleet.enrollment import Enrolled
 from strands_robots.fleet.lockout_report import LockoutReport
 from strands_robots.fleet.networks import Networks
 from strands_robots.safety.answers import Answer
 from strands_robots.safety.controller import Progress
-from strands_robots.safety.identity import ROBOTS, KeyFile
+from strands_robots.safety.identity import ROBOTS, EnrolledKeys, KeyFile
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.roster import Roster, RosterRow
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
@@ -375,7 +375,7 @@ def test_two_keys_of_one_id_are_both_left_out(fleet: Fleet, near: ScriptedNetwor
     assert {name: each.outcome for name, each in outcome.items() if name != "both"} == dict.fromkeys(
         ("arm-1", "arm-2"), Enrolled.NEW
     )
-    assert sorted(enrolled_robots()) == ["arm-1", "arm-2"]
+    assert sorted(EnrolledKeys().load()) == ["arm-1", "arm-2"]
 
 
 def test_log_of_an_argument_is_written_after_the_stop_has_left(fleet: Fleet, near: ScriptedNetwork) -> None:

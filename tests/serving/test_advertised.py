@@ -17,7 +17,6 @@ from strands_robots.serving.advertised import (
     AdvertisedVerb,
     RobotDescription,
     find_verb,
-    own_names,
     typed,
 )
 from strands_robots.serving.own_verbs import own_verbs
@@ -277,8 +276,3 @@ def test_robot_of_ours_lacks_nothing_however_many_verbs_it_has() -> None:
     assert (read.lacking, read.absent) == ((), "")
     assert "resume" not in read.verbs
     assert not read.verbs["verb1"].own
-
-
-def test_names_of_presence_are_read_as_data() -> None:
-    assert own_names(["brewCoffee", 5, "\x1b", None]) == ["brewCoffee"]
-    assert own_names("brewCoffee") == own_names(None) == []

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import secrets
 import socket
 import threading
 import webbrowser
@@ -22,7 +21,6 @@ from strands_robots.cli.command import command
 from strands_robots.cli.keys import PassphraseFile, signing_key
 from strands_robots.cli.network import Network
 from strands_robots.cli.output import CliError, Exit, Screen
-from strands_robots.safety.ed25519 import keygen
 from strands_robots.utils import device_id, missing_extra
 
 if TYPE_CHECKING:
@@ -236,19 +234,10 @@ class DemoRobots:
 @contextmanager
 def _demo_robots(screen: Screen) -> Iterator[DemoRobots]:
     """Make the demo's key and settings; its robots end with the block."""
-    import tempfile  # noqa: PLC0415 - the demo only
-
     from strands_robots.cli.demo import free_port  # noqa: PLC0415 - the demo only
+    from strands_robots.cli.demo.steps import demo_operator  # noqa: PLC0415 - as above
 
-    passphrase = f"Demo-{secrets.token_hex(8)}"
-    with tempfile.TemporaryDirectory(prefix="strands-dashboard-") as folder:
-        key = Path(folder) / "operator.pem"
-        settings.put("STRANDS_MESH_RESUME_PUBLIC_KEY", keygen(key, passphrase))
-        settings.put("STRANDS_STATE_DIR", folder)
-        settings.put("STRANDS_MESH_AUDIT_DIR", "")
-        for name in ("DEVICE_CONNECT_ESTOP_ALLOW", "DEVICE_CONNECT_ESTOP_PUBLIC_KEYS"):
-            settings.put(name, "")
-        settings.put("STRANDS_CHECKIN_TIMEOUT_S", "0")
+    with demo_operator() as (key, passphrase):
         # Its STOP is for its own robots, not for those of the user's mesh.
         settings.put("STRANDS_MESH", "false")
         port = free_port()

@@ -12,7 +12,6 @@ from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from importlib import metadata
 from pathlib import Path
-from tempfile import TemporaryFile
 from typing import TYPE_CHECKING
 
 import typer
@@ -22,7 +21,7 @@ from strands_robots.cli.command import command
 from strands_robots.cli.network import Network
 from strands_robots.cli.output import CliError, Screen, label, table
 from strands_robots.cli.owners import IMPORT_PACKAGE, other_owners, owner_remedy
-from strands_robots.cli.readiness import LOOPBACK, dial_problem, listen_problem, port_holder
+from strands_robots.cli.readiness import LOOPBACK, dial_problem, listen_problem, port_holder, unwritable
 from strands_robots.errors import UnreachableError
 from strands_robots.fleet.adapter import MESH
 from strands_robots.fleet.link_flags import described
@@ -348,15 +347,11 @@ def _rendering() -> Iterator[Finding]:
 
 def _state() -> Iterator[Finding]:
     folder = state_dir()
-    probe = folder
-    while not probe.exists():
-        probe = probe.parent
-    try:
-        with TemporaryFile(dir=probe):
-            yield Finding("state", Mark.OK, f"grants and lockouts are stored in {folder}")
-    except OSError as exc:
+    if why := unwritable(folder):
         remedy = "set STRANDS_STATE_DIR to a directory that this user can write"
-        yield Finding("state", Mark.BROKEN, f"{probe} cannot be written: {exc.strerror}", remedy)
+        yield Finding("state", Mark.BROKEN, f"{folder} cannot be written: {why}", remedy)
+    else:
+        yield Finding("state", Mark.OK, f"grants and lockouts are stored in {folder}")
 
 
 def _robot_keys() -> Iterator[Finding]:

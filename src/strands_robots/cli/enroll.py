@@ -48,7 +48,7 @@ def enroll(
         if change is None:
             show_enrolled(screen)
         else:
-            apply(screen, change, DEFAULT_TENANT if on_mesh else network.stated_tenant)
+            apply(screen, change, DEFAULT_TENANT if on_mesh else network.stated.stated_tenant)
         return
     if console:
         _enroll_console(screen, console)

@@ -9,10 +9,11 @@ import typer
 
 from strands_robots.cli.output import CliError, Exit, Screen, label, plain, table
 from strands_robots.errors import NoSuchRobotError
-from strands_robots.fleet.enrollment import FORGET, change_enrolment, enrolled_robots, served_here
+from strands_robots.fleet.enrollment import FORGET, change_enrolment, served_here
 from strands_robots.safety.identity import (
     OFF,
     RETIRED,
+    EnrolledKeys,
     EnrolledRobot,
     KeyFileError,
     fingerprint,
@@ -90,7 +91,7 @@ def show_enrolled(screen: Screen) -> None:
         CliError: the file cannot be used.
     """
     try:
-        robots = enrolled_robots()
+        robots = EnrolledKeys().robots()
     except (KeyFileError, OSError) as exc:
         raise CliError(f"The enrolled robots cannot be read: {exc}") from exc
     rows = ((name, _state(each), _networks(each), fingerprint(each.key)) for name, each in sorted(robots.items()))

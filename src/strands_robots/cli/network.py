@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 import shlex
-from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, closing, contextmanager
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
@@ -69,11 +69,6 @@ class Network:
     tls_key: Annotated[Path | None, _option("--tls-key", "This side's private key (PEM).")] = None
     credentials: Annotated[Path | None, _option("--credentials", "Device Connect credentials file (JSON).")] = None
 
-    @property
-    def opted_in(self) -> bool:
-        """True when the user accepts a transport without authentication."""
-        return self._stated.opted_in
-
     def link(self) -> LinkConfig:
         """Return the link that the flags describe.
 
@@ -83,17 +78,16 @@ class Network:
         """
         try:
             profile = self._profile
-            stated = self._flags_over(profile)
-            link = stated.link(as_flag)
+            link = self.stated.link(as_flag)
         except ValidationError as exc:
             raise CliError(str(exc), Exit.USAGE) from exc
-        if profile is not None and not profile.reaches_devices(self._given):
-            raise CliError(f"The connection profile {profile.label} has a mesh alone: give --mesh.", Exit.USAGE)
-        if stated.credentials:
-            # For the processes that a command starts, and for what it prints.
-            settings.put("MESSAGING_CREDENTIALS_FILE", str(stated.credentials))
         if profile is not None:
-            put_settings(_mesh_beside(profile))
+            if self.on_mesh_alone:
+                raise CliError(f"The connection profile {profile.label} has a mesh alone: give --mesh.", Exit.USAGE)
+            mesh = None if self._usable_mesh is False else profile.mesh
+            # The mesh of the environment may be another fleet's.
+            put_settings({"STRANDS_MESH": "false"} if mesh is None else mesh)
+        self._put_credentials()
         return link
 
     def check(self) -> None:
@@ -106,17 +100,17 @@ class Network:
         if profile is not None:
             profile.check()
 
-    def caller(self, otherwise: str = SOURCE) -> str:
-        """Return the caller's name of the connection profile, else ``otherwise``.
+    def caller(self) -> str:
+        """Return the caller's name of the connection profile, else the usual one.
 
         One that cannot be used is left out: a stop needs none.
         """
         profile = self._profile
         try:
-            return (profile.name if profile is not None else None) or otherwise
+            return (profile.name if profile is not None else None) or SOURCE
         except ValidationError as unfit:
-            logger.warning("%s The caller is %s.", unfit, otherwise)
-            return otherwise
+            logger.warning("%s The caller is %s.", unfit, SOURCE)
+            return SOURCE
 
     @property
     def _given(self) -> dict[str, Any]:
@@ -129,12 +123,16 @@ class Network:
         # Read once: a file that changes meanwhile must not give one command two fleets.
         return profile_for(self.profile, self._given)
 
-    def _flags_over(self, profile: FleetProfile | None) -> LinkFlags:
+    @property
+    def stated(self) -> LinkFlags:
+        """The flags of Device Connect, over those of the profile."""
+        profile = self._profile
         return LinkFlags(**self._given) if profile is None else profile.flags(self._given)
 
-    @property
-    def _stated(self) -> LinkFlags:
-        return self._flags_over(self._profile)
+    def _put_credentials(self) -> None:
+        """Name the credentials to the processes that a command starts."""
+        if credentials := self.stated.credentials:
+            settings.put("MESSAGING_CREDENTIALS_FILE", str(credentials))
 
     def networks(
         self,
@@ -173,10 +171,8 @@ class Network:
             raise CliError(str(exc), Exit.USAGE) from exc
         if not networks.stated and not self.on_mesh_alone:
             # It names the extra.
-            self._stated.link(as_flag)
-        if credentials := self._stated.credentials:
-            # For the processes that a command starts, and for what it prints.
-            settings.put("MESSAGING_CREDENTIALS_FILE", str(credentials))
+            self.stated.link(as_flag)
+        self._put_credentials()
         return networks
 
     @contextmanager
@@ -204,7 +200,7 @@ class Network:
     def other_user(self, networks: Networks) -> str:
         """Return who else serves robots where those of this machine meet, or ""."""
         devices = any(each.name == DEVICE_CONNECT for each in networks.stated)
-        return other_user(self._stated.link(as_flag)) if devices else ""
+        return other_user(self.stated.link(as_flag)) if devices else ""
 
     @property
     def _usable_mesh(self) -> bool | None:
@@ -216,11 +212,6 @@ class Network:
             logger.warning("%s The mesh is left out.", unfit)
             return False
         return None
-
-    @property
-    def stated_tenant(self) -> str:
-        """The tenant of Device Connect, of the flag or the environment."""
-        return self._stated.stated_tenant
 
     @property
     def flags(self) -> str:
@@ -258,19 +249,6 @@ class Network:
             put_settings(profile.mesh)
         if self.port is not None:
             put_settings(mesh_at(port("--port", self.port)))
-
-
-def _mesh_beside(profile: FleetProfile) -> Mapping[str, str]:
-    """Return the settings of the mesh for a command that may join it besides.
-
-    One that cannot be used is left out, and so is that of the environment: it may be another fleet's.
-    """
-    try:
-        stated = profile.mesh
-    except ValidationError as unfit:
-        logger.warning("%s The mesh is left out.", unfit)
-        stated = None
-    return {"STRANDS_MESH": "false"} if stated is None else stated
 
 
 def say_missing(screen: Screen, networks: Networks) -> None:
@@ -331,27 +309,18 @@ def _near_verbs(there: Networks, robot: str, verb: str) -> str:
         return ""
 
 
-def temporary_mesh_id(name: str) -> str:
-    """Return a fresh mesh id for one command, covered by its certificate, if any."""
-    from strands_robots.mesh.transport import TransportError  # noqa: PLC0415 - loaded when a network is used
-    from strands_robots.mesh.wire_identity import IdentityError, visitor_id  # noqa: PLC0415 - as above
-
-    try:
-        return visitor_id(name)
-    except (TransportError, IdentityError) as exc:
-        raise CliError(str(exc), Exit.USAGE) from exc
-
-
 @contextmanager
 def mesh_peer(robot: Any, peer_id: str | None, peer_type: str) -> Iterator[Mesh]:
     """Join the native mesh while the block runs; raise :class:`CliError` if it fails."""
-    from strands_robots.fleet.mesh.joining import MeshUnavailableError, joined_mesh  # noqa: PLC0415 - as above
+    from strands_robots.mesh import init_mesh  # noqa: PLC0415 - loaded when a network is used
 
-    with ExitStack() as stack:
-        try:
-            mesh = stack.enter_context(joined_mesh(robot, peer_id, peer_type))
-        except MeshUnavailableError as exc:
-            raise CliError(str(exc)) from exc
-        except ValueError as exc:
-            raise CliError(str(exc), Exit.USAGE) from exc
+    try:
+        mesh = init_mesh(robot, peer_id, peer_type)
+    except ValueError as exc:
+        raise CliError(str(exc), Exit.USAGE) from exc
+    if mesh is None:
+        raise CliError("The native mesh is off: STRANDS_MESH switches it off.")
+    with closing(mesh):
+        if not mesh.alive:
+            raise CliError("The native mesh has no session; the log says why.")
         yield mesh

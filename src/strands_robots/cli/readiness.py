@@ -65,16 +65,22 @@ def link_certificate_problem(link: LinkConfig) -> str:
 def state_problem() -> str:
     """Return why the state directory cannot be written, or empty."""
     folder = state_dir()
+    if not (why := unwritable(folder)):
+        return ""
+    return (
+        f"The state directory {folder} cannot be written ({why}): a restart forgets a lockout, resume "
+        "--local frees no robot, answers are not signed, and nothing is audited. Set STRANDS_STATE_DIR to a "
+        "directory that this user can write."
+    )
+
+
+def unwritable(folder: Path) -> str:
+    """Return why a folder, or the one that it would be made in, cannot be written."""
     try:
-        probe = next(each for each in (folder, *folder.parents) if each.exists())
-        with TemporaryFile(dir=probe):
+        with TemporaryFile(dir=next(each for each in (folder, *folder.parents) if each.exists())):
             return ""
     except OSError as exc:
-        return (
-            f"The state directory {folder} cannot be written ({exc.strerror}): a restart forgets a lockout, resume "
-            "--local frees no robot, answers are not signed, and nothing is audited. Set STRANDS_STATE_DIR to a "
-            "directory that this user can write."
-        )
+        return exc.strerror or str(exc)
 
 
 def meeting_problem(link: LinkConfig) -> str:

@@ -264,7 +264,10 @@ def _on_device_connect(
     driver = driver_for(body, "robot")
     try:
         runtime = device_connect.init_device_connect_sync(
-            driver, peer_id=peer_id or default_id(body), link=link, allow_insecure=True if network.opted_in else None
+            driver,
+            peer_id=peer_id or default_id(body),
+            link=link,
+            allow_insecure=True if network.stated.opted_in else None,
         )
     except (device_connect.DuplicateDeviceError, TimeoutError, OSError) as exc:
         raise CliError(f"The robot is not on the network: {exc}") from exc

@@ -15,7 +15,7 @@ import typer
 from rich.control import Control
 
 from strands_robots.cli.command import Seconds, command
-from strands_robots.cli.network import mesh_peer, temporary_mesh_id
+from strands_robots.cli.network import mesh_peer
 from strands_robots.cli.output import POLL_S, CliError, Exit, Screen, table, wait_until
 from strands_robots.cli.record import record_robot
 from strands_robots.envelope import is_error, text_of
@@ -240,7 +240,7 @@ def _follow(
     """Let a leader published on the mesh drive a follower of this machine."""
     from strands_robots.fleet.mesh.leading import DEVICE, followed  # noqa: PLC0415 - loaded when the network is used
 
-    with _made_follower(screen, follower, arm, record, mesh=True, peer_id=temporary_mesh_id("follow")) as robot:
+    with _made_follower(screen, follower, arm, record, mesh=True, peer_id=_temporary_mesh_id("follow")) as robot:
         with _refused(), followed(robot, peer, options.max_speed) as leading:
             _announce(screen, f"{peer}/{DEVICE}", robot.tool_name_str, leading)
             why, stats = wait_until(screen, options.timed(leading.over)), leading.stats
@@ -250,6 +250,17 @@ def _follow(
     _check_stopped(verdict)
     left_out = row["errors"] + row["rejected"] + row["slew_rejected"] + row["rate_dropped"]
     screen.say(f"{why} {row['frames_received']} frames arrived, {left_out} of them were not applied.", "green")
+
+
+def _temporary_mesh_id(name: str) -> str:
+    """Return a fresh mesh id for one command, covered by its certificate, if any."""
+    from strands_robots.mesh.transport import TransportError  # noqa: PLC0415 - loaded when a network is used
+    from strands_robots.mesh.wire_identity import IdentityError, visitor_id  # noqa: PLC0415 - as above
+
+    try:
+        return visitor_id(name)
+    except (TransportError, IdentityError) as exc:
+        raise CliError(str(exc), Exit.USAGE) from exc
 
 
 def _lead_peer(

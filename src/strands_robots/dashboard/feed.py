@@ -109,13 +109,6 @@ class FleetFeed:
         """End a robot's motion without a lockout, as after a jog; graded, never raises."""
         return await self.there.stop_async(robot, STOP_S)
 
-    def bears(self, robot: str) -> bool:
-        """Return whether a robot of this id is known on the network; asks no one."""
-        try:
-            return self.there.bears(robot)
-        except RefusalError:
-            return False
-
     def session(self, robot: str) -> object:
         """Return what differs once another robot may answer to this id; asks no one."""
         try:

@@ -20,6 +20,7 @@ from strands_robots.dashboard.fleet_model import FleetModel, RobotRow, key_of
 from strands_robots.envelope import Envelope, error
 from strands_robots.errors import AmbiguousRobotError
 from strands_robots.fleet.adapter import NetworkAdapter
+from strands_robots.fleet.bearers import bears
 from strands_robots.fleet.shared_id import DECIDED_S, SharedId, decided
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.stopping import grade
@@ -206,7 +207,7 @@ class PageRobots:
         shared.asking = asyncio.get_running_loop().run_in_executor(self._pool, work)
 
     def _bearers(self, robot: PageRobot) -> list[FleetFeed]:
-        return [each for each in self._feeds.joined if each is robot.feed or each.bears(robot.id)]
+        return [each for each in self._feeds.joined if each is robot.feed or bears(each.there, robot.id)]
 
     def _alive(self, feed: FleetFeed, name: str) -> bool:
         row = self._model.row(key_of(feed.network, name))

@@ -9,7 +9,8 @@ import logging
 import math
 import socket
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Iterable
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -56,7 +57,6 @@ SAMPLED_AT_ONCE = 10
 
 SESSIONS_MAX = 64
 MESSAGE_MAX = 64 * 2**10
-NDJSON = "application/x-ndjson"
 NO_TICKET = "This page's ticket is needed.\n"
 
 
@@ -264,14 +264,7 @@ class Dashboard:
         model = self.model
         head = {"number": model.history.number, "now": model.clock(), "wall": time.time(), "stops": model.stops()}
         keys = [row.key for row in model.rows()]
-
-        async def lines() -> AsyncIterator[str]:
-            yield json.dumps(head) + "\n"
-            for line in model.states(keys, int(number), at):
-                yield line + "\n"
-                await asyncio.sleep(0)
-
-        return StreamingResponse(lines(), media_type=NDJSON)
+        return _lines(chain((json.dumps(head),), model.states(keys, int(number), at)))
 
     async def _series(self, request: Request) -> Response:
         """Send the samples of one robot."""
@@ -281,13 +274,7 @@ class Dashboard:
         found = self.model.series(asked.get("robot", ""), _number(asked.get("after")))
         if found is None:
             return PlainTextResponse("No such robot.\n", 404)
-
-        async def lines() -> AsyncIterator[str]:
-            for line in found:
-                yield line + "\n"
-                await asyncio.sleep(0)
-
-        return StreamingResponse(lines(), media_type=NDJSON)
+        return _lines(found)
 
 
 class QuietServer(uvicorn.Server):
@@ -347,6 +334,17 @@ def _file(path: Path) -> Any:
         return Response(content, media_type=kind)
 
     return serve
+
+
+def _lines(lines: Iterable[str]) -> Response:
+    """Return an answer of many lines; other work has a turn behind each."""
+
+    async def sent() -> AsyncIterator[str]:
+        for line in lines:
+            yield line + "\n"
+            await asyncio.sleep(0)
+
+    return StreamingResponse(sent(), media_type="application/x-ndjson")
 
 
 def _number(given: str | None) -> float:

@@ -26,7 +26,7 @@ FIND_S = 2.0
 """Seconds at most in which robots are looked for."""
 
 CLOSED = "the fleet was closed before it answered"
-"""Reason of a call that :meth:`NetworkAdapter.close` ends."""
+"""Reason of a call that the end of its network ends, or that comes later."""
 
 STOP_S = 5.0
 """Seconds in which a robot has to answer a stop."""

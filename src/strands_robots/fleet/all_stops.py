@@ -12,9 +12,9 @@ from typing import Any
 
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.errors import UnreachableError
-from strands_robots.fleet.adapter import STOP_S, NetworkAdapter
+from strands_robots.fleet.adapter import CLOSED, STOP_S, NetworkAdapter
 from strands_robots.fleet.fleet_verdict import FleetVerdict, NetworkVerdict
-from strands_robots.fleet.networks import CLOSED, Networks
+from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.side_by_side import on_own_thread, side_by_side
 from strands_robots.fleet.stop_answers import not_reached, roster_verdict
 from strands_robots.safety.controller import Progress

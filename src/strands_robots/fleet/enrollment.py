@@ -10,7 +10,7 @@ from enum import Enum
 from strands_robots.audit import log_safety_event
 from strands_robots.errors import NoSuchRobotError
 from strands_robots.fleet.lockout_report import LockoutReport
-from strands_robots.safety.identity import EnrolledKeys, EnrolledRobot, Exemption, fingerprint, local_name
+from strands_robots.safety.identity import EnrolledKeys, Exemption, fingerprint, local_name
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.roster_report import CELL_MAX
 from strands_robots.safety.sightings import sightings
@@ -84,15 +84,6 @@ def enroll(reports: Sequence[LockoutReport], network: NetworkKey, *, replace: bo
 def shown_key(report: LockoutReport) -> bytes | None:
     """Return the key that a robot signed its report with; None without one."""
     return own_key(Purpose.LOCKOUT_STATE, report.name, _statement(report.facts))
-
-
-def enrolled_robots() -> dict[str, EnrolledRobot]:
-    """Return the enrolled robots by name, with their exemptions.
-
-    Raises:
-        KeyFileError, OSError: the file cannot be used.
-    """
-    return EnrolledKeys().robots()
 
 
 def change_enrolment(robot: str, action: str, reason: str = "", *, tenant: str = "") -> str:

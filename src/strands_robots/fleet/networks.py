@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 from strands_robots.envelope import Envelope, error
 from strands_robots.errors import NoSuchRobotError, RefusalError, UnreachableError
-from strands_robots.fleet.adapter import FIND_S, STOP_S, Detail, FoundRobot, NetworkAdapter, OnEvent
+from strands_robots.fleet.adapter import CLOSED, FIND_S, STOP_S, Detail, FoundRobot, NetworkAdapter, OnEvent
 from strands_robots.fleet.bearers import bears, reaches
 from strands_robots.fleet.joining import Joining
 from strands_robots.fleet.side_by_side import on_own_thread, side_by_side, those
@@ -44,8 +44,6 @@ R = TypeVar("R")
 
 STILL = READS | STOPS | RESUMES | {"wait"}
 """Verbs of our robots that move nothing."""
-
-CLOSED = "the networks were left"
 
 
 class Networks:

@@ -263,11 +263,6 @@ class Roster:
         """The rows that the exit code depends on."""
         return tuple(row for row in self.rows if self.counts(row))
 
-    @property
-    def told_only(self) -> tuple[RosterRow, ...]:
-        """The rows that are printed as a group and do not alter the exit code."""
-        return tuple(row for row in self.rows if not self.counts(row))
-
     def with_reported(self, rows: Iterable[RosterRow], by: str) -> Roster:
         """Return the roster with rows that the controller ``by`` reported.
 

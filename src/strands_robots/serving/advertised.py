@@ -245,11 +245,6 @@ def verb_names(functions: object) -> list[str]:
     return [each["name"] for each in _rows(functions)]
 
 
-def own_names(names: object) -> list[str]:
-    """Return the names of own verbs as a mesh peer's presence has them."""
-    return verb_names([{"name": each} for each in islice(names, VERBS_MAX)]) if isinstance(names, list) else []
-
-
 def fitting(rows: Iterable[T], most: int) -> list[T]:
     """Return the rows whose JSON is within so many bytes together, the first ones first."""
     kept, left = list[T](), most

@@ -66,12 +66,14 @@ def _run(screen: DemoScreen, report: DemoReport, output: Path) -> None:
     from strands_robots.cli.demo.steps import CONTROLLER, DriveSteps, SafetySteps, demo_operator  # noqa: PLC0415
     from strands_robots.device_connect.backends import loopback_config  # noqa: PLC0415
     from strands_robots.device_connect.safety_controller import safety_controller  # noqa: PLC0415
+    from strands_robots.safety.ed25519 import load_signing_key  # noqa: PLC0415
     from strands_robots.simulation.tabletop import TABLETOP  # noqa: PLC0415
 
     port = free_port()
     screen.head(f"Another process serves a simulated {ROBOT} at a table; this one is the agent, by a script")
     with ExitStack() as stack:
-        key = stack.enter_context(demo_operator())
+        # A safety controller of the user's own takes no part.
+        key = load_signing_key(*stack.enter_context(demo_operator(CONTROLLER)))
         with report.step("serve"):
             robot = stack.enter_context(served_robot(ROBOT, TABLETOP, PEER, port, TENANT))
         screen.done(f"{PEER} is on the network at 127.0.0.1:{port}, in process {robot.process.pid}")

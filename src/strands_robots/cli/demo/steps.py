@@ -23,7 +23,7 @@ from strands_robots.cli.watch import joints_table
 from strands_robots.fleet.joint_features import joint_limits
 from strands_robots.policies.base import plain_numbers
 from strands_robots.safety.controller import SafetyController
-from strands_robots.safety.ed25519 import keygen, load_signing_key
+from strands_robots.safety.ed25519 import keygen
 from strands_robots.safety.resume import sign
 from strands_robots.simulation.tabletop import CUBE, PLATE
 
@@ -85,21 +85,23 @@ class DemoReport:
 
 
 @contextmanager
-def demo_operator() -> Iterator[Any]:
-    """Yield an operator's key for this demo; the robot gets its public half.
+def demo_operator(estop_allow: str = "") -> Iterator[tuple[Path, str]]:
+    """Yield the file and the passphrase of a key whose public half robots get.
 
-    Robot and audit get a state folder of their own, so that no demo finds the lockout of an earlier one.
+    Robots and audit get a state folder of their own, so that no demo finds the lockout of an earlier one.
+
+    Args:
+        estop_allow: sources whose emergency stop counts; every one by default.
     """
     with tempfile.TemporaryDirectory(prefix="strands-demo-") as folder:
         key, passphrase = Path(folder) / "operator.pem", f"Demo-{secrets.token_hex(16)}"
         settings.put("STRANDS_MESH_RESUME_PUBLIC_KEY", keygen(key, passphrase))
         settings.put("STRANDS_STATE_DIR", folder)
         settings.put("STRANDS_MESH_AUDIT_DIR", "")
-        # A safety controller of the user's own takes no part.
-        settings.put("DEVICE_CONNECT_ESTOP_ALLOW", CONTROLLER)
+        settings.put("DEVICE_CONNECT_ESTOP_ALLOW", estop_allow)
         settings.put("DEVICE_CONNECT_ESTOP_PUBLIC_KEYS", "")
         settings.put("STRANDS_CHECKIN_TIMEOUT_S", "0")
-        yield load_signing_key(key, passphrase)
+        yield key, passphrase
 
 
 class DriveSteps:

@@ -485,13 +485,12 @@ class MeshNetwork:
             given = {"robot_name": next(iter(names), ""), **given}
         return given
 
-    def _waited_for(self, robot: str, longest: float = math.inf) -> bool:
+    def _waited_for(self, robot: str) -> bool:
         """Return whether the peer is in reach, once that can be known."""
         from strands_robots.mesh.transport.zenoh_config import DISCOVERY_S, discovery_timeout  # noqa: PLC0415 - as above
 
         # A loaded machine gets twice the time.
-        usual = max(discovery_timeout(DISCOVERY_S), 2 * DISCOVERY_S)
-        return awaited(self._joined_mesh, robot, self._joined + min(usual, longest))
+        return awaited(self._joined_mesh, robot, self._joined + max(discovery_timeout(DISCOVERY_S), 2 * DISCOVERY_S))
 
     def _absent(self, robot: str, verb: str) -> NoSuchRobotError:
         remedy = near(robot, in_reach(self._joined_mesh)).strip()
