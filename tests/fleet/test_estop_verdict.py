@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Collection
+from contextlib import nullcontext
 from types import SimpleNamespace
 from typing import Any
 
@@ -92,7 +93,8 @@ def press(monkeypatch: pytest.MonkeyPatch) -> Press:
             return measure(self, *given)
 
         monkeypatch.setattr(stop_roster.StopRoster, "outcome", measured)
-        answer = stops.stop_and_lock(fleet, "test")  # type: ignore[arg-type]
+        outcome = stops.stopped_and_locked(fleet.link, fleet.source, lambda: nullcontext(fleet), "test")  # type: ignore[arg-type]
+        answer = safety_controller.outcome_envelope(outcome)
         assert fleet.asked == [name for name in plain if name not in stopped]
         return answer
 

@@ -6,13 +6,13 @@ import logging
 import threading
 from collections.abc import Callable, Collection
 from concurrent.futures import Future
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from strands_robots.envelope import Envelope
 from strands_robots.fleet.adapter import FIND_S, STOP_S
-from strands_robots.fleet.stop_answers import measured, roster_verdict, with_plain_stops, with_reasons
+from strands_robots.fleet.stop_answers import measured, with_plain_stops, with_reasons
 from strands_robots.safety.controller import OnProgress, Progress, StopReport
 from strands_robots.safety.orders import new_epoch
 from strands_robots.safety.roster_search import FoundDevices, RosterSearch
@@ -43,11 +43,6 @@ Connect = Callable[[], AbstractContextManager["FleetClient"]]
 """Connects a client for the length of a block, or lends one that is connected."""
 
 
-def stop_everything(fleet: FleetClient) -> Envelope:
-    """Stop each device that is found; answers by name, measured by the roster."""
-    return roster_verdict(stop_found(fleet, STOP_S)[1])
-
-
 def stop_found(fleet: FleetClient, seconds: float) -> tuple[dict[str, Envelope], StopOutcome]:
     """Stop each device when it is found; return answers and outcome."""
     roster = StopRoster(network_key(fleet.link))
@@ -59,13 +54,6 @@ def stop_found(fleet: FleetClient, seconds: float) -> tuple[dict[str, Envelope],
     outcome = replace(measured(answers, roster, sending, problem=fleet.stale.rstrip(".")), unsigned=True)
     outcome.record(fleet.source)
     return answers, outcome
-
-
-def stop_and_lock(fleet: FleetClient, reason: str, scope: Scope = EVERY_ROBOT) -> Envelope:
-    """Send an emergency stop under the name of a connected client; answers by name."""
-    from strands_robots.device_connect.safety_controller import outcome_envelope  # noqa: PLC0415 - the network is loaded when it is used
-
-    return outcome_envelope(stopped_and_locked(fleet.link, fleet.source, lambda: nullcontext(fleet), reason, scope))
 
 
 def stopped_and_locked(
