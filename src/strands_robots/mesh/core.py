@@ -579,6 +579,7 @@ class Mesh(SensorLoopsMixin):
         self,
         signing_key: Any = None,
         *,
+        reason: str = "",
         estop_id: str = "",
         on_answers: OnAnswers = lambda replies: None,
         scope: Scope = EVERY_ROBOT,
@@ -591,6 +592,7 @@ class Mesh(SensorLoopsMixin):
 
         Args:
             signing_key: for fleets that act on signed stops only.
+            reason: sent to the robots.
             estop_id: 32 hex digits, the same for one press; a fresh one by default.
             on_answers: called with the replies so far.
             scope: the robots that it is for. Where none of them is there, every robot is stopped.
@@ -605,6 +607,7 @@ class Mesh(SensorLoopsMixin):
             raise RuntimeError(f"{self.peer_id} is not on the mesh: no peer would hear the emergency stop.")
         return self._safety.emergency_stop(
             signing_key,
+            reason=reason,
             estop_id=estop_id,
             on_answers=on_answers,
             scope=scope,

@@ -356,12 +356,13 @@ class MeshNetwork:
         deadline_s: float | None = None,
         on_progress: OnProgress = lambda progress: None,
     ) -> StopOutcome:
-        """Stop and lock the peers; the mesh carries no reason, and tells no progress."""
-        del reason, deadline_s, on_progress  # the mesh's own deadlines count
+        """Stop and lock the peers; the mesh tells no progress."""
+        del deadline_s, on_progress  # the mesh's own deadlines count
         return lock_peers(
             self._joined_mesh,
             signing_key,
             scope,
+            reason=reason,
             estop_id=estop_id,
             since=self._fresh,
             remembers=remembers,
