@@ -144,3 +144,14 @@ def test_waiting_motions_take_no_thread_of_the_loop(
         lambda: not [each for each in threading.enumerate() if each.name.startswith("networks")],
         what="the end of the threads",
     )
+
+
+def test_motion_of_a_robot_that_has_left_both_networks_finds_none(
+    fleet: Fleet, near: ScriptedNetwork, far: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    both = fleet["both"]
+    assert "moveTo" in both.verbs
+    leave(near, monkeypatch)
+    leave(far, monkeypatch)
+    with pytest.raises(errors.NoSuchRobotError, match="any more"):
+        both.move_to(x=1)
