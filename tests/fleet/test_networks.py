@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
@@ -694,15 +693,3 @@ class TestStopLink:
         assert verdict.missing == ("arm-9",)
         assert {each.network: list(each.silent) for each in verdict.networks} == {DEVICE_CONNECT: ["arm-9"], MESH: []}
         assert verdict["arm-1"].stopped and verdict["arm-2"].stopped
-
-
-def test_robot_that_left_one_network_is_not_called_on_another_one_where_it_is_silent(
-    near: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    far = ScriptedNetwork(MESH, {"both": OURS})
-    with Networks([near, far]) as joined:
-        joined.settled()
-        assert joined.instead("both", "moveTo", near, moves=False) is far
-        silent_for = 4 * far.beats_every("both")
-        monkeypatch.setattr(far, "beats", lambda robots: dict.fromkeys(robots, time.monotonic() - silent_for))
-        assert joined.instead("both", "moveTo", near, moves=False) is None

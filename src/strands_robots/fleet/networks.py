@@ -306,7 +306,7 @@ class Networks:
         return self._chosen(robot, verb, bearers, moves=moves)
 
     def instead(self, robot: str, verb: str, gone: NetworkAdapter, *, moves: bool) -> NetworkAdapter | None:
-        """Return the network on which a robot lives that has left another one; None for none.
+        """Return the network that still has a robot which left another one, or None.
 
         Args:
             robot: its id.

@@ -509,7 +509,7 @@ class MeshNetwork:
 
     @staticmethod
     def _linked() -> bool:
-        """Return whether the mesh has a hub; another peer may just be taking the place of the last one."""
+        """Return whether the mesh has a hub, once another peer had time to become it."""
         from strands_robots.mesh import session  # noqa: PLC0415 - loaded when it is used
 
         until = time.monotonic() + HUB_S
