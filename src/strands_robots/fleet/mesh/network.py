@@ -74,7 +74,7 @@ DESCRIBE_S = 5.0
 VERB_S = 2.0
 """Seconds in which a peer has to describe a verb of its own before that is called."""
 
-HUB_S = 3.0
+HUB_S = 1.0
 """Seconds in which a mesh that lost its hub has to have one again before a call counts as not to be delivered."""
 
 UNSEEN_S = 0.2
@@ -520,7 +520,7 @@ class MeshNetwork:
         return True
 
     def _absent(self, robot: str, verb: str) -> NoSuchRobotError:
-        remedy = near(robot, in_reach(self._joined_mesh)).strip()
+        remedy = near(robot, {*in_reach(self._joined_mesh)} - {robot}).strip()
         return NoSuchRobotError(f"No peer {robot!r} is on the mesh", robot=robot, verb=verb, remedy=remedy)
 
 
