@@ -138,6 +138,9 @@ def run(
 
     Returns:
         The verdict of the halt.
+
+    Raises:
+        DuplicateDeviceError: another device of this id is served.
     """
     from strands_robots import device_connect  # noqa: PLC0415 - the network is loaded when it is used
     from strands_robots.device_connect.links import usual_link  # noqa: PLC0415
@@ -152,7 +155,11 @@ def run(
     report: Callable[[str], None] = _print_to_terminal if until is None else logger.info
     joins = getattr(robot, "mesh", None) is None and (mesh or (mesh is None and mesh_env_request() is True))
     with device_connect.StopSignal() if until is None else nullcontext(until) as stop:
-        runtime = device_connect.init_device_connect_sync(robot, peer_id=peer_id, **network)
+        try:
+            runtime = device_connect.init_device_connect_sync(robot, peer_id=peer_id, **network)
+        except device_connect.DuplicateDeviceError as exc:
+            # Its last line says it all: without the frames of the loop that brought it up.
+            raise device_connect.DuplicateDeviceError(str(exc)) from None
         peer = None
         report(f"Serving {runtime.device_id}; Ctrl-C stops the robot first.")
         try:

@@ -69,6 +69,8 @@ def test_call_sends_typed_values(run: Run, fleet: FakeFleet) -> None:
     ("answer", "code"),
     [
         (error("not allowed"), 1),
+        (error("seconds is missing", refused="arguments"), 2),
+        (CallRefusedError("Invalid params", -32602), 2),
         (CallRefusedError("Unknown method: x", -32601), 1),
         (NoSuchDeviceError("No device 'arm-1' in tenant 'default'."), 3),
         (DeviceTimeoutError("arm-1 is announced and did not answer within 4 s."), 3),
@@ -268,3 +270,10 @@ def test_call_without_a_function_lists_them_with_their_domains(run: Run, fleet: 
     bare = run("peers", "echo-1").stdout
     assert "This device has no lockout, no lease and no stop." in bare
     assert "\x1b" not in bare
+
+
+def test_call_that_was_sent_and_got_no_answer_says_that_it_may_still_be_carried_out(run: Run, fleet: FakeFleet) -> None:
+    fleet.answer = DeviceTimeoutError("arm-1 got the call and gave no answer: it may have left the network.")
+    result = run("call", "arm-1", "execute")
+    assert result.exit_code == 3
+    assert "It may still carry the call out." in result.stderr

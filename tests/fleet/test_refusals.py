@@ -6,7 +6,7 @@ import pytest
 
 from strands_robots import errors
 from strands_robots.errors import RefusalError, StrandsRobotsError
-from strands_robots.fleet.refusals import BY_REASON, refusal_of_text
+from strands_robots.fleet.refusals import BY_REASON, refusal_of_text, said
 from strands_robots.mesh import commands
 from strands_robots.safety.approval import Approval
 from strands_robots.serving.refused import RefusalReason
@@ -60,3 +60,7 @@ def test_refusal_says_who_what_why_and_what_to_do() -> None:
 def test_refusals_keep_the_built_in_that_callers_know(cause: type[RefusalError], known_as: type[Exception]) -> None:
     assert isinstance(cause("why", robot="arm-1"), known_as)
     assert str(cause("why", robot="arm-1", remedy="")) == "arm-1: why."
+
+
+def test_call_without_an_answer_may_still_be_carried_out() -> None:
+    assert said(errors.NoAnswerError("it did not answer")) == "it did not answer. It may still carry the call out."

@@ -105,6 +105,18 @@ class TestVerbsAsMethods:
             robot.fly()
         assert list(robot.verbs) == ["swim"]
 
+    def test_verb_of_a_robot_that_is_gone_is_not_called_unknown(
+        self, arm: RemoteRobot, network: ScriptedNetwork
+    ) -> None:
+        del network.robots["arm-1"]
+        with pytest.raises(errors.NoSuchRobotError, match="gone"):
+            arm.move_to(x=1)
+
+    def test_verbs_that_were_found_are_known_of_a_robot_that_is_gone(self, network: ScriptedNetwork) -> None:
+        arm = RemoteRobot(FoundRobot("arm-1", functions=OURS), network)
+        del network.robots["arm-1"]
+        assert list(arm.verbs) == [each["name"] for each in OURS]
+
     def test_copy_asks_the_robot_for_nothing(self, arm: RemoteRobot, network: ScriptedNetwork) -> None:
         assert copy.copy(arm).id == "arm-1"
         assert not network.calls

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -144,3 +145,25 @@ def test_waiting_motions_take_no_thread_of_the_loop(
         lambda: not [each for each in threading.enumerate() if each.name.startswith("networks")],
         what="the end of the threads",
     )
+
+
+def test_motion_of_a_robot_that_has_left_both_networks_finds_none(
+    fleet: Fleet, near: ScriptedNetwork, far: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    both = fleet["both"]
+    assert "moveTo" in both.verbs
+    leave(near, monkeypatch)
+    leave(far, monkeypatch)
+    with pytest.raises(errors.NoSuchRobotError, match="any more"):
+        both.move_to(x=1)
+
+
+def test_robot_that_left_one_network_is_not_called_on_another_one_where_it_is_silent(
+    near: ScriptedNetwork, far: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with Networks([near, far]) as joined:
+        joined.settled()
+        assert joined.instead("both", "moveTo", near, moves=False) is far
+        silent_for = 4 * far.beats_every("both")
+        monkeypatch.setattr(far, "beats", lambda robots: dict.fromkeys(robots, time.monotonic() - silent_for))
+        assert joined.instead("both", "moveTo", near, moves=False) is None

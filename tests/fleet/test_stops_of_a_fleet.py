@@ -27,8 +27,10 @@ from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.roster import Roster, RosterRow
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.safety.sightings import Known
+from strands_robots.utils import ValidationError
 
 NEAR = key_of(DEVICE_CONNECT)
+KEY = Ed25519PrivateKey.generate()
 
 
 @pytest.fixture
@@ -185,9 +187,9 @@ def test_lockouts_are_read_and_resumed_by_robot(fleet: Fleet, near: ScriptedNetw
     assert {name: [each.epoch for each in report.lockouts] for name, report in fleet.lockouts().items()} == {
         name: [stop.estop_id] for name in ("arm-1", "arm-2", "both")
     }
-    assert fleet.resume("key", "arm-1") == {"arm-1": (True, "free")}
+    assert fleet.resume(KEY, "arm-1") == {"arm-1": (True, "free")}
     assert sorted(near.locked) == ["both"]
-    assert {name: free for name, (free, _) in fleet.resume("key").items()} == dict.fromkeys(
+    assert {name: free for name, (free, _) in fleet.resume(KEY).items()} == dict.fromkeys(
         ("arm-1", "arm-2", "both"), True
     )
 
@@ -213,8 +215,8 @@ def test_robot_that_no_search_finds_is_asked_by_its_id(
     for network in (near, far):
         monkeypatch.setattr(network, "lockable", lambda *_: [])
     far.locked["arm-2"] = "e" * 32
-    assert fleet.resume("key", "arm-2") == {"arm-2": (True, "free")}
-    assert fleet.resume("key") == {}
+    assert fleet.resume(KEY, "arm-2") == {"arm-2": (True, "free")}
+    assert fleet.resume(KEY) == {}
 
 
 def test_resume_of_one_robot_asks_all_before_it_names_who_is_not_heard(
@@ -230,7 +232,7 @@ def test_resume_of_one_robot_asks_all_before_it_names_who_is_not_heard(
         return Unheard()
 
     monkeypatch.setattr(module, "unheard_now", unheard)
-    fleet.resume("key", "arm-1")
+    fleet.resume(KEY, "arm-1")
     assert heard == [{"arm-1", "both"}, {"arm-2", "both"}]
 
 
@@ -238,7 +240,7 @@ def test_robot_that_stays_locked_on_one_network_is_not_free(
     fleet: Fleet, far: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(far, "resume", lambda reports, *_: {each.name: (False, "no") for each in reports})
-    outcome = fleet.resume("key")
+    outcome = fleet.resume(KEY)
     assert outcome["arm-1"][0] is True
     assert outcome["both"] == (False, "no")
 
@@ -254,7 +256,7 @@ def test_network_that_fails_midway_of_a_resume_hides_no_robot_that_was_freed(
         raise errors.UnreachableError("the connection is lost")
 
     monkeypatch.setattr(broken, "resume", lost)
-    outcome = fleet.resume("key")
+    outcome = fleet.resume(KEY)
     told = (False, f"{broken.name} failed: the connection is lost")
     alone = {"arm-1", "arm-2"} & sound.robots.keys()
     assert outcome == dict.fromkeys(alone, (True, "free")) | dict.fromkeys(broken.robots, told)
@@ -263,7 +265,7 @@ def test_network_that_fails_midway_of_a_resume_hides_no_robot_that_was_freed(
 def test_resume_of_an_absent_robot_is_refused_and_frees_none(fleet: Fleet, near: ScriptedNetwork) -> None:
     fleet.estop()
     with pytest.raises(errors.NoSuchRobotError, match="nowhere"):
-        fleet.resume("key", ["arm-1", "nowhere"])
+        fleet.resume(KEY, ["arm-1", "nowhere"])
     assert "arm-1" in near.locked
 
 
@@ -275,7 +277,7 @@ def test_robots_that_are_not_heard_are_named_before_others_are_freed(
 
     monkeypatch.setattr(module, "unheard_now", lambda *_: Unheard(("arm-7",)))
     with caplog.at_level(logging.WARNING):
-        fleet.resume("key")
+        fleet.resume(KEY)
     assert "NOT HEARD: arm-7" in caplog.text
 
 
@@ -363,7 +365,7 @@ def test_robot_that_was_freed_on_one_network_is_asked_anew_on_the_other(
 
     monkeypatch.setattr(near, "resume", freed)
     monkeypatch.setattr(far, "resume", strict)
-    assert fleet.resume("key")["both"] == (True, "free")
+    assert fleet.resume(KEY)["both"] == (True, "free")
 
 
 def test_two_keys_of_one_id_are_both_left_out(fleet: Fleet, near: ScriptedNetwork, far: ScriptedNetwork) -> None:
@@ -430,3 +432,21 @@ def test_robots_of_another_network_that_is_stopped_too_are_none_of_other_network
     with Fleet([near, far]) as fleet:
         for stop in (fleet.stop(), fleet.estop()):
             assert [each.outcome.roster.elsewhere for each in stop.networks if each.outcome is not None] == [1, 1]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        ((None, ["arm-1"]), "signing_key"),
+        (("key", "arm-1"), "signing_key"),
+        ((KEY, 5), "robots"),
+        ((KEY, None), "robots"),
+        ((KEY, [None]), "robots"),
+    ],
+)
+def test_resume_names_an_argument_that_is_unfit_and_asks_no_robot(
+    fleet: Fleet, near: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch, arguments: Any, named: str
+) -> None:
+    monkeypatch.setattr(near, "lockable", lambda timeout: pytest.fail("it looks for robots"))
+    with pytest.raises(ValidationError, match=f"^{named} must be"):
+        fleet.resume(*arguments)

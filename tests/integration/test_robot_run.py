@@ -15,7 +15,7 @@ from fixtures.toy_robots import ToyRobot
 from fixtures.waiting import eventually, free_port
 
 from strands_robots import HardwareRobot
-from strands_robots.device_connect import loopback_config
+from strands_robots.device_connect import DuplicateDeviceError, loopback_config
 from strands_robots.device_connect.client import open_client
 from strands_robots.mesh import Mesh
 from strands_robots.robot import run
@@ -88,6 +88,26 @@ def test_robot_whose_tags_are_none_of_ours_is_served_on_both_networks(monkeypatc
     finally:
         toy.close()
     assert [mesh.peer_id for mesh in joined] == ["tagged"]
+
+
+def test_second_robot_of_an_id_is_refused_without_the_frames_of_its_loop(
+    monkeypatch: pytest.MonkeyPatch, patient_halts: None
+) -> None:
+    port, until = free_port(), threading.Event()
+    monkeypatch.setenv("STRANDS_DC_PORT", str(port))
+    toy = ToyRobot("toy")
+    first = threading.Thread(target=run, args=(toy,), kwargs={"peer_id": "arm-1", "until": until, "mesh": False})
+    first.start()
+    try:
+        eventually(lambda: status_of(port, "arm-1"))
+        with pytest.raises(DuplicateDeviceError, match="'arm-1' is live") as refused:
+            run(ToyRobot("second"), peer_id="arm-1", until=threading.Event(), mesh=False)
+    finally:
+        until.set()
+        first.join(30)
+        toy.close()
+    assert [each.name for each in refused.traceback][1:] == ["run"]
+    assert refused.value.__suppress_context__
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

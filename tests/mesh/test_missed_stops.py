@@ -101,11 +101,12 @@ def settled(asked: list[Any]) -> None:
 def test_robot_that_was_cut_off_is_locked_by_the_original_and_no_stop_is_published_again(peers: Fleet) -> None:
     sent = list[bytes]()
     peers.stranger().declare_subscriber("strands/safety/estop", lambda sample: sent.append(sample.payload))
-    first, away = stopped_without(peers, "arm-2")
+    first, away = stopped_without(peers, "arm-2", reason="a hand")
     before, answers = len(sent), received(peers, "strands/*/missed/answer")
     back(peers, "arm-2")
     eventually(lambda: away.lockout_epoch == first.lockout_epoch, what="the lock of the robot that is back")
     assert len(sent) == before
+    assert away._adapter.lockouts()[0]["reason"] == "a hand"
     event = answers[0]["stops"][0]["event"]
     assert base64.urlsafe_b64decode(event + "=" * (-len(event) % 4)) == sent[0]
 

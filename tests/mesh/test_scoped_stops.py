@@ -167,3 +167,29 @@ def test_scope_that_is_not_proven_is_every_robot_where_signatures_are_demanded(
     assert adapter.scope("console", {**body, "scope": {"cell": "cell-3"}}) == EVERY_ROBOT
     console.emergency_stop(key, scope=ONLY_ARM_1)
     assert locked(peers) == {"arm-1"}
+
+
+@pytest.mark.parametrize("scope", [EVERY_ROBOT, Scope(cell="cell-1"), ONLY_ARM_1], ids=str)
+@pytest.mark.parametrize("signs", [False, True])
+def test_reason_of_a_stop_is_kept_by_the_robots_that_it_locks(
+    peers: Fleet, monkeypatch: pytest.MonkeyPatch, scope: Scope, signs: bool
+) -> None:
+    key = Ed25519PrivateKey.generate() if signs else None
+    if key is not None:
+        monkeypatch.setenv("DEVICE_CONNECT_ESTOP_PUBLIC_KEYS", ed25519.encode(ed25519.public_half(key)))
+        monkeypatch.setenv(REQUIRE_SIGNED, "true")
+    console = peers.join(None, "console")
+    _, mesh = join(peers, "arm-1", "cell-1")
+    # The longest that a face lets through.
+    reason = "\N{WAVING HAND SIGN}" * 200
+    console.emergency_stop(key, reason=reason, scope=scope)
+    assert [each["reason"] for each in mesh._adapter.lockouts()] == [reason]
+
+
+def test_stop_without_a_reason_states_none(peers: Fleet) -> None:
+    console = peers.join(None, "console")
+    _, mesh = join(peers, "arm-1")
+    published = received(peers, "strands/safety/estop")
+    console.emergency_stop()
+    assert published and all("reason" not in each for each in published)
+    assert mesh._adapter.lockouts()[0]["reason"] == "fleet e-stop"

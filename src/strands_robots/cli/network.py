@@ -263,7 +263,7 @@ def answering(there: Networks, robot: str, verb: str) -> Iterator[None]:
 
     Raises:
         CliError: no such robot or no answer (exit code 3), the call was refused as such, or two robots have the id
-            (exit code 1), or was not sent for its arguments (exit code 2).
+            (exit code 1), or its arguments were refused (exit code 2).
     """
     from strands_robots.fleet.refusals import near_verbs, said  # noqa: PLC0415 - only a call needs it
 
@@ -275,14 +275,14 @@ def answering(there: Networks, robot: str, verb: str) -> Iterator[None]:
             raise
         several = isinstance(refusal, AmbiguousRobotError)
         reason, code = said(refusal), Exit.REFUSED if answer or several else Exit.SILENT
+        if isinstance(refusal, ArgumentsError):
+            code = Exit.USAGE
         fields: dict[str, Any] = {"answer": answer} if answer else {}
         if several:
             reason += " Give one of them another id; --mesh means the one on the mesh."
         elif isinstance(refusal, NoSuchRobotError):
             reason += "" if refusal.remedy else near_robots(there, robot)
             reason += "".join(f" Not reached: {name}, {why.rstrip('.')}." for name, why in there.missing.items())
-        elif isinstance(refusal, ArgumentsError) and not answer:
-            code = Exit.USAGE
         elif "jsonrpc_code" in answer:
             fields = {"jsonrpc_code": answer["jsonrpc_code"]}
             verbs = near_verbs(there, robot, verb) if isinstance(refusal, UnknownVerbError) else ""

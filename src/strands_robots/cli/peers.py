@@ -19,6 +19,7 @@ from strands_robots.fleet.adapter import FIND_S
 from strands_robots.fleet.callers import SOURCE
 from strands_robots.fleet.networks import STILL
 from strands_robots.serving.known_verbs import QUICK, STOPS, TEXTS, VERBS, WAITING
+from strands_robots.serving.refused import RefusalReason
 from strands_robots.utils import WAIT_S, ValidationError, identifier, number
 
 if TYPE_CHECKING:
@@ -180,7 +181,8 @@ def call(
             raise CliError(reason, failure.code, **failure.fields) from failure
     if is_error(answer):
         reason = text_of(answer) or f"{device} refused {function}."
-        code = Exit.SILENT if answer.get("stopped", ...) is None else Exit.REFUSED
+        code = Exit.USAGE if answer.get("refused") == RefusalReason.ARGUMENTS.value else Exit.REFUSED
+        code = Exit.SILENT if answer.get("stopped", ...) is None else code
         raise CliError(plain(f"{reason} {network.other_user(there)}".rstrip(), 2000), code, answer=answer)
     screen.data(answer)
     screen.say(readable(text_of(answer)) or f"{device} answered {function}.", "green")

@@ -22,7 +22,7 @@ from device_connect_edge.messaging.exceptions import MessagingError, NotConnecte
 
 from strands_robots.bounded_json import LONG_MAX, json_object
 from strands_robots.device_connect.backends import LinkConfig, open_client
-from strands_robots.device_connect.backends.base import NoResponderError
+from strands_robots.device_connect.backends.base import NoResponderError, ResponderLostError
 from strands_robots.device_connect.discovery import DESCRIBE_S, HEARTBEATS_S, Discovery, Peer, parts
 from strands_robots.device_connect.enrollment import network_of
 from strands_robots.device_connect.shutdown import LOOP_JOIN_TIMEOUT_S
@@ -65,7 +65,7 @@ class NoSuchDeviceError(StrandsRobotsError, LookupError):
 
 
 class DeviceTimeoutError(StrandsRobotsError, TimeoutError):
-    """The device is on the network and did not answer in time."""
+    """The device got the call and did not answer in time, or left the network before."""
 
 
 class ClientClosedError(StrandsRobotsError, TimeoutError):
@@ -192,7 +192,7 @@ class FleetClient:
         Raises:
             ValidationError: ``params`` holds NaN or infinity, at any depth, or what JSON cannot carry.
             NoSuchDeviceError: no device has the id ``device``.
-            DeviceTimeoutError: it is there and did not answer within ``timeout`` seconds.
+            DeviceTimeoutError: it did not answer within ``timeout`` seconds, or left after the call had reached it.
             CallRefusedError: it refused the call as such: an unknown function, a malformed message.
             MessagingError: the network cannot carry the call.
         """
@@ -417,6 +417,8 @@ class FleetClient:
         """Return the error for an unanswered call."""
         if isinstance(exc, NoResponderError):
             return NoSuchDeviceError(f"No device {device!r} in tenant {self.link.tenant!r}.")
+        if isinstance(exc, ResponderLostError):
+            return DeviceTimeoutError(f"{device} got the call and gave no answer: it may have left the network.")
         if isinstance(exc, RequestTimeoutError):
             return DeviceTimeoutError(f"{device} is on the network and did not answer within {within:g} s ({exc}).")
         return exc

@@ -252,12 +252,16 @@ class Fleet:
             timeout: seconds in which each robot has to answer.
 
         Raises:
+            ValidationError: ``signing_key`` cannot sign, ``robots`` are no ids, or ``timeout`` is not above 0.
             NoSuchRobotError: one of ``robots`` is on no network.
             KeyFileError: the enrolled keys cannot be used.
         """
         seconds = number("timeout", timeout, above=0, high=60)
-        named = [robots] if isinstance(robots, str) else list(robots)
-        wanted = [device_id("robots", each) for each in named]
+        if _signer(signing_key)[0] is None:
+            raise ValidationError(f"signing_key must be an Ed25519 private key, not {type(signing_key).__name__}.")
+        if not isinstance(robots, str | Collection):
+            raise ValidationError(f"robots must be ids, not {shown(robots)}.")
+        wanted = [device_id("robots", each) for each in ([robots] if isinstance(robots, str) else robots)]
         reports = ask_lockouts(self._networks, seconds, besides=wanted, look_s=seconds)
         if unheard := unheard_in(reports):
             logger.warning("%s", unheard)

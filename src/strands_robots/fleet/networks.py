@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar
 from strands_robots.envelope import Envelope, error
 from strands_robots.errors import NoSuchRobotError, RefusalError, UnreachableError
 from strands_robots.fleet.adapter import CLOSED, FIND_S, STOP_S, Detail, FoundRobot, NetworkAdapter, OnEvent
-from strands_robots.fleet.bearers import bears, reaches
+from strands_robots.fleet.bearers import bears, reaches, silent
 from strands_robots.fleet.joining import Joining
 from strands_robots.fleet.side_by_side import on_own_thread, side_by_side, those
 from strands_robots.serving.known_verbs import READS, RESUMES, STOPS
@@ -306,7 +306,7 @@ class Networks:
         return self._chosen(robot, verb, bearers, moves=moves)
 
     def instead(self, robot: str, verb: str, gone: NetworkAdapter, *, moves: bool) -> NetworkAdapter | None:
-        """Return the network that has a robot which has left another one; None for none.
+        """Return the network that still has a robot which left another one, or None.
 
         Args:
             robot: its id.
@@ -314,7 +314,7 @@ class Networks:
             gone: the network that no longer has it.
             moves: as of :meth:`of`, which names what is raised.
         """
-        others = [each for each in self.bearers(robot) if each is not gone]
+        others = [each for each in self.bearers(robot) if each is not gone and not silent(each, robot)]
         return self._chosen(robot, verb, others, moves=moves) if others else None
 
     def decides(self, robot: str) -> bool:

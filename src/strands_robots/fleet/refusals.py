@@ -17,6 +17,7 @@ from strands_robots.errors import (
     CallerError,
     ControlError,
     LockoutError,
+    NoAnswerError,
     NoSuchRobotError,
     RefusalError,
     RobotError,
@@ -85,6 +86,8 @@ def said(refusal: RefusalError) -> str:
         return f"The network does not carry this: {refusal.why}"
     if isinstance(refusal, ValueError):
         return refusal.why
+    if isinstance(refusal, NoAnswerError):
+        return f"{refusal.why.rstrip('.')}. It may still carry the call out."
     why = refusal.why if refusal.why.endswith((".", "!", "?")) else f"{refusal.why}."
     return f"{why} {refusal.remedy}" if isinstance(refusal, NoSuchRobotError) and refusal.remedy else why
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Self
 
 from strands_robots.envelope import Envelope, is_error
-from strands_robots.errors import NoSuchRobotError, RefusalError, RobotError, UnknownVerbError
+from strands_robots.errors import NoAnswerError, NoSuchRobotError, RefusalError, RobotError, UnknownVerbError
 from strands_robots.fleet.adapter import STOP_S, FoundRobot, NetworkAdapter
 from strands_robots.fleet.description import docstring, python_name, signature
 from strands_robots.fleet.event_feed import EventFeed
@@ -258,7 +258,7 @@ class RemoteRobot:
         known = self._known
         if name not in known.names:
             # It may have come back with other verbs.
-            known = self._describe(anew=True)
+            known = self._describe(anew=True, must=True)
         wire = known.names.get(name)
         if wire is None:
             raise self._unknown(name)
@@ -287,18 +287,21 @@ class RemoteRobot:
     def _known(self) -> _Known:
         return self._described_as or self._describe()
 
-    def _describe(self, *, anew: bool = False) -> _Known:
+    def _describe(self, *, anew: bool = False, must: bool = False) -> _Known:
         """Ask the network for the robot's verbs, and name the methods.
 
         Args:
             anew: ask the robot itself; what is known stays where it does not answer.
+            must: raise :class:`NoSuchRobotError` or :class:`NoAnswerError` for a robot that is gone.
         """
         try:
-            description = RobotDescription.of(self._network.describe(self.address, anew=anew))
+            functions = self._network.describe(self.address, anew=anew)
         except RefusalError as exc:
+            if must and isinstance(exc, NoSuchRobotError | NoAnswerError):
+                raise
             logger.warning("%s: its verbs cannot be read: %s", self.id, exc)
-            return self._described_as or _Known(RobotDescription(), {})
-        known = _Known.of(description)
+            return self._described_as or _Known.of(RobotDescription.of(self._found.functions))
+        known = _Known.of(RobotDescription.of(self._found.functions if functions is None else functions))
         self._described_as = known
         return known
 
@@ -436,8 +439,8 @@ class RobotOfWorld(RemoteRobot):
         current = self._described_as is not None and self._world._known is self._whole
         return (self._described_as if current else None) or self._describe()
 
-    def _describe(self, *, anew: bool = False) -> _Known:
-        whole = self._world._describe(anew=True) if anew else self._world._known
+    def _describe(self, *, anew: bool = False, must: bool = False) -> _Known:
+        whole = self._world._describe(anew=True, must=must) if anew else self._world._known
         verbs = {name: verb for name, each in whole.description.verbs.items() if (verb := _of_one(each))}
         self._described_as, self._whole = _Known.of(replace(whole.description, verbs=verbs)), whole
         return self._described_as

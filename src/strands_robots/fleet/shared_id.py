@@ -52,6 +52,9 @@ class SharedId:
             robot: the id.
             bearers: networks that have it, the one to prefer first.
             absent: keys of this id that are enrolled on networks which are not joined, one of which has to sign then.
+
+        Raises:
+            NoSuchRobotError: it has left all of them.
         """
         with self._lock:
             asked = (tuple(absent.items()), *((each.name, each.session(robot)) for each in bearers))
@@ -59,6 +62,8 @@ class SharedId:
             if old or asked != self._asked or self.decided not in bearers:
                 signed = side_by_side(lambda each: _signing_key(robot, each), bearers)
                 keys = {each: key for each, (there, key) in zip(bearers, signed, strict=True) if there}
+                if not keys:
+                    raise NoSuchRobotError(f"No robot {robot!r} is in reach any more", robot=robot)
                 self.decided = self._of_one(keys, absent.values()) or _proven(robot, keys, set(absent.values()))
                 # A robot that did not answer, or not signed, is asked again.
                 self._asked, self._asked_at = (asked if self.decided is not None else ()), time.monotonic()
@@ -85,6 +90,7 @@ def decided(
     """Return the network that a motion goes to.
 
     Raises:
+        NoSuchRobotError: it has left all of them.
         AmbiguousRobotError: no key decides.
     """
     network = shared_id.decide(robot, bearers, absent)

@@ -579,6 +579,7 @@ class Mesh(SensorLoopsMixin):
         self,
         signing_key: Any = None,
         *,
+        reason: str = "",
         estop_id: str = "",
         on_answers: OnAnswers = lambda replies: None,
         scope: Scope = EVERY_ROBOT,
@@ -591,11 +592,11 @@ class Mesh(SensorLoopsMixin):
 
         Args:
             signing_key: for fleets that act on signed stops only.
+            reason: sent to the robots.
             estop_id: 32 hex digits, the same for one press; a fresh one by default.
             on_answers: called with the replies so far.
-            scope: the robots that it is for. Where none of them is there, every robot is stopped.
-            remembers: says whether this machine knows a robot in the scope.
-            on_widened: called where every robot is stopped for that.
+            scope: the robots that it is for; where none of them is there, every robot is stopped.
+            remembers, on_widened: says whether one is known here; called where every robot is stopped.
 
         Raises:
             RuntimeError: this peer is not on the mesh.
@@ -603,13 +604,9 @@ class Mesh(SensorLoopsMixin):
         # A link that is down must not keep this robot from stopping; the fleet gets the stop later.
         if self._context.transport is None:
             raise RuntimeError(f"{self.peer_id} is not on the mesh: no peer would hear the emergency stop.")
+        meant: dict[str, Any] = {"scope": scope, "remembers": remembers, "on_widened": on_widened}
         return self._safety.emergency_stop(
-            signing_key,
-            estop_id=estop_id,
-            on_answers=on_answers,
-            scope=scope,
-            remembers=remembers,
-            on_widened=on_widened,
+            signing_key, reason=reason, estop_id=estop_id, on_answers=on_answers, **meant
         )
 
     def check_in_every(self, interval_s: float, signing_key: Any = None) -> None:

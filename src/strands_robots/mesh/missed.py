@@ -15,7 +15,7 @@ from strands_robots.mesh.scheduler import repeat
 from strands_robots.mesh.transport import Declaration, Sample, Transport, TransportError, undeclare
 from strands_robots.safety.awake import AWAKE
 from strands_robots.safety.missed_stops import ANSWER, ANSWER_MAX_BYTES, PEER_BACK, QUESTION, MissedStops
-from strands_robots.safety.orders import MISSED, StopOrder, StopRefused, derived_epoch
+from strands_robots.safety.orders import MISSED, NO_REASON, StopOrder, StopRefused, derived_epoch, stated_reason
 from strands_robots.safety.plane import SafetyPlane
 from strands_robots.safety.question_ports import Member, RobotsPort, Stated
 from strands_robots.safety.statements import Purpose
@@ -83,7 +83,7 @@ class MeshPort(RobotsPort):
         return StopOrder(
             epoch,
             source,
-            "fleet e-stop",
+            stated_reason(body) or NO_REASON,
             MISSED,
             remote=True,
             issued=notice.t,

@@ -32,7 +32,7 @@ from strands_robots.mesh.transport import Sample, TransportError
 from strands_robots.safety import ed25519
 from strands_robots.safety.gate import MotionRequest
 from strands_robots.safety.head_witness import CheckInAnswers, HeadWitness
-from strands_robots.safety.orders import StopOrder, new_epoch, signed_stop
+from strands_robots.safety.orders import NO_REASON, StopOrder, new_epoch, signed_stop, stated_reason
 from strands_robots.safety.peer_answers import (
     enrolled_peers,
     record_heads,
@@ -130,6 +130,7 @@ class FleetSafety:
         self,
         signing_key: Any = None,
         *,
+        reason: str = "",
         estop_id: str = "",
         on_answers: OnAnswers = lambda replies: None,
         scope: Scope = EVERY_ROBOT,
@@ -145,7 +146,7 @@ class FleetSafety:
             self._press = (estop_id or new_epoch(), context.clock())
         epoch, pressed = self._press
         order = StopOrder(
-            epoch, context.peer_id, "emergency stop", "mesh", issued=context.clock(), pressed=pressed, scope=scope
+            epoch, context.peer_id, reason or NO_REASON, "mesh", issued=context.clock(), pressed=pressed, scope=scope
         )
         if not scope.only:
             order = self._with_original(order, signing_key)
@@ -208,7 +209,7 @@ class FleetSafety:
         replies = stop.send(COLLECT_S, on_answers, remembers)
         if stop.widened:
             on_widened()
-            return self.emergency_stop(signing_key, estop_id=order.epoch, on_answers=on_answers)
+            return self.emergency_stop(signing_key, reason=order.reason, estop_id=order.epoch, on_answers=on_answers)
         own = self._local_reply(order, local() if local is not None else None) if self._adapter.within(scope) else []
         counts, stopped = self._conclude(order, [*own, *replies], replies, stop.targets())
         if scope.cell:
@@ -304,7 +305,8 @@ class FleetSafety:
         context = self._context
         counts = {**counts, "lockout_engaged": True}
         notice = wire.EstopNotice(context.peer_id, context.clock(), order.epoch, context.session_id(), counts)
-        stated = {**notice.to_wire(), "pressed_at": order.pressed, **order.scope.field()}
+        why = {} if order.reason == NO_REASON else {"reason": order.reason}
+        stated = {**notice.to_wire(), "pressed_at": order.pressed, **why, **order.scope.field()}
         return self._signed(stated, Purpose.EMERGENCY_STOP, signing_key)
 
     # Receiving.
@@ -342,7 +344,7 @@ class FleetSafety:
         order = StopOrder(
             epoch,
             notice.peer_id,
-            "fleet e-stop",
+            stated_reason(body) or NO_REASON,
             "mesh",
             True,
             notice.t,
@@ -397,7 +399,7 @@ class FleetSafety:
             StopOrder(
                 notice.estop_id,
                 sender,
-                "fleet e-stop",
+                stated_reason(body) or NO_REASON,
                 "mesh",
                 True,
                 notice.t,

@@ -43,6 +43,8 @@ UNREAD_AGAIN_S = 0.25
 UNREAD_SOURCES_MAX = 64
 
 REASON_MAX = 200
+NO_REASON = "fleet e-stop"
+"""Reason of a stop on the mesh that states none."""
 
 ANSWERED = "answered"
 """Field of a repeated stop: the devices that its issuer asks for no further answer."""
@@ -200,6 +202,12 @@ def stated_epoch(source: str, params: Mapping[str, Any]) -> str:
     return ""
 
 
+def stated_reason(params: Mapping[str, Any]) -> str:
+    """Return the reason that a stop states, cut to its length; empty for none."""
+    reason = params.get("reason")
+    return reason[:REASON_MAX] if isinstance(reason, str) and reason.isprintable() else ""
+
+
 @dataclass(frozen=True, slots=True)
 class StopRefused:
     """Message of ``source`` that does not count, with the reason."""
@@ -337,7 +345,6 @@ class StopRules:
         if isinstance(raw, int):
             epoch, why = self._unread_epoch(source, received), f"an emergency stop of {raw} bytes, which was not read"
             return StopOrder(epoch, source, why, path, remote=True, received=received)
-        reason = params.get("reason")
         received_at, issued = self._clock() - (time.monotonic() - received), seconds_of(params.get("t"))
         compared = issued is not None and path != MISSED
         ahead = self._clocks.note(source, received_at - issued, received) if compared and issued is not None else None
@@ -345,7 +352,7 @@ class StopRules:
         return StopOrder(
             self._epoch(source, params, received),
             source,
-            reason[:REASON_MAX] if isinstance(reason, str) and reason.isprintable() else "",
+            stated_reason(params),
             path,
             remote=True,
             issued=issued,

@@ -15,6 +15,7 @@ from strands_robots.envelope import error
 from strands_robots.errors import ArgumentsError, LockoutError, NoSuchRobotError, UnknownVerbError
 from strands_robots.fleet.mesh import descriptions, network
 from strands_robots.fleet.mesh.network import MeshNetwork
+from strands_robots.mesh import session
 from strands_robots.mesh.transport import zenoh_config
 from strands_robots.serving.advertised import RobotDescription
 
@@ -249,3 +250,17 @@ def test_programs_without_a_robot_are_none_of_a_stop_unless_they_say_that_someth
     answers, outcome = joined(mesh).stop_all()
     assert {name: said["stopped"] for name, said in answers.items()} == {"arm-1": True, "odd-tool": False}
     assert not {"desk", "robot-mesh-tool"} & {row.name for row in outcome.roster.rows}
+
+
+def test_call_is_not_sent_on_a_mesh_that_has_lost_its_hub_and_a_stop_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(session, "cut_off", lambda: True)
+    monkeypatch.setattr(network, "HUB_S", 0.1)
+    mesh = FakeMesh([row("arm-1")], done)
+    there = joined(mesh)
+    with pytest.raises(NoSuchRobotError):
+        there.call("arm-1", "go_home", {}, 5.0)
+    with pytest.raises(NoSuchRobotError):
+        there.describe("arm-1")
+    assert mesh.sent == []
+    there.call("arm-1", "stop", {}, 5.0)
+    assert [command["action"] for _, command, _ in mesh.sent] == ["stop"]

@@ -36,6 +36,7 @@ class TimedMesh:
         self.peer_id, self.lockout_epoch, self.alive = "tool", "e" * 32, True
         self.stops: list[float] = []
         self.ids: set[str] = set()
+        self.reasons: set[str] = set()
 
     @property
     def peers(self) -> list[dict[str, Any]]:
@@ -43,9 +44,10 @@ class TimedMesh:
         return [{"peer_id": name, "reachable": True, **self.facts.get(name, {})} for name in there]
 
     def emergency_stop(
-        self, signing_key: Any = None, *, estop_id: str = "", on_answers: Callable[[list[Any]], None]
+        self, signing_key: Any = None, *, reason: str = "", estop_id: str = "", on_answers: Callable[[list[Any]], None]
     ) -> list[dict[str, Any]]:
         self.stops.append(self.now)
+        self.reasons.add(reason)
         on_answers([])
         # One press is one stop, however often it is sent.
         self.ids.add(estop_id)
@@ -92,7 +94,7 @@ def timed_mesh(monkeypatch: pytest.MonkeyPatch) -> Callable[..., TimedMesh]:
 def locked(mesh: TimedMesh) -> Envelope:
     """Send the emergency stop of a command that has just joined, and return its answer."""
     there = MeshNetwork.joined(mesh)  # type: ignore[arg-type]
-    return there.verdict(there.emergency_stop(""))
+    return there.verdict(there.emergency_stop("a hand"))
 
 
 def test_loopback_estop_is_sent_at_once_and_again_when_a_robot_appears(timed_mesh: Callable[..., TimedMesh]) -> None:
@@ -100,6 +102,7 @@ def test_loopback_estop_is_sent_at_once_and_again_when_a_robot_appears(timed_mes
     assert locked(mesh)["robots"] == {"arm-1": "stopped", "arm-2": "stopped"}
     assert len(mesh.stops) == 2
     assert mesh.stops[0] == 0.0
+    assert mesh.reasons == {"a hand"}
     assert mesh.now < 1.5
 
 

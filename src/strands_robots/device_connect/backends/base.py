@@ -30,6 +30,10 @@ class NoResponderError(StrandsRobotsError, RequestTimeoutError, PublishError):  
     """
 
 
+class ResponderLostError(StrandsRobotsError, RequestTimeoutError):  # type: ignore[misc]  # as above
+    """The device that got the request left the network before it replied."""
+
+
 def _short_stop(size: int) -> bytes:
     """Encode a stop for foreign handlers, in place of one of ``size`` bytes."""
     params = {"event_id": uuid.uuid4().hex, "reason": f"an emergency stop of {size} bytes, which was not read"}

@@ -26,7 +26,7 @@ from device_connect_edge.messaging.exceptions import (
 from ...bounded_json import LONG_MAX, SMALL_BYTES
 from ...utils import redacted
 from . import jsonrpc, zenoh_session
-from .base import Backend, NoResponderError, Undo, UnreadableReplyError, too_long
+from .base import Backend, NoResponderError, ResponderLostError, Undo, UnreadableReplyError, too_long
 from .config import LinkConfig
 from .dial import why_silent, words_of
 from .dispatch import REPLY_SUBJECT, Backlog, CommandServer, OrderedFeed, on_a_thread
@@ -45,6 +45,9 @@ REPLY_TTL_S = 60.0
 
 FIRST_RETRY_S = 0.005
 """Seconds until a peer asks again where no device answered; doubled at each try. Links here come up in milliseconds."""
+
+LOST_S = 0.5
+"""Seconds in which a router says that no device serves a key; a request that ends later had reached one."""
 
 LARGE_BYTES = 2**16
 """From here on, which is more than one batch, a message goes out on a thread: it may have to wait for the link."""
@@ -141,6 +144,7 @@ class ZenohBackend(Backend):
 
         Raises:
             NoResponderError: no device serves ``subject``.
+            ResponderLostError: the device that got it left before it replied.
             RequestTimeoutError: a device does, but gave no reply within ``timeout`` seconds.
             NotConnectedError: closed, or a client without its router.
         """
@@ -155,6 +159,8 @@ class ZenohBackend(Backend):
                 remaining = deadline - again
                 if not self._link.is_peer or again > linked_by or remaining <= 0:
                     raise
+            except ResponderLostError:
+                raise
             except RequestTimeoutError as error:
                 raise RequestTimeoutError(f"no reply on {subject} within {timeout:g} s") from error
             # A peer that links at this very moment is not known here yet.
@@ -169,6 +175,7 @@ class ZenohBackend(Backend):
             UnreadableReplyError: the reply is out of bounds.
         """
         session, loop, wait_s = self._connected().session, asyncio.get_running_loop(), max(within, 0.001)
+        began = time.monotonic()
         request, key = _Request(loop, self._outcomes), key_of(subject)
         token: Any = zenoh.CancellationToken()
         handler = zenoh_session.direct(request.on_reply, request.on_end)
@@ -179,6 +186,8 @@ class ZenohBackend(Backend):
                 get()
             else:
                 await on_a_thread(get)
+            # A peer knows who serves a key: where no one does, the query ends before it is sent.
+            unsent = request.ended
             answer = await request.future
         except zenoh.ZError as error:
             raise PublishError(f"cannot ask {key}: {error}") from error
@@ -194,6 +203,8 @@ class ZenohBackend(Backend):
             raise UnreadableReplyError(f"{key}: {request.unread}")
         if request.failure:
             raise PublishError(f"{key} refused: {request.failure}")
+        if not unsent and (self._link.is_peer or time.monotonic() - began > LOST_S):
+            raise ResponderLostError(f"what served {subject} left before it replied")
         raise NoResponderError(f"no device answers on {subject}")
 
     async def close(self) -> None:
@@ -331,13 +342,13 @@ class ZenohBackend(Backend):
 class _Request:
     """A pending query: replies come on Zenoh's thread, its future is settled once."""
 
-    __slots__ = ("_outcomes", "answered", "failure", "future", "unread")
+    __slots__ = ("_outcomes", "answered", "ended", "failure", "future", "unread")
 
     def __init__(self, loop: asyncio.AbstractEventLoop, outcomes: Backlog) -> None:
         self._outcomes = outcomes
         self.failure = self.unread = ""
         self.future: asyncio.Future[bytes | None] = loop.create_future()
-        self.answered = False
+        self.answered = self.ended = False
 
     def on_reply(self, reply: Any) -> None:
         """Take a reply. On Zenoh's thread."""
@@ -352,6 +363,7 @@ class _Request:
 
     def on_end(self) -> None:
         """Settle a request that ended without a reply. On Zenoh's thread."""
+        self.ended = True
         # An answered request has woken the loop already.
         if not self.answered:
             self._outcomes.offer((self, None))

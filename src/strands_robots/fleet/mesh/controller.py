@@ -117,6 +117,7 @@ class MeshController:
         def send() -> list[dict[str, Any]]:
             return self._mesh.emergency_stop(
                 self._key,
+                reason=reason,
                 estop_id=epoch,
                 on_answers=note,
                 scope=scope,

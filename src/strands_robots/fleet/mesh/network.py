@@ -37,7 +37,16 @@ from strands_robots.fleet.adapter import (
 from strands_robots.fleet.lockout_report import LockoutReport, Resumed
 from strands_robots.fleet.mesh.controller import MeshController
 from strands_robots.fleet.mesh.descriptions import functions_of, functions_of_each, functions_of_kind
-from strands_robots.fleet.mesh.discovery import CALLER, CONSOLE, awaited, discover, has_robot, in_reach, is_in_reach
+from strands_robots.fleet.mesh.discovery import (
+    CALLER,
+    CONSOLE,
+    LOOK_S,
+    awaited,
+    discover,
+    has_robot,
+    in_reach,
+    is_in_reach,
+)
 from strands_robots.fleet.mesh.events import follow
 from strands_robots.fleet.mesh.lockouts import ask_peers, lockable_peers, resume_peers
 from strands_robots.fleet.mesh.requests import PeerRequests
@@ -64,6 +73,9 @@ DESCRIBE_S = 5.0
 
 VERB_S = 2.0
 """Seconds in which a peer has to describe a verb of its own before that is called."""
+
+HUB_S = 1.0
+"""Seconds in which a mesh that lost its hub has to have one again before a call counts as not to be delivered."""
 
 UNSEEN_S = 0.2
 """Seconds in which an unseen peer has to answer a stop, once peers are known."""
@@ -202,6 +214,8 @@ class MeshNetwork:
     def describe(self, robot: str, *, anew: bool = False) -> object:
         """Return the robot's functions, of an older one those of its kind."""
         del anew  # the robot is always asked
+        if not (self._waited_for(robot) and self._linked()):
+            raise self._absent(robot, "describe")
         functions = functions_of(self._joined_mesh, robot, DESCRIBE_S)
         return self.announced_functions(robot) if functions is None else functions
 
@@ -231,7 +245,7 @@ class MeshNetwork:
         mesh = self._joined_mesh
         try:
             there = self._waited_for(robot)
-            if not there and verb not in ALWAYS_SENT:
+            if verb not in ALWAYS_SENT and not (there and self._linked()):
                 raise self._absent(robot, verb)
             action = self._action(robot, verb)
         except UnreachableError:
@@ -370,12 +384,13 @@ class MeshNetwork:
         deadline_s: float | None = None,
         on_progress: OnProgress = lambda progress: None,
     ) -> StopOutcome:
-        """Stop and lock the peers; the mesh carries no reason, and tells no progress."""
-        del reason, deadline_s, on_progress  # the mesh's own deadlines count
+        """Stop and lock the peers; the mesh tells no progress."""
+        del deadline_s, on_progress  # the mesh's own deadlines count
         return lock_peers(
             self._joined_mesh,
             signing_key,
             scope,
+            reason=reason,
             estop_id=estop_id,
             since=self._fresh,
             remembers=remembers,
@@ -506,8 +521,20 @@ class MeshNetwork:
         # A loaded machine gets twice the time.
         return awaited(self._joined_mesh, robot, self._joined + max(discovery_timeout(DISCOVERY_S), 2 * DISCOVERY_S))
 
+    @staticmethod
+    def _linked() -> bool:
+        """Return whether the mesh has a hub, once another peer had time to become it."""
+        from strands_robots.mesh import session  # noqa: PLC0415 - loaded when it is used
+
+        until = time.monotonic() + HUB_S
+        while session.cut_off():
+            if time.monotonic() >= until:
+                return False
+            time.sleep(LOOK_S)
+        return True
+
     def _absent(self, robot: str, verb: str) -> NoSuchRobotError:
-        remedy = near(robot, in_reach(self._joined_mesh)).strip()
+        remedy = near(robot, {*in_reach(self._joined_mesh)} - {robot}).strip()
         return NoSuchRobotError(f"No peer {robot!r} is on the mesh", robot=robot, verb=verb, remedy=remedy)
 
 

@@ -52,6 +52,7 @@ def lock_peers(
     signing_key: Any = None,
     scope: Scope = EVERY_ROBOT,
     *,
+    reason: str = "",
     estop_id: str = "",
     since: float | None = None,
     remembers: Remembers | None = None,
@@ -65,6 +66,7 @@ def lock_peers(
         mesh: the peer that sends it.
         signing_key: signs it.
         scope: the robots that it is for. Where none of them is there, every robot is stopped.
+        reason: sent to the peers.
         estop_id: 32 hex digits; a fresh one by default.
         since: as in :func:`stop_peers`.
         remembers: says whether a robot of ``scope`` is known; by default by this machine's roster.
@@ -86,7 +88,7 @@ def lock_peers(
         if not roster.scope.everything:
             known = remembers or robots_known_at(mesh_network)
             some = {"scope": roster.scope, "remembers": known, "on_widened": roster.widen}
-        return mesh.emergency_stop(signing_key, estop_id=epoch, on_answers=left, **some)
+        return mesh.emergency_stop(signing_key, reason=reason, estop_id=epoch, on_answers=left, **some)
 
     sent = time.monotonic()
     try:
