@@ -274,7 +274,7 @@ class RobotDriver(CollectedOnce):
 
     @property
     def locked_out(self) -> bool | None:
-        """Whether an emergency stop locks it, which presence states; None where no one knows."""
+        """True while an emergency stop locks it; None where that is not known."""
         if self.registration is not None:
             return self.registration.entry.locked
         return None if self._latched is None else self._latched.state.locked
@@ -598,7 +598,7 @@ class RobotDriver(CollectedOnce):
         return not (self.activity.busy or self._rolling or self.activity.fault or self._looking)
 
     def unchanged(self) -> bool:
-        """Look at the robot, on a worker; False when its state, or its lock, is another one."""
+        """Look at the robot, on a worker; False when its state or lock is another."""
         if not lock_stated(self).items() <= self.runtime.status.items():
             return False
         same = self.same(self.glance(), self.activity) and not self.robot.gate.under_way

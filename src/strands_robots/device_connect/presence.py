@@ -42,7 +42,7 @@ def encoded_capabilities(driver: DeviceDriver) -> str:
 
 
 def lock_stated(driver: object) -> dict[str, bool]:
-    """Return what a driver's device announces of its lockout; empty where it states none."""
+    """Return what a device announces of its lockout; empty where it states none."""
     locked = getattr(driver, "locked_out", None)
     return {"locked": locked} if isinstance(locked, bool) else {}
 
