@@ -8,10 +8,11 @@ from contextlib import contextmanager
 
 import pytest
 from fixtures.face_robots import OURS, FaceSite
-from fixtures.faces import Answer, Face, described_by
+from fixtures.faces import Answer, Face, PageFace, described_by
 from fixtures.waiting import eventually
 
 from strands_robots import connect
+from strands_robots.errors import ControlError
 
 pytestmark = pytest.mark.timeout(300)
 BARISTA, MILL, CARELESS = OURS
@@ -102,6 +103,16 @@ class TestFaceContract:
             assert site.robots.ask("steps") == before
             assert face.call(BARISTA, "beansLeft").ok
             assert face.stop(BARISTA).ok, "a stop needs no lease"
+        assert face.call(BARISTA, "brewCoffee", cups=1).ok
+
+    def test_page_holds_a_robot_without_joints(self, site: FaceSite, face: Face) -> None:
+        if not isinstance(face, PageFace):
+            return
+        with face.holding(BARISTA) as taken, connect(name="other") as fleet:
+            assert taken.ok, taken
+            assert face.call(BARISTA, "brewCoffee", cups=1).ok, "its call sends the lease"
+            with pytest.raises(ControlError):
+                fleet[BARISTA].call("brewCoffee", cups=1)
         assert face.call(BARISTA, "brewCoffee", cups=1).ok
 
     def test_stop_ends_a_verb_in_its_middle_and_the_next_one_begins(
