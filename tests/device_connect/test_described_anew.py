@@ -16,6 +16,7 @@ from fixtures.toy_robots import ToyWorld
 from strands_robots.device_connect._compat import Runtime, describe_anew
 from strands_robots.device_connect.backends import LinkConfig
 from strands_robots.device_connect.simulation_driver import SimulationDeviceDriver
+from strands_robots.safety.lockout import LockoutLatch
 from strands_robots.serving.offered_verbs import Offers
 
 LINK = LinkConfig("nats", connect=("nats://127.0.0.1:1",))
@@ -76,7 +77,7 @@ def runtime(request: pytest.FixtureRequest, driver: SimulationDeviceDriver) -> A
         made._d2d_mode = True
     made.messaging = Link()
     capabilities = driver.capabilities.model_dump()
-    made._d2d_announcer = PresenceAnnouncer(made.messaging, "sim-1", "default", capabilities, {}, {})
+    made._d2d_announcer = PresenceAnnouncer(made.messaging, "sim-1", "default", capabilities, {}, made.status)
     describe_anew(made, driver)
     return made
 
@@ -148,3 +149,23 @@ def test_devices_of_one_class_share_what_describes_them(world: Growing) -> None:
     first.offers = Offers(world, first.made)
     assert first.described() is not second.described()
     assert first.described() is first.described()
+
+
+async def test_lockout_and_its_end_are_announced_once_each(runtime: Any, driver: SimulationDeviceDriver) -> None:
+    latch = LockoutLatch("sim-1")
+    driver._unregistered = latch
+    driver.robot.gate.attach(latch)
+    driver.set_device(runtime)
+    driver.activity = driver.glance()
+    announce(runtime, driver)
+    await ended()
+    runtime.messaging.published.clear()
+    for change, locked in ((lambda: latch.engage("e" * 32, "desk", "smoke"), True), (latch.clear, False)):
+        change()
+        assert not driver.unchanged()
+        for _ in range(3):
+            announce(runtime, driver)
+            await ended()
+        assert [each["status"]["locked"] for each in runtime.messaging.published] == [locked]
+        assert driver.unchanged()
+        runtime.messaging.published.clear()

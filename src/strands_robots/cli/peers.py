@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 LEASE_ID = "lease_id"
 
 GRAVE = ("estop_unheard", "distrusted", "locked")
-"""Facts of a peer that are shown before those of the same robot on another network."""
+"""Facts of a peer that are shown before others of the same robot on any network, the gravest first."""
 
 CALL_S = 10.0
 MOTION_S = CALL_S + WAIT_S
@@ -101,7 +101,7 @@ class _Row:
     def of(cls, robot: FoundRobot, network: NetworkAdapter, bearers: Sequence[NetworkAdapter]) -> Self:
         others = [each for each in bearers if each is not network]
         known = [robot, *(each.known(robot.id) for each in others)]
-        gravest = next((each for each in known if any(each.facts.get(name) for name in GRAVE)), robot)
+        gravest = next((each for name in GRAVE for each in known if each.facts.get(name)), robot)
         return cls(robot, gravest, [network.name, *(each.name for each in others)])
 
     @property
@@ -111,6 +111,7 @@ class _Row:
         return {
             **robot.facts,
             **{"id": robot.id, "type": robot.type, "model": robot.model},
+            **({} if robot.locked is None else {"locked": robot.locked}),
             "age_s": None if robot.age_s is None else round(robot.age_s, 3),
             **{"network": self.networks[0], "also_on": self.networks[1:]},
         }

@@ -10,8 +10,10 @@ import contextlib
 import contextvars
 import functools
 import inspect
+import json
 import logging
 import re
+import time
 from collections.abc import Awaitable, Callable, Iterable, Iterator
 from concurrent.futures import Future
 from typing import Any, TypeVar, cast
@@ -28,7 +30,7 @@ from ..utils import ValidationError
 from .backends import LinkConfig, backend_for, jsonrpc
 from .backends.dispatch import Answer, send
 from .beat import Beating, beat_of
-from .presence import PresenceView, encoded_capabilities, presence_builder
+from .presence import PresenceView, encoded_capabilities, lock_stated, presence_builder
 
 HOLD_EVENTS_S = 5.0
 """Seconds of a lost link for which events wait; a server that restarts is back sooner, and older events mislead."""
@@ -185,10 +187,17 @@ class Runtime(DeviceRuntime):  # type: ignore[misc]  # the framework has no type
         self._announcer = announcer
         if announcer is not None:
             _ANNOUNCED[self] = encoded_capabilities(self._driver)
-            build = presence_builder(
-                announcer._device_id, lambda: _ANNOUNCED[self], announcer._identity, announcer._status
+            announcer._build_payload = presence_builder(
+                announcer._device_id,
+                lambda: _ANNOUNCED[self],
+                announcer._identity,
+                lambda: {**announcer._status, **lock_stated(self._driver)},
             )
-            announcer._build_payload = build
+
+    def _build_registration_params(self) -> dict[str, Any]:
+        params = cast(dict[str, Any], super()._build_registration_params())
+        params["status"] |= lock_stated(self._driver)
+        return params
 
     async def _register(self, force: bool = False) -> None:
         _ANNOUNCED[self] = encoded_capabilities(self._driver)
@@ -374,23 +383,32 @@ _ANNOUNCING: WeakKeyDictionary[Any, asyncio.Task[None]] = WeakKeyDictionary()
 
 
 def describe_anew(runtime: Any, driver: DeviceDriver) -> None:
-    """Announce a device again where its description has changed; on its loop."""
+    """Announce a device again where its description or lock has changed; on its loop."""
     if not isinstance(runtime, DeviceRuntime):
         return
     described, before = encoded_capabilities(driver), _ANNOUNCED.get(runtime)
-    announcing = _ANNOUNCING.get(runtime)
-    if described == before or (announcing is not None and not announcing.done()):
+    announcing, lock = _ANNOUNCING.get(runtime), lock_stated(driver)
+    same = described == before and lock.items() <= runtime.status.items()
+    if same or (announcing is not None and not announcing.done()):
         return
     _ANNOUNCED[runtime] = described
+    runtime.status.update(lock)
     if before is not None:
-        _ANNOUNCING[runtime] = asyncio.create_task(_announce(runtime, driver))
+        _ANNOUNCING[runtime] = asyncio.create_task(_announce(runtime, driver, described != before))
         runtime._track_task(_ANNOUNCING[runtime])
 
 
-async def _announce(runtime: Any, driver: DeviceDriver) -> None:
+async def _announce(runtime: Any, driver: DeviceDriver, other_description: bool) -> None:
     announcer = runtime._d2d_announcer
     if not runtime._d2d_mode:
-        await runtime._register(force=True)
+        if other_description:
+            await runtime._register(force=True)
+        if lock := lock_stated(driver):
+            # The registry takes what is no standard field of a status from heartbeats alone.
+            beat = {"device_id": runtime.device_id, "ts": time.time(), **lock}
+            with contextlib.suppress(MessagingError):  # its next regular heartbeat says the same
+                subject = f"device-connect.{runtime.tenant}.{runtime.device_id}.heartbeat"
+                await runtime.messaging.publish(subject, json.dumps(beat).encode())
     elif announcer is not None:
         # The framework's own announcer repeats what it was made with.
         announcer._capabilities = driver.capabilities.model_dump()

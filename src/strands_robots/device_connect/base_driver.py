@@ -23,6 +23,7 @@ from device_connect_edge.types import DeviceStatus, EventDef, FunctionDef
 from strands_robots import settings
 from strands_robots.contract import Haltable, Robot, RolloutEvent, Unsubscribe, observe
 from strands_robots.device_connect._compat import CollectedOnce, Runtime, describe_anew, emit, observed, on, rpc
+from strands_robots.device_connect.presence import lock_stated
 from strands_robots.device_connect.runtime_stops import stops_of
 from strands_robots.device_connect.safety_registration import (
     LEAVE_TIMEOUT_S,
@@ -260,13 +261,23 @@ class RobotDriver(CollectedOnce):
         answer = self.verbs["getStatus"].call(self.robot, arguments)()
         if not isinstance(answer, dict):
             return answer
-        if self.registration is not None:
-            lockouts = self.registration.facts(arguments.get("nonce", ""))
-        else:
-            lockouts = lock_facts(self._unregistered) if self._unregistered in self.robot.gate.latches else {}
+        here, nonce = self.registration, arguments.get("nonce", "")
+        lockouts = lock_facts(self._latched) if here is None else here.facts(nonce)
         control = {} if self.pipeline.leases is None else {"control": self.pipeline.leases.facts()}
         running = self.robot.gate.under_way.name
         return {**answer, **lockouts, **control, **({"verb": running} if running else {})}
+
+    @property
+    def _latched(self) -> LockoutLatch | None:
+        """The latch of a robot that no plane has."""
+        return self._unregistered if self._unregistered in self.robot.gate.latches else None
+
+    @property
+    def locked_out(self) -> bool | None:
+        """True while an emergency stop locks it; None where that is not known."""
+        if self.registration is not None:
+            return self.registration.entry.locked
+        return None if self._latched is None else self._latched.state.locked
 
     # Stops.
 
@@ -481,7 +492,7 @@ class RobotDriver(CollectedOnce):
     def heartbeat(self) -> dict[str, Any]:
         """Return what every heartbeat carries besides the id and the time."""
         describe_anew(self.runtime, self)
-        return {**_status_fields(self.activity), "state": jsonable(self.activity.facts)}
+        return {**_status_fields(self.activity), **lock_stated(self), "state": jsonable(self.activity.facts)}
 
     def set_device(self, device: Any) -> None:
         """Learn the runtime, which has this robot's id on the network."""
@@ -512,9 +523,9 @@ class RobotDriver(CollectedOnce):
         """Start telling the state; the robot manages its own hardware connection."""
         if self.runtime is None or self._watchers:
             return
+        await self._register()
         # Before it is announced: a change from now on is told.
         describe_anew(self.runtime, self)
-        await self._register()
         opened = self.authorization.opened()
         if opened is not None:
             logger.warning("%s is real hardware, and callers that are not named may move it: %s.", self.peer_id, opened)
@@ -587,7 +598,9 @@ class RobotDriver(CollectedOnce):
         return not (self.activity.busy or self._rolling or self.activity.fault or self._looking)
 
     def unchanged(self) -> bool:
-        """Look at the robot, on a worker; False when its state is another one."""
+        """Look at the robot, on a worker; False when its state or lock is another."""
+        if not lock_stated(self).items() <= self.runtime.status.items():
+            return False
         same = self.same(self.glance(), self.activity) and not self.robot.gate.under_way
         return same and not self.offers.look()
 

@@ -41,8 +41,14 @@ def encoded_capabilities(driver: DeviceDriver) -> str:
     return str(described()) if callable(described) else json.dumps(driver.capabilities.model_dump(), allow_nan=False)
 
 
+def lock_stated(driver: object) -> dict[str, bool]:
+    """Return what a device announces of its lockout; empty where it states none."""
+    locked = getattr(driver, "locked_out", None)
+    return {"locked": locked} if isinstance(locked, bool) else {}
+
+
 def presence_builder(
-    device_id: str, capabilities: Callable[[], str], identity: Presence, status: Mapping[str, Any]
+    device_id: str, capabilities: Callable[[], str], identity: Presence, status: Callable[[], Mapping[str, Any]]
 ) -> Callable[[], bytes]:
     """Return a builder of presence messages that encodes nothing but the status.
 
@@ -50,14 +56,14 @@ def presence_builder(
         device_id: whose presence.
         capabilities: returns them in JSON, as they are described now.
         identity: stays as it is.
-        status: read anew for each message.
+        status: returns it, for each message anew.
     """
     device, own = json.dumps(device_id), json.dumps(identity)
 
     def build() -> bytes:
         now = time.time()
         changing = {
-            "status": {**status, "ts": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(now))},
+            "status": {**status(), "ts": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(now))},
             "ts": now,
             "d2d": True,
         }

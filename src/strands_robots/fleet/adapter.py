@@ -45,6 +45,7 @@ class FoundRobot:
         world: id of the world that it is a part of, and stops with; empty for none.
         status: what it says it is doing.
         age_s: seconds since its last own message; None where only a registry names it.
+        locked: whether an emergency stop locks it, as it says; not proven. None where it says nothing.
         facts: all that its network knows of it, for programs.
         functions: as they came over the wire; None where it has not told them.
     """
@@ -57,6 +58,7 @@ class FoundRobot:
     world: str = ""
     status: str = ""
     age_s: float | None = None
+    locked: bool | None = None
     facts: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
     functions: object = field(default=None, compare=False, repr=False)
 

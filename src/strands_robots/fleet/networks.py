@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from itertools import zip_longest
 from typing import TYPE_CHECKING, Any, Self, TypeVar
@@ -644,7 +645,9 @@ def _by_id(listed: Sequence[tuple[NetworkAdapter, list[FoundRobot]]]) -> dict[st
     found: dict[str, tuple[FoundRobot, NetworkAdapter]] = {}
     # The first network is the last to write, so its robots win an id.
     for network, robots in reversed(listed):
-        found |= {each.id: (each, network) for each in robots}
+        # Locked on one of two networks is locked.
+        locked = {each.id for each in robots if each.id in found and found[each.id][0].locked}
+        found |= {each.id: (replace(each, locked=True) if each.id in locked else each, network) for each in robots}
     return found
 
 

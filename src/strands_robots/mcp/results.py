@@ -120,6 +120,8 @@ def refused(refusal: RefusalError) -> Envelope:
     return error(f"{text_of(answer)} list_robots names those that there are.") if absent else answer
 
 
-def row(found: FoundRobot) -> dict[str, str]:
-    """Return what a list of robots has of one."""
-    return {"id": found.id[:128], "type": found.type[:40], "model": found.model[:60], "availability": found.status[:20]}
+def row(found: FoundRobot) -> dict[str, str | bool]:
+    """Return what a list of robots has of one; ``locked`` where it states that."""
+    stated = {} if found.locked is None else {"locked": found.locked}
+    texts = {"id": found.id[:128], "type": found.type[:40], "model": found.model[:60]}
+    return {**texts, "availability": found.status[:20], **stated}

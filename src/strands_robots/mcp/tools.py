@@ -62,12 +62,12 @@ def add_reads(server: MCPServer[Any], access: AccessOf, standing: StandingContro
     async def list_robots(
         context: Context[Any, Any], start: Annotated[Count, Field(description="next_start of a page")] = 0
     ) -> Result:
-        """List the robots on the network, in pages: id, type, model, availability."""
+        """List the robots in pages: id, type, model, availability, locked or not."""
         networks = access(context).caller.networks
         found = await asyncio.to_thread(networks.find)
         # A world stands for its robots.
         rows = [row(each) for _, (each, _) in sorted(found.items()) if not each.world]
-        page = list[dict[str, str]]()
+        page = list[dict[str, str | bool]]()
         for each in rows[start:]:
             if page and len(json.dumps([*page, each])) > PAGE_BYTES:
                 break

@@ -123,7 +123,7 @@ def robot_mesh(
 
 
 def _peers(there: Networks) -> Envelope:
-    """List all that are in reach, with type, state, functions and network.
+    """List all that are in reach, with type, state, lockout, functions and network.
 
     Verbs of its own come with their parameters, in the robot's words.
     """
@@ -251,6 +251,7 @@ def _row(found: FoundRobot, network: str, functions: object) -> dict[str, Any]:
         "id": found.id,
         "type": found.type,
         "status": found.status,
+        **({} if found.locked is None else {"locked": found.locked}),
         "network": network,
         "functions": [each.name for each in verbs],
         **({"own_verbs": own} if own else {}),

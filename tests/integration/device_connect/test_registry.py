@@ -19,6 +19,7 @@ from fixtures.waiting import eventually
 from fixtures.zenoh_router import ZenohRouter
 
 from strands_robots.device_connect import FleetClient, LinkConfig, init_device_connect_sync, stop_device_connect
+from strands_robots.safety.plane import plane
 from strands_robots.tools import robot_mesh
 
 pytestmark = pytest.mark.system
@@ -117,6 +118,14 @@ def test_estop_without_names_names_every_robot_that_the_registry_lists(site: Sit
     # The bare device knows nothing of emergency stops; a plain stop halts it.
     assert (code, said["silent"], said["not_locked"]) == (3, [], ["bare-1"])
     assert site.machine.json("lockout")[1]["live"]["arm-1"]["locked"]
+
+    def shown() -> dict[str, Any]:
+        return {row["id"]: row.get("locked") for row in robot_mesh(action="peers")["peers"]}
+
+    # The registry learns it from a heartbeat.
+    eventually(lambda: shown() == {"arm-1": True, "arm-2": True, "bare-1": None}, what="the lockouts")
+    plane().clear_local("the test")
+    eventually(lambda: shown() == {"arm-1": False, "arm-2": False, "bare-1": None}, what="the free robots")
 
 
 def test_events_of_every_robot_in_registry_mode_are_received(site: Site) -> None:

@@ -137,6 +137,7 @@ class TestFaceContract:
         self, site: FaceSite, face: Face, brewing: Callable[[], object]
     ) -> None:
         with called(face, BARISTA, "brewCoffee", brewing, cups=8):
+            assert face.locked() == set()
             stopped = face.estop()
             assert stopped.ok, stopped
             steps = site.robots.ask("steps")
@@ -146,6 +147,7 @@ class TestFaceContract:
             assert not refused.ok
             assert "is locked by the emergency stop of" in refused.text
             assert "To resume: " in refused.text
+        eventually(lambda: face.locked() == {*OURS}, what="the locked robots in its list")
         assert face.call(BARISTA, "beansLeft").ok
         assert site.robots.ask("steps") == steps
         freed = face.resume(BARISTA)
@@ -156,6 +158,7 @@ class TestFaceContract:
         assert site.robots.ask("steps") == steps, "a resume starts nothing"
         assert face.call(BARISTA, "brewCoffee", cups=1).ok
         assert not face.call(MILL, "grind").ok, "the others stay locked"
+        eventually(lambda: face.locked() == {*OURS} - {BARISTA}, what="the free robot in its list")
 
     def test_verb_that_ignores_its_permit_is_named_and_keeps_the_robot_busy(self, site: FaceSite, face: Face) -> None:
         site.robots.ask("hang")

@@ -431,7 +431,8 @@ def _carried() -> Iterator[None]:
 
 
 def _found(peer: Peer) -> FoundRobot:
-    age = peer.age_s
+    age, stated = peer.age_s, peer.status.get("locked")
+    locked = stated if isinstance(stated, bool) else None
     return FoundRobot(
         peer.id,
         plain_text(peer.type, 100),
@@ -440,9 +441,11 @@ def _found(peer: Peer) -> FoundRobot:
         must_answer=peer.stop_verb is not None or peer.lockable,
         status=plain_text(peer.status.get("availability"), 100),
         age_s=age,
+        locked=locked,
         facts={
             **{"id": peer.id, "type": peer.type, "model": peer.model, "status": peer.status},
             **{"functions": peer.functions, "events": peer.events, "tags": list(peer.tags)},
+            **({} if locked is None else {"locked": locked}),
             "age_s": None if age is None else round(age, 3),
         },
         functions=peer.functions,

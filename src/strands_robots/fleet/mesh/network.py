@@ -565,6 +565,7 @@ def _named_as(verb: str, result: Mapping[str, Any]) -> Envelope:
 
 
 def _found(row: Mapping[str, Any]) -> FoundRobot:
+    locked = row.get("locked")
     return FoundRobot(
         str(row["peer_id"]),
         plain_text(row.get("type"), 100),
@@ -572,5 +573,7 @@ def _found(row: Mapping[str, Any]) -> FoundRobot:
         read_tags(row.get("tags")),
         status=plain_text(row.get("task_status"), 100),
         age_s=row.get("age"),
+        # Of a peer whose key is another one only the lock is believed.
+        locked=locked if locked is True or (locked is False and "distrusted" not in row) else None,
         facts=row,
     )
