@@ -176,9 +176,10 @@ class ConsoleScreen:
             label(head, "bold green" if up else "bold white on red"),
             label("SPACE stops everything    f forgets robots that are gone    q quits", "bold"),
             label("j k choose a robot    o stops that one alone    c stops its cell, and robots without one"),
-            table("", columns, rows),
-            *(label(each, "yellow") for each in said),
+            # Above the table: a terminal cuts off what is below many robots.
             *_outcomes(console.buttons.latest, links),
+            *(label(each, "yellow") for each in said),
+            table("", columns, rows),
             *(label(line, "red") for line in log),
         )
 
