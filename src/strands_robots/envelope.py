@@ -77,5 +77,29 @@ def jsonable(value: object, depth: int = DEPTH_MAX) -> Any:
     return jsonable(plain(), depth - 1) if callable(plain) else shown(value)
 
 
+def uncarried(value: object, place: str = "", depth: int = DEPTH_MAX) -> str:
+    """Return the first part of a value that JSON cannot carry and its place, or "".
+
+    Numpy's scalars and arrays, and sets, are carried as :func:`jsonable` has them.
+    """
+    at, inner = place or "result", depth - 1
+    if value is None or isinstance(value, bool | str):
+        return ""
+    if isinstance(value, float):
+        return "" if math.isfinite(value) else f"{at} is {float(value)}"
+    if isinstance(value, int):
+        return "" if value.bit_length() <= 256 else f"{at} is {shown(value)}"
+    if depth > 0 and isinstance(value, Mapping):
+        odd = next((key for key in value if not isinstance(key, str | int | float | None)), None)
+        if odd is not None and not hasattr(odd, "tolist"):
+            return f"{at} has the key {shown(odd)}"
+        rows = ((f"{place}.{key}" if place else str(key), each) for key, each in value.items())
+        return next(filter(None, (uncarried(each, name, inner) for name, each in rows)), "")
+    if depth > 0 and isinstance(value, list | tuple | set | frozenset):
+        return next(filter(None, (uncarried(each, f"{at}[{n}]", inner) for n, each in enumerate(value))), "")
+    plain = getattr(value, "tolist", None) if depth > 0 else None
+    return uncarried(plain(), place, inner) if callable(plain) else f"{at} is {shown(value)}"
+
+
 def _content(text: str, fields: dict[str, Any]) -> list[dict[str, Any]]:
     return [{"text": text}, {"json": dict(fields)}] if fields else [{"text": text}]

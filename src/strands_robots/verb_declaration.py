@@ -46,6 +46,8 @@ F = TypeVar("F", bound=Callable[..., Any])
 NAME_MAX = 64
 SUMMARY_MAX = 600
 
+TIME_OVER = "its time was over before it was done"
+
 MARK = "__strands_verb__"
 """Attribute by which a method is known as a verb."""
 
@@ -122,11 +124,11 @@ class DeclaredVerb:
 
     def carry_out(
         self, robot: object, arguments: Mapping[str, Any], request: MotionRequest | None = None
-    ) -> tuple[Any, str]:
+    ) -> tuple[Any, str, str]:
         """Call the method with checked arguments, and a permit where it takes one.
 
         Returns:
-            Its result, and how a motion ended: ``completed``, or ``stopped`` where its permit is void.
+            Its result, how a motion ended: ``completed``, or ``stopped`` where its permit is void, and why it is void.
 
         Raises:
             MotionRefused: the robot is locked, was halted since the call was asked for, or one of its own verbs has
@@ -135,11 +137,13 @@ class DeclaredVerb:
         gate = gate_of(robot)
         if not self.motion:
             with gate.reading(self.name):
-                return self.function(robot, **arguments), ""
+                return self.function(robot, **arguments), "", ""
         with gate.moving(self.name, START_S + self.lasts, request) as permit:
             given = {self.permit: permit} if self.permit else {}
             result = self.function(robot, **arguments, **given)
-            return result, "completed" if permit.valid else "stopped"
+            if permit.valid:
+                return result, "completed", ""
+            return result, "stopped", "it was stopped" if permit.request.overtaken else TIME_OVER
 
     def called(self, robot: object, *values: object, **named: object) -> Any:
         """Do what a call of the method does: check its arguments, then carry it out.

@@ -97,6 +97,24 @@ def test_estop_names_each_robot_and_exits_with_the_worst(
     assert (facts["status"] == "success") is (code == 0)
 
 
+@pytest.mark.parametrize(
+    ("stop_report", "locked"),
+    [
+        (report(answer("a", False, why="a verb has not returned")), True),
+        (report(answer("a"), silent=("b",)), True),
+        (report(silent=("a",)), False),
+        (report(answer("a", None, why="a: this stop was resumed before it came again")), False),
+    ],
+)
+def test_estop_that_failed_names_the_resume_of_the_robots_that_it_locked(
+    run: Run, monkeypatch: pytest.MonkeyPatch, stop_report: StopReport, locked: bool
+) -> None:
+    monkeypatch.setattr(safety_controller, "safety_controller", lambda *given, **more: FakeController(stop_report))
+    result = run("estop", *{*stop_report.answered, *stop_report.silent})
+    assert result.exit_code != 0
+    assert ("They are locked until" in result.stdout, "resume --local" in result.stdout) == (locked, locked)
+
+
 @pytest.mark.parametrize("arguments", [("--as", ""), ("--key", "nowhere")])
 def test_estop_with_wrong_arguments_is_exit_2(run: Run, arguments: tuple[str, ...]) -> None:
     assert run("estop", *arguments).exit_code == 2

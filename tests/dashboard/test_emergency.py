@@ -19,10 +19,11 @@ from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
 from strands_robots.fleet.networks import Networks
 from strands_robots.safety.answers import Answer
 from strands_robots.safety.controller import Progress, StopReport
-from strands_robots.safety.roster import Roster
+from strands_robots.safety.roster import Roster, RosterRow
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
-from strands_robots.safety.sightings import sightings
+from strands_robots.safety.sightings import Known, sightings
 from strands_robots.safety.statements import Proof
+from strands_robots.safety.stop_roster import StopOutcome
 
 
 def answer(name: str = "arm-1", stopped: bool | None = True, **more: Any) -> Answer:
@@ -362,6 +363,23 @@ def test_press_leaves_on_a_stop_link_of_its_own_before_the_network_is_joined() -
         feeds.close()
         networks.close()
     assert there.standing_for == []
+
+
+def test_robot_on_both_networks_is_none_of_others_in_a_stop_of_both(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = FleetModel()
+    feeds = [Fed(Controller(StopReport("e" * 32, {"arm-1": answer()}, {}, {}, (), True, 9.0))) for _ in range(2)]
+    feeds[1].network = "mesh"
+    made = page_feeds(model, *feeds)
+    stop = FleetStop(model, made)
+    stop.press()
+    eventually(lambda: not stop.running, what="the stop's end")
+    for (name, _), button in made.buttons.every.items():
+        key = ScriptedNetwork(name).key
+        roster = Roster(key, (RosterRow("arm-1", Known.ENROLLED),), elsewhere=2)
+        assert button.report is not None
+        button.outcome = StopOutcome(button.report, button.report, roster)
+    notes = [each["notes"] for each in stop.state()["roster"].values()]
+    assert [" ".join(each).count("1 robot of other networks") for each in notes] == [1, 1]
 
 
 def test_network_without_link_and_robot_is_waited_for_by_no_stop_and_alarms_no_one() -> None:

@@ -57,6 +57,7 @@ def test_robot_is_shown_with_its_verbs_under_the_network_key_of_the_page(page: P
     assert page.feed.network == {DEVICE_CONNECT: "dc", MESH: "mesh"}[page.there.name]
     assert (row.kind, row.model, row.locked, row.expected) == ("strands_robot", "so100", False, True)
     eventually(lambda: [form["name"] for form in row.forms] == ["moveTo", "getStatus", "stop"], what="its verbs")
+    assert row.holdable
 
 
 def test_robot_that_comes_later_is_found_without_waiting_for_the_next_search(page: Page) -> None:
@@ -232,6 +233,7 @@ def test_device_of_others_says_what_it_lacks(page: Page) -> None:
     page.there.of_kind = (function("boil"),)
     row = page.shown("kettle")
     eventually(lambda: row.lacking == "no lockout, no lease, no stop", what="what it lacks")
+    assert not row.holdable
     ours = page.shown("arm-1")
     eventually(lambda: ours.forms and not ours.lacking, what="one of ours lacks nothing")
 

@@ -12,7 +12,7 @@ import pytest
 from fixtures.waiting import until
 from tests.fleet.scripted import OURS, ScriptedNetwork
 
-from strands_robots.dashboard import page_robots
+from strands_robots.dashboard import fleet_model, page_robots
 from strands_robots.dashboard.feeds import Feeds
 from strands_robots.dashboard.fleet_model import FleetModel
 from strands_robots.dashboard.page_robots import PageRobot, PageRobots
@@ -182,6 +182,19 @@ async def test_row_that_a_page_uses_stays(one: Page) -> None:
 async def test_bad_answer_to_a_stop_is_never_hidden(one: Page, state: str) -> None:
     one.model.verdict("mesh", "both", {"id": "e" * 32, "state": state})
     await until(lambda: one.shown() == [FIRST, SECOND], what="the row with the answer")
+
+
+@pytest.mark.parametrize("state", ["not_stopped", "unknown", "silent"])
+async def test_bad_answer_that_one_robot_gives_on_both_networks_is_named_once(
+    one: Page, monkeypatch: pytest.MonkeyPatch, state: str
+) -> None:
+    monkeypatch.setattr(fleet_model, "UNANSWERED_S", 0.0)
+    for network in ("dc", "mesh"):
+        one.model.verdict(network, "both", {"id": "e" * 32, "state": state})
+    one.robots.look(set())
+    assert (one.shown(), one.row(FIRST).namesake) == ([FIRST], False)
+    one.model.verdict("dc", "both", {"id": "e" * 32, "state": "stopped"})
+    await until(lambda: one.shown() == [FIRST, SECOND], what="what only the second row says")
 
 
 async def test_other_robot_that_takes_the_id_gets_its_row(one: Page, keys: list[SigningIdentity]) -> None:

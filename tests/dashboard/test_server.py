@@ -473,3 +473,19 @@ def test_audit_records_are_read_as_they_are_appended(tmp_path: Path) -> None:
     with log.open("a") as file:
         file.write('nt": "b"}\nnot json\n')
     assert [each["event"] for each in server._new_records(log, at)[0]] == ["b"]
+
+
+def test_what_happened_leaves_out_the_renewals_of_the_pages_leases(make: Make) -> None:
+    site = make()
+    log = server.audit.audit_directory() / server.AUDIT_FILE
+    log.parent.mkdir(parents=True, exist_ok=True)
+
+    def told() -> bool:
+        with log.open("a") as file:
+            for action in ("renewControl", "tell"):
+                record = {"event": "command_executed", "peer_id": "arm-1", "payload": {"action": action}}
+                file.write(json.dumps(record) + "\n")
+        return '"tell"' in site.model.changes(0)[1]
+
+    eventually(told, what="the audit on the page")
+    assert "renewControl" not in site.model.changes(0)[1]

@@ -138,6 +138,8 @@ def test_halt_of_an_id_on_both_reaches_both(
     verdict = fleet["both"].halt()
     assert verdict.stopped is False
     assert list(verdict.not_stopped) == ["both on mesh"]
+    device_connect.stops = mesh.stops = success("Stopped turnPlate.", stopped=True, halted=["turnPlate"])
+    assert fleet["both"].halt().halted == ("turnPlate",)
 
 
 def test_robot_that_comes_up_on_the_other_network_makes_its_motions_ambiguous(

@@ -122,7 +122,7 @@ def test_error_reply_does_not_count_as_stopped(
     assert faulty.turns == []
     peers.bus.partition(faulty.wire, cut=False)
     faulty.wire.put("strands/faulty/presence", {"robot_id": "faulty", "timestamp": peers.clock()})
-    eventually(lambda: "faulty was out of reach and has answered" in caplog.text)
+    eventually(lambda: "faulty has answered emergency stop" in caplog.text)
     faulty.join()
     assert len(faulty.turns) == 2
     assert any(line.levelname == "CRITICAL" and "dispatch error" in line.getMessage() for line in caplog.records)

@@ -168,7 +168,11 @@ def test_a_locked_peer_refuses_motion_and_answers_reads_and_stops(peers: Fleet) 
     world = World("left")
     peers.join(world, "sim-1", "sim")
     console.emergency_stop()
-    assert console.send("sim-1", {"action": "step"}, timeout=20)["error"] == "command rejected"
+    refused = console.send("sim-1", {"action": "step"}, timeout=20)
+    assert refused["error"] == "command rejected", "older callers know it by these words"
+    facts = refused["refusal"]
+    assert (facts["locked"], facts["refused"], facts["stopped_by"]) == (True, "lockout", "console")
+    assert f"epoch {facts['epochs'][0]}" in facts["reason"] and "To resume: " in facts["reason"]
     start = {"action": "start", "policy_provider": "mock"}
     assert console.send("sim-1", start, timeout=20)["error"] == "command rejected"
     for action in ("status", "ping", "stop", "state", "features", "teleop_status", "teleop_stop"):

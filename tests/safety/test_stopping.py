@@ -111,4 +111,5 @@ def test_an_explanation_is_short_and_says_what_came() -> None:
     assert "no bus" in explain(RuntimeError("no bus"))
     assert "no answer" in explain(TimeoutError("2 s"))
     assert explain(error("wedged")) == "did not stop: wedged"
+    assert explain(error("did not stop: jam: wedged")) == "did not stop: jam: wedged"
     assert len(explain({"status": "x" * 10**5})) < 300

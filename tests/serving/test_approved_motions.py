@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+from fixtures.barista import Barista
+from fixtures.pan_tilt import ArmDevice, PanTilt
 from fixtures.toy_robots import ToyRobot
 from fixtures.waiting import eventually
 
+from strands_robots.contract import adapt
 from strands_robots.envelope import error, success
+from strands_robots.hardware import HardwareRobot
 from strands_robots.safety.approval import Approval, Grants, Leave, digest
 from strands_robots.safety.gate import MotionRequest
 from strands_robots.serving import starting_motions
 from strands_robots.serving.leave import Command
+from strands_robots.serving.peer_verbs import PEER_VERBS
 from strands_robots.serving.pipeline import Pipeline, Result
 from strands_robots.serving.refused import RefusalReason, Refused
 from strands_robots.serving.robot_verbs import ARM_VERBS
-from strands_robots.serving.verbs import Arguments
+from strands_robots.serving.verbs import Arguments, Verb
 
 GOOD = {"instruction": "GOOD", "duration": 300.0}
 EVIL = {"instruction": "EVIL", "duration": 300.0}
@@ -55,14 +60,54 @@ def pipeline(robot: Any, grants: Grants, *allow: str) -> Pipeline:
     return Pipeline.of(robot, lambda: "arm-1", hardware=True, authorize=authorize, approval=approval)
 
 
-def served(line: Pipeline, caller: str, arguments: Arguments = GOOD, verb: str = "execute") -> Result:
+def served(
+    line: Pipeline,
+    caller: str,
+    arguments: Arguments = GOOD,
+    verb: str = "execute",
+    verbs: Mapping[str, Verb] = ARM_VERBS,
+) -> Result:
     results: list[Result] = []
-    line.serve(Command(ARM_VERBS[verb], arguments, caller, line.pending.arrive()), results.append)
+    line.serve(Command(verbs[verb], arguments, caller, line.pending.arrive()), results.append)
     return results[0]
 
 
 def ok(result: Result) -> bool:
     return bool(result.result["status"] == "success")
+
+
+@pytest.mark.parametrize(
+    ("verb", "verbs", "said"),
+    [
+        ("execute", ARM_VERBS, "arm-1 runs no tasks; it has verbs of its own."),
+        ("execute", PEER_VERBS, "arm-1 runs no tasks; it has verbs of its own."),
+        ("pick", ARM_VERBS, "pick is refused: arm-1 lacks what it needs"),
+        ("releaseTorque", PEER_VERBS, "releaseTorque is refused: arm-1 lacks what it needs"),
+        ("nod", PEER_VERBS, "nod is refused: arm-1 lacks what it needs"),
+    ],
+)
+@pytest.mark.parametrize("caller", ["agent-a", "stranger"])
+def test_verb_that_a_robot_lacks_asks_for_no_approval_and_no_other_caller(
+    grants: Grants, caller: str, verb: str, verbs: Mapping[str, Verb], said: str
+) -> None:
+    result = served(pipeline(adapt(Barista()), grants), caller, {}, verb, verbs)
+    assert result.refusal is None
+    assert said in result.result["reason"]
+
+
+def test_task_of_a_robot_without_tasks_is_refused_by_that_with_arguments_that_fit(grants: Grants) -> None:
+    line = pipeline(adapt(Barista()), grants)
+    assert served(line, "agent-a").result["reason"] == "arm-1 runs no tasks; it has verbs of its own."
+    line.robot.gate.attach(Locked())  # type: ignore[union-attr]
+    locked = served(line, "agent-a").refusal
+    assert locked is not None and locked.why is RefusalReason.LOCKOUT
+
+
+def test_verb_for_which_an_arm_has_no_part_asks_for_no_approval(grants: Grants) -> None:
+    refused = served(pipeline(HardwareRobot(PanTilt(), "arm"), grants), "agent-a", {"object": "cube"}, "pick")
+    assert "pick is refused: arm-1 lacks what it needs" in refused.result["reason"]
+    asked = served(pipeline(HardwareRobot(ArmDevice(), "arm"), grants), "agent-a", {"object": "cube"}, "pick")
+    assert asked.refusal is not None and asked.refusal.why is RefusalReason.APPROVAL
 
 
 def test_a_bound_grant_moves_nothing_else_and_is_not_disturbed(robot: ToyRobot, grants: Grants) -> None:

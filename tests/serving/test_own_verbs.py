@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fixtures.barista import Barista, Careless
+from fixtures.barista import Barista, Careless, Stubborn
 
 from strands_robots import Permit, verb
 from strands_robots.contract import adapt
+from strands_robots.envelope import success
 from strands_robots.serving.leave import Command
 from strands_robots.serving.own_verbs import answer_of, own_verbs
 from strands_robots.serving.pipeline import Pipeline, Result
@@ -100,9 +101,83 @@ def test_own_verb_is_served_with_its_arguments_checked() -> None:
     assert "it has no mugs" in served(Barista(), "brewCoffee", cups=1, mugs=2).result["reason"]
 
 
-def test_numpy_is_numbers_and_lists_and_nan_is_none() -> None:
+def test_numpy_is_numbers_and_lists() -> None:
     answer = served(Careless(), "weigh").result
-    assert (answer["grams"], answer["samples"], answer["count"], answer["noise"]) == (12.5, [[1.0, 2.0]], 3, None)
+    assert (answer["grams"], answer["samples"], answer["count"]) == (12.5, [[1.0, 2.0]], 3)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (float("nan"), "result is nan"),
+        (np.float32("inf"), "result is inf"),
+        ({"x": [1, {"y": -np.inf}]}, "x[1].y is -inf"),
+        (np.array([0.5, np.nan]), "result[1] is nan"),
+        ({"x": object}, "x is <class 'object'>"),
+        ({"x": {(1, 2): 3}}, "x has the key (1, 2)"),
+        (b"raw", "result is b'raw'"),
+        pytest.param(1 << 300, "result is an integer of 301 bits", id="long integer"),
+    ],
+)
+def test_what_json_cannot_carry_is_an_error_that_names_verb_and_place(given: object, said: str) -> None:
+    answer = answer_of("weigh", given, "completed")
+    assert (answer["status"], answer["task_status"]) == ("error", "completed")
+    assert answer["reason"] == f"weigh completed. It returned what JSON cannot carry: {said}."
+
+
+def test_value_that_holds_itself_is_an_error() -> None:
+    loop: list[object] = []
+    loop.append(loop)
+    assert answer_of("weigh", loop)["status"] == "error"
+
+
+def test_motion_that_a_stop_ended_is_an_error_with_what_it_returned() -> None:
+    robot = Barista()
+    answers: list[Result] = []
+    brewing = threading.Thread(target=lambda: answers.append(served(robot, "brewCoffee", cups=8)))
+    brewing.start()
+    assert robot.brewing.wait(20.0)
+    adapt(robot).halt()
+    brewing.join(20.0)
+    answer = answers[0].result
+    assert (answer["status"], answer["reason"]) == ("error", "brewCoffee stopped: it was stopped.")
+    assert (answer["task_status"], answer["why"], answer["cups"]) == ("stopped", "it was stopped", 8)
+
+
+def test_motion_that_returned_long_after_its_stop_is_an_error_too() -> None:
+    robot = Stubborn()
+    answers: list[Result] = []
+    grinding = threading.Thread(target=lambda: answers.append(served(robot, "grind")))
+    grinding.start()
+    assert robot.started.wait(20.0)
+    adapt(robot).gate.revoke()
+    robot.released.set()
+    grinding.join(20.0)
+    assert (answers[0].result["status"], answers[0].result["task_status"]) == ("error", "stopped")
+
+
+def test_motion_whose_time_was_over_is_an_error_with_that_reason() -> None:
+    class Slow:
+        @verb(motion=True)
+        def brew(self, permit: Permit) -> None:
+            permit.end_at(0.0)
+
+    assert served(Slow(), "brew").result["reason"] == "brew stopped: its time was over before it was done."
+
+
+@pytest.mark.parametrize(
+    ("given", "said", "fields"),
+    [
+        (None, "", {}),
+        (3, "", {"result": 3}),
+        ({"reason": "it felt something", "task_status": "completed"}, " it felt something", {"task_status": "stopped"}),
+        (success("Two cups.", cups=2), " Two cups.", {"cups": 2}),
+    ],
+)
+def test_words_and_fields_of_a_stopped_motion_are_kept(given: object, said: str, fields: dict[str, Any]) -> None:
+    answer = answer_of("brew", given, "stopped", "it was stopped")
+    assert (answer["status"], answer["reason"]) == ("error", f"brew stopped: it was stopped.{said}")
+    assert {name: answer[name] for name in fields} == fields
 
 
 def test_verb_that_raises_failed_inside_the_device() -> None:

@@ -16,7 +16,7 @@ from tests.fleet.scripted import ScriptedNetwork, function
 
 from strands_robots import settings
 from strands_robots.envelope import error, success
-from strands_robots.errors import UnreachableError
+from strands_robots.errors import UnknownVerbError, UnreachableError
 from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
 from strands_robots.fleet.device_connect.network import DeviceConnectNetwork
 from strands_robots.fleet.mesh import network
@@ -350,6 +350,18 @@ def test_own_verb_is_called_with_its_arguments_for_as_long_as_it_lasts(bar: Scri
     robot_mesh(action="call", target="bar-1", verb="brewCoffee", arguments={"cups": 2})
     robot_mesh(action="call", target="bar-1", verb="ownUnknown")
     assert bar.calls == [("bar-1", "brewCoffee", {"cups": 2}, 125.0), ("bar-1", "ownUnknown", {}, 35.0)]
+
+
+def test_unknown_verb_is_refused_with_those_that_resemble_it(bar: ScriptedNetwork) -> None:
+    def unknown(arguments: object) -> dict[str, Any]:
+        raise UnknownVerbError("Unknown method: brew_coffee", robot="bar-1", verb="brew_coffee")
+
+    bar.answers["brew_coffee"] = unknown
+    answer = robot_mesh(action="call", target="bar-1", verb="brew_coffee", arguments={"cups": 2})
+    assert (answer["status"], answer["reason"]) == (
+        "error",
+        "Unknown method: brew_coffee. Near it: brewCoffee.",
+    )
 
 
 def test_error_without_content_is_an_error_to_the_model(bar: ScriptedNetwork) -> None:

@@ -265,7 +265,7 @@ def answering(there: Networks, robot: str, verb: str) -> Iterator[None]:
         CliError: no such robot or no answer (exit code 3), the call was refused as such, or two robots have the id
             (exit code 1), or was not sent for its arguments (exit code 2).
     """
-    from strands_robots.fleet.refusals import said  # noqa: PLC0415 - only a call needs it
+    from strands_robots.fleet.refusals import near_verbs, said  # noqa: PLC0415 - only a call needs it
 
     try:
         yield
@@ -285,7 +285,7 @@ def answering(there: Networks, robot: str, verb: str) -> Iterator[None]:
             code = Exit.USAGE
         elif "jsonrpc_code" in answer:
             fields = {"jsonrpc_code": answer["jsonrpc_code"]}
-            verbs = _near_verbs(there, robot, verb) if isinstance(refusal, UnknownVerbError) else ""
+            verbs = near_verbs(there, robot, verb) if isinstance(refusal, UnknownVerbError) else ""
             reason = f"{reason.rstrip('.')}.{verbs}" if verbs else reason
         raise CliError(plain(reason, 2000), code, **fields) from refusal
 
@@ -297,16 +297,6 @@ def near_robots(there: Networks, robot: str) -> str:
     except RefusalError:
         return ""
     return "" if robot in names else near(robot, names)
-
-
-def _near_verbs(there: Networks, robot: str, verb: str) -> str:
-    """Return a sentence with the verbs of a robot that resemble an absent one."""
-    from strands_robots.serving.advertised import verb_names  # noqa: PLC0415 - only a refusal needs it
-
-    try:
-        return near(verb, verb_names(there.describe(robot, anew=True)))
-    except RefusalError:
-        return ""
 
 
 @contextmanager

@@ -150,14 +150,18 @@ def estop(
         )
         verdict = _watched(screen, networks, pressed, latest) if screen.live else pressed()
         _say_ignored(screen, cut, unread, unfit)
-        concerned = _report(screen, networks, verdict, _estop_facts, drawn=screen.live)
-        there = [each for each in networks.stated if each.name in concerned]
-        if there and all(each.on_this_machine for each in there):
-            user = meeting_user(there[0].meeting_port)
-            screen.say(LOCKED)
-            screen.copyable(f"  sudo -u {user} {RESUME_HERE}" if user else f"  {RESUME_HERE}")
-        else:
-            show_resume(screen, key, f"{' --mesh' if on_mesh else ''}{network.flags}")
+        try:
+            _report(screen, networks, verdict, _estop_facts, drawn=screen.live)
+        finally:
+            # A robot that did not stop is locked all the same.
+            locked = {each.network for each in verdict.networks if _locked(each)}
+            there = [each for each in networks.stated if each.name in locked]
+            if there and all(each.on_this_machine for each in there):
+                user = meeting_user(there[0].meeting_port)
+                screen.say(LOCKED)
+                screen.copyable(f"  sudo -u {user} {RESUME_HERE}" if user else f"  {RESUME_HERE}")
+            elif there:
+                show_resume(screen, key, f"{' --mesh' if on_mesh else ''}{network.flags}")
 
 
 @contextmanager
@@ -257,7 +261,7 @@ def _report(
     facts: Callable[[Networks, NetworkVerdict], Mapping[str, Any]],
     *,
     drawn: bool = False,
-) -> frozenset[str]:
+) -> None:
     """Print a stop of all; raise unless every robot that must answer stands still.
 
     Args:
@@ -266,9 +270,6 @@ def _report(
         verdict: of the stop.
         facts: returns what programs read of the first network; robots of others stand under the network's name.
         drawn: the table is on the screen already.
-
-    Returns:
-        The names of the networks that have robots.
     """
     shown = _shown(verdict)
     rows = _rows(shown)
@@ -301,7 +302,15 @@ def _report(
         worst = Exit.REFUSED if any(code is Exit.REFUSED for code, _ in failed) else Exit.SILENT
         raise CliError(plain(" ".join(said for _, said in failed), 2000), worst, **known)
     screen.data({"status": "success", **known})
-    return frozenset(each.network for each in shown)
+
+
+def _locked(each: NetworkVerdict) -> bool:
+    """Return whether a robot answered an emergency stop by which it is locked."""
+    if each.outcome is None:
+        return False
+    report = each.outcome.report
+    answered = {*report.stopped, *report.not_stopped, *each.outcome.others.stopped, *each.outcome.others.not_stopped}
+    return not answered <= {*each.outcome.not_locked}
 
 
 def _why(networks: Networks, each: NetworkVerdict, outcome: StopOutcome) -> str:

@@ -9,6 +9,7 @@ from typing import Any
 
 from strands_robots.dashboard.feeds import Feeds
 from strands_robots.dashboard.fleet_model import FleetModel, key_of
+from strands_robots.fleet.all_stops import for_all
 from strands_robots.fleet.fleet_verdict import NetworkVerdict
 from strands_robots.fleet.stop_button import StopButton
 from strands_robots.safety.answers import Answer
@@ -118,6 +119,7 @@ class FleetStop:
         now, links = self._model.clock(), self._links()
         heard = [row.heard for row in self._model.rows() if row.heard is not None]
         silent_s = round(now - max(heard), 2) if heard else None
+        silent = silent_s is not None and silent_s > SILENT_S
         not_left = {name: each for name, each in self._not_left.items() if name not in self._feeds.senders}
         rosters = {name: _roster(each) for name, each in self._measured().items()}
         rosters |= {name: {"ok": False, "sentence": each.sentence, "notes": []} for name, each in not_left.items()}
@@ -126,7 +128,8 @@ class FleetStop:
             "links": links,
             "missing": self._feeds.missing,
             "silent_s": silent_s,
-            "can_stop": bool(links) and all(links.values()) and (silent_s is None or silent_s <= SILENT_S),
+            "silent": silent,
+            "can_stop": bool(links) and all(links.values()) and not silent,
             "running": self.running,
             "roster": rosters,
             "pressed_at": self._pressed_at,
@@ -148,7 +151,8 @@ class FleetStop:
     def _measured(self) -> dict[str, StopOutcome]:
         """Return the outcomes of the latest stop of all, where there are robots."""
         found = {name: each.outcome for (name, scope), each in self._buttons.every.items() if scope.everything}
-        outcomes = {name: each for name, each in found.items() if each is not None}
+        told = zip(found, for_all([*found.values()]), strict=True)
+        outcomes = {name: each for name, each in told if each is not None}
         return {name: each for name, each in outcomes.items() if each.size or each.problems} or outcomes
 
     def _pressed_for(self) -> str:

@@ -227,7 +227,8 @@ class FleetFeed:
             description = RobotDescription.of(functions)
             forms, known = forms_of_verbs(description.verbs.values()), isinstance(functions, list | tuple)
             lacking = ", ".join(f"no {each}" for each in description.lacking) if known else ""
-            self._model.update(self.network, name, forms=forms, lacking=lacking)
+            holdable = "acquireControl" in description.verbs
+            self._model.update(self.network, name, forms=forms, holdable=holdable, lacking=lacking)
 
     async def _ask_verbs(self, name: str) -> None:
         loop = asyncio.get_running_loop()

@@ -59,6 +59,7 @@ class RobotRow:
         messages: signs of life since the last sample of the history, and ``gap_s`` the longest time between two.
         units: unit of each joint's position, as its features name it; ``limits`` are in the same.
         forms: its verbs, as :func:`~strands_robots.dashboard.verb_forms.forms_of` describes them.
+        holdable: its control lease can be acquired.
         lacking: what a device that is none of ours does not have: a lockout, a lease, a stop.
         hidden: another row shows the same robot.
         namesake: another robot of this id has a row, too.
@@ -84,6 +85,7 @@ class RobotRow:
     control_told_at: float = float("-inf")
     check_in: dict[str, Any] | None = None
     forms: tuple[Mapping[str, Any], ...] = ()
+    holdable: bool = False
     lacking: str = ""
     hidden: bool = False
     namesake: bool = False
@@ -438,6 +440,7 @@ class FleetModel:
                 "type": "robot",
                 "key": key,
                 "forms": list(row.forms),
+                "holdable": row.holdable,
                 "limits": row.limits,
                 "units": row.units,
                 "cameras": row.cameras,

@@ -168,8 +168,9 @@ class PageRobots:
             shared = self._shared.setdefault(name, _Shared())
             self._ask(name, shared, ordered)
             if shared.proof.key is not None:
-                after = ordered[ordered.index(self._lasting(ordered)) + 1 :]
-                hidden |= {each.key for each in after if each.key not in in_use and not self._model.unsettled(each)}
+                lasting = self._lasting(ordered)
+                after = [each for each in ordered[ordered.index(lasting) + 1 :] if each.key not in in_use]
+                hidden |= {each.key for each in after if not self._model.unsettled(each) or _says_it(lasting, each)}
             seen = {each.key for each in ordered} - hidden
             namesakes |= seen if len(seen) > 1 else set()
         self._model.arrange(hidden, namesakes)
@@ -227,6 +228,13 @@ class PageRobots:
 
 _ORDER = (False, None, True)
 """Answers to a stop from the worst: it did not stop, it is not known, it did."""
+
+
+def _says_it(shown: RobotRow, other: RobotRow) -> bool:
+    """Return whether a row says of the latest stop all that another row says of it."""
+    stop, same = other.stop or {}, shown.stop or {}
+    told = all(each in same and same[each] == stop.get(each) for each in ("id", "state"))
+    return told and not (other.alarm or other.doubt or "alarm" in stop)
 
 
 def _quietly(work: Callable[[], object]) -> None:

@@ -168,7 +168,9 @@ class Dashboard:
                 payload = record.get("payload")
                 facts = payload if isinstance(payload, dict) else {}
                 name, event = str(record.get("peer_id", "")), str(record.get("event", ""))
-                self.model.note("audit", name, event, facts, audit=True)
+                # The page renews each lease that it holds four times a second.
+                if (event, facts.get("action")) != ("command_executed", "renewControl"):
+                    self.model.note("audit", name, event, facts, audit=True)
 
     async def _admitted(self, socket: WebSocket) -> str | None:
         """Accept a WebSocket and return the role of its first message, or None."""

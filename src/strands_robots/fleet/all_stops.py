@@ -23,7 +23,7 @@ from strands_robots.safety.orders import new_epoch
 from strands_robots.safety.roster import RosterRow
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.safety.sightings import Known
-from strands_robots.safety.stop_roster import robots_known_at
+from strands_robots.safety.stop_roster import StopOutcome, robots_known_at
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.utils import plain_text
 
@@ -220,18 +220,19 @@ def _told_once(verdicts: Sequence[Stopped], named: Collection[str]) -> list[Stop
 
 
 def _for_all(stops: Sequence[Stopped]) -> list[Stopped]:
-    """Return the verdicts; the stop was for the others' robots, too."""
-    outcomes = [each.outcome for each, _ in stops]
+    outcomes = for_all([each.outcome for each, _ in stops])
+    return [(replace(each, outcome=told), left) for (each, left), told in zip(stops, outcomes, strict=True)]
+
+
+def for_all(outcomes: Sequence[StopOutcome | None]) -> list[StopOutcome | None]:
+    """Return the outcomes of one stop by network; it was for the others' robots, too."""
     known = [frozenset(() if each is None else map(_sure, each.roster.rows)) - {""} for each in outcomes]
 
-    def told(place: int, each: NetworkVerdict) -> NetworkVerdict:
-        if each.outcome is None:
-            return each
-        roster, others = each.outcome.roster, frozenset[str]().union(*known[:place], *known[place + 1 :])
-        roster = replace(roster, elsewhere=max(0, roster.elsewhere - len(others)))
-        return replace(each, outcome=replace(each.outcome, roster=roster))
+    def told(place: int, each: StopOutcome) -> StopOutcome:
+        others = frozenset[str]().union(*known[:place], *known[place + 1 :])
+        return replace(each, roster=replace(each.roster, elsewhere=max(0, each.roster.elsewhere - len(others))))
 
-    return [(told(place, each), left) for place, (each, left) in enumerate(stops)]
+    return [None if each is None else told(place, each) for place, each in enumerate(outcomes)]
 
 
 def _sure(row: RosterRow) -> str:

@@ -201,7 +201,7 @@ def combined(robot: str, verdicts: Sequence[StopVerdict], elapsed_ms: float) -> 
     if not verdicts:
         return StopVerdict(unknown={robot: "it did not answer, or has no stop"}, elapsed_ms=elapsed_ms)
     return StopVerdict(
-        tuple(name for each in verdicts for name in each.halted),
+        tuple(dict.fromkeys(name for each in verdicts for name in each.halted)),
         {name: why for each in verdicts for name, why in each.not_stopped.items()},
         {name: why for each in verdicts for name, why in each.unknown.items()},
         elapsed_ms,

@@ -7,7 +7,7 @@ fields, and an answer of the mesh, which is a text, by its words.
 from __future__ import annotations
 
 from collections.abc import Awaitable, Mapping
-from typing import Any
+from typing import Any, Protocol
 
 from strands_robots.envelope import Envelope, error, text_of
 from strands_robots.errors import (
@@ -24,7 +24,7 @@ from strands_robots.errors import (
     UnreachableError,
 )
 from strands_robots.serving.refused import RefusalReason
-from strands_robots.utils import plain_text
+from strands_robots.utils import near, plain_text
 
 WHY_MAX = 500
 
@@ -67,6 +67,13 @@ WORDS: tuple[tuple[str, type[RefusalError]], ...] = (
 """Words of a text, the first that is found counts."""
 
 
+class Describes(Protocol):
+    """A network, or several, that describe their robots."""
+
+    def describe(self, robot: str, *, anew: bool = False) -> object:
+        """Return the robot's functions; raises :class:`RefusalError`."""
+
+
 def said(refusal: RefusalError) -> str:
     """Return a refusal in words, without the remedies that are for Python.
 
@@ -99,6 +106,16 @@ def with_meaning(text: str) -> str:
     """Return a refusal of the mesh, with its meaning where it is a fixed word."""
     known = EXACT.get(text)
     return text if known is None else f"{text}: {known[1]}"
+
+
+def near_verbs(network: Describes, robot: str, verb: str) -> str:
+    """Return a sentence with the verbs of a robot that resemble an absent one."""
+    from strands_robots.serving.advertised import verb_names  # noqa: PLC0415 - only a refusal needs it
+
+    try:
+        return near(verb, verb_names(network.describe(robot, anew=True)))
+    except RefusalError:
+        return ""
 
 
 def refusal_of(robot: str, verb: str, answer: Mapping[str, Any]) -> RefusalError:

@@ -6,10 +6,10 @@ import time
 from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Literal
 
 from strands_robots.contract import Haltable, Robot, holds_robots
-from strands_robots.envelope import is_error
+from strands_robots.envelope import Envelope, is_error
 from strands_robots.mesh import topics, wire
 from strands_robots.mesh.console_keys import MOTION
 from strands_robots.mesh.context import Context
@@ -258,7 +258,9 @@ class CommandReceiver:
         if refusal is not None:
             event = "wire_motion_refused" if refusal.why is RefusalReason.APPROVAL else "command_refused"
             reason = DISPATCH if refusal.why is RefusalReason.FAILED else refusal.reason
-            self._refuse(request, verb.name, _wire_text(refusal), reason, event)
+            # The word of a lockout is the whole text on this wire; its facts go beside it.
+            facts = refusal.envelope if refusal.why is RefusalReason.LOCKOUT else None
+            self._refuse(request, verb.name, _wire_text(refusal), reason, event, facts)
             return
         self._reply(request.sender_id, request.turn_id, result=answer.result)
         if verb.kind is not Kind.READ or verb.name == "teleop_stop":
@@ -322,17 +324,26 @@ class CommandReceiver:
             self._logged = (reason, now)
             logger.critical("%s was asked to stop over the mesh: %s.", self._context.peer_id, reason)
 
-    def _refuse(
-        self, request: wire.Request, action: str, text: str, reason: str = "", event: str = "command_refused"
+    def _refuse(  # noqa: PLR0917 - one refusal
+        self,
+        request: wire.Request,
+        action: str,
+        text: str,
+        reason: str = "",
+        event: str = "command_refused",
+        envelope: Envelope | None = None,
     ) -> None:
         self._context.audit(event, request.sender_id, action=action[:32], reason=reason or text)
-        self._reply(request.sender_id, request.turn_id, error=text)
+        self._reply(request.sender_id, request.turn_id, error=text, refusal=envelope)
 
-    def _reply(self, sender: str, turn: str, *, result: Any = None, error: str = "") -> None:
+    def _reply(
+        self, sender: str, turn: str, *, result: Any = None, error: str = "", refusal: Envelope | None = None
+    ) -> None:
         context = self._context
         if sender in RESERVED_IDS:
             return  # a reply below the safety topics would make 0.5.3 peers drop e-stops
-        reply = wire.Reply("error" if error else "response", context.peer_id, turn, result, error, context.clock())
+        kind: Literal["response", "error"] = "error" if error else "response"
+        reply = wire.Reply(kind, context.peer_id, turn, result, error, context.clock(), refusal=refusal)
         key = topics.response(sender, context.peer_id, turn)
         try:
             context.put(key, context.identity.sign(reply.to_wire()))

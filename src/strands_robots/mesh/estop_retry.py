@@ -80,7 +80,7 @@ class EstopRetry:
                 outcome = stop_outcome(reply)
                 if outcome is Outcome.STOPPED:
                     left.discard(peer)
-                    logger.warning("%s was out of reach and has answered emergency stop %s now.", peer, epoch)
+                    logger.warning("%s has answered emergency stop %s now, and did not at first.", peer, epoch)
                 elif outcome is Outcome.TIMED_OUT:
                     silences[peer] += 1
                     if silences[peer] >= UNANSWERED_MAX:

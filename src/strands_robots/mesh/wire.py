@@ -175,7 +175,10 @@ class Request:
 
 @dataclass(slots=True)  # not frozen: that would cost each message a microsecond
 class Reply:
-    """An answer in a turn: ``result`` of a response, ``error`` of an error."""
+    """An answer in a turn: ``result`` of a response, ``error`` of an error.
+
+    ``refusal`` is the envelope of an error, for callers that read more than its words.
+    """
 
     type: Literal["response", "error"]
     responder_id: str
@@ -184,9 +187,12 @@ class Reply:
     error: str = ""
     timestamp: float = 0.0
     body: Mapping[str, Any] = field(default_factory=dict)
+    refusal: Mapping[str, Any] | None = None
 
     def to_wire(self) -> dict[str, Any]:
         answer: dict[str, Any] = {"error": self.error} if self.type == "error" else {"result": self.result}
+        if self.refusal is not None:
+            answer["refusal"] = self.refusal
         head = {"type": self.type, "responder_id": self.responder_id, "turn_id": self.turn_id}
         return {**head, **answer, "timestamp": self.timestamp}
 

@@ -201,7 +201,8 @@ def explain(answer: object) -> str:
     if outcome in (Outcome.REFUSED, Outcome.UNKNOWN) and isinstance(answer, Mapping):
         for key in ("reason", "error", "message"):
             if isinstance(answer.get(key), str) and answer[key]:
-                return f"{outcome.value}: {answer[key]}"
+                # A robot that graded a part of itself says so already.
+                return f"{outcome.value}: {answer[key].removeprefix(f'{outcome.value}: ')}"
     return f"{outcome.value}: {shown(answer)}"
 
 

@@ -16,6 +16,7 @@ from strands_robots.envelope import error
 from strands_robots.safety.approval import Approval, Leave, digest
 from strands_robots.safety.gate import MotionRefused, MotionRequest
 from strands_robots.serving.control import ControlLeases, NotHolderError
+from strands_robots.serving.offered_verbs import unoffered
 from strands_robots.serving.policy_arguments import MOCK, mock_refusal
 from strands_robots.serving.refused import RefusalReason, Refused
 from strands_robots.serving.verbs import LEASE_ID, LEASE_NAMES, LEASE_TTL_S, Arguments, Kind, Verb
@@ -83,10 +84,14 @@ class MotionRules:
 
         Raises:
             Refused: naming who refused, and why.
-            MotionRefused: the robot was halted since the command arrived.
+            MotionRefused: the robot does not offer the verb, or was halted since the command arrived.
         """
         verb = command.verb
-        callers = self.authorize(command, arguments) or ()
+        try:
+            callers = self.authorize(command, arguments) or ()
+        except Refused:
+            self._refuse_unoffered(verb)
+            raise
         terms = self._terms(command, arguments)
         if verb.kind is not Kind.MOTION:
             return Leave()
@@ -140,7 +145,14 @@ class MotionRules:
         except NotHolderError as exc:
             raise Refused(RefusalReason.CONTROL, str(exc), envelope=exc.envelope) from None
 
+    def _refuse_unoffered(self, verb: Verb) -> None:
+        """Refuse a verb that the robot does not offer, for which no grant would help."""
+        lacking = None if self.robot is None else unoffered(self.robot, verb, self.peer_id())
+        if lacking is not None:
+            raise MotionRefused(error(lacking))
+
     def _unapproved(self, verb: Verb) -> Refused:
+        self._refuse_unoffered(verb)
         text = Approval.refusal(verb.name, self.peer_id())
         return Refused(RefusalReason.APPROVAL, text, reason="the operator has not approved it")
 

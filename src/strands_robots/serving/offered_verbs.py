@@ -9,7 +9,7 @@ from typing import Any
 
 from strands_robots.contract import body_of, holds_robots
 from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS
-from strands_robots.serving.verbs import Verb
+from strands_robots.serving.verbs import POLICY_PROVIDER, Verb
 
 logger = logging.getLogger(__name__)
 
@@ -29,6 +29,26 @@ def offered(robot: Any, verbs: Mapping[str, Verb]) -> dict[str, Verb]:
     """
     arm = _arm_verbs(robot)
     return {name: verb for name, verb in verbs.items() if _offers(robot, verb, arm)}
+
+
+def tasks_refused(robot: Any, verb: Verb, name: str) -> str | None:
+    """Return why a robot without tasks refuses a verb that starts one, else None.
+
+    A world has its robots' tasks, and says itself which robot lacks them.
+    """
+    if POLICY_PROVIDER.name not in verb.by_name or holds_robots(robot) or _offers(robot, verb, None):
+        return None
+    return f"{name} runs no tasks; it has verbs of its own."
+
+
+def unoffered(robot: Any, verb: Verb, name: str) -> str | None:
+    """Return the refusal of a verb that a robot does not offer now, or None."""
+    if offered(robot, {verb.name: verb}):
+        return None
+    generic = (
+        f"{verb.name} is refused: {name} lacks what it needs, such as an arm, a model of it, a gripper or a camera."
+    )
+    return tasks_refused(robot, verb, name) or generic
 
 
 class Offers:

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from strands_robots.contract import body_of, holds_robots, stops_motions
-from strands_robots.envelope import Envelope, jsonable, success
+from strands_robots.envelope import Envelope, error, fields_of, is_error, jsonable, success, text_of, uncarried
 from strands_robots.safety.gate import MotionRequest
 from strands_robots.serving.advertised import RobotDescription
 from strands_robots.serving.robot_verbs import ARM_VERBS, WORLD_VERBS
@@ -144,19 +144,28 @@ def _served(body: object, declared: DeclaredVerb) -> Verb:
     )
 
 
-def answer_of(verb: str, result: object, ended: str = "") -> Envelope:
+def answer_of(verb: str, result: object, ended: str = "", why: str = "") -> Envelope:
     """Return what a robot's own verb returned as an envelope that JSON can carry.
 
-    An envelope stays one. The items of another mapping are its fields, any other value is the field ``result``.
+    An envelope stays one. The items of another mapping are its fields, any other value is the field ``result``. A
+    motion that did not come to its end is an error, as one of ours is, with what it returned.
 
     Args:
         verb: its name.
         result: as the method returned it.
         ended: ``task_status`` of a motion; empty for a read.
+        why: the reason why a motion did not come to its end; empty where it did.
     """
-    plain = jsonable(result)
     status = {"task_status": ended} if ended else {}
-    said = f"{verb} {ended or 'answered'}."
+    said = f"{verb} {ended or 'answered'}{': ' if why else ''}{why}."
+    unfit = uncarried(result)
+    if unfit:
+        return error(f"{said} It returned what JSON cannot carry: {unfit}.", **status)
+    plain = jsonable(result)
+    if why and not is_error(plain):
+        given = plain if isinstance(plain, dict) else {} if plain is None else {"result": plain}
+        kept = {key: each for key, each in fields_of(given).items() if key not in ("status", "reason")}
+        return error(f"{said} {text_of(given)}".rstrip(), **{"why": why, **kept, **status})
     if not isinstance(plain, Mapping):
         return success(said, **status, **({} if plain is None else {"result": plain}))
     if plain.get("status") in ("success", "error"):

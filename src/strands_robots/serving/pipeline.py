@@ -17,9 +17,10 @@ from strands_robots.contract import Robot, body_of
 from strands_robots.envelope import Envelope, error, is_error
 from strands_robots.identity_map import IdentityMap
 from strands_robots.safety.approval import Leave
-from strands_robots.safety.gate import REFUSALS, MotionGate, MotionRequest, refusal_envelope
+from strands_robots.safety.gate import REFUSALS, MotionGate, MotionRefused, MotionRequest, refusal_envelope
 from strands_robots.serving.control import NotHolderError, leases_of
 from strands_robots.serving.leave import Command, MotionRules
+from strands_robots.serving.offered_verbs import tasks_refused
 from strands_robots.serving.refused import RefusalReason, Refused
 from strands_robots.serving.verbs import Arguments, Kind, Verb
 from strands_robots.serving.workers import Share, Shares, shares_of
@@ -201,4 +202,7 @@ class Pipeline(MotionRules):
         try:
             return command.verb.checked(command.arguments)
         except ValidationError as exc:
+            lacking = None if self.robot is None else tasks_refused(self.robot, command.verb, self.peer_id())
+            if lacking is not None:
+                raise MotionRefused(error(lacking)) from None
             raise Refused(RefusalReason.ARGUMENTS, str(exc)) from None

@@ -19,13 +19,13 @@ from typing import Any
 from strands_robots import settings
 from strands_robots.agent_tool import fitted, tool
 from strands_robots.envelope import Envelope, error, is_error, success, text_of
-from strands_robots.errors import NoSuchRobotError, RefusalError, StrandsRobotsError
+from strands_robots.errors import NoSuchRobotError, RefusalError, StrandsRobotsError, UnknownVerbError
 from strands_robots.fleet.adapter import STOP_S, FoundRobot
 from strands_robots.fleet.all_stops import answer_of, estop_all, stop_all
 from strands_robots.fleet.callers import TOOL
 from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.profiles import profile_for
-from strands_robots.fleet.refusals import said
+from strands_robots.fleet.refusals import near_verbs, said
 from strands_robots.fleet.stated_networks import networks_for_stop, networks_of
 from strands_robots.fleet.stop_answers import by_bearer, combined_verdict
 from strands_robots.serving import known_verbs
@@ -163,7 +163,11 @@ def _called(there: Networks, robot: str, verb: str, arguments: Mapping[str, Any]
     if verb in known_verbs.STOPS:
         return there.call(robot, verb, arguments, STOP_S)
     network, described = there.described(robot, verb)
-    return network.call(robot, verb, arguments, CALL_S + (described.lasts_s if described is not None else 0.0))
+    try:
+        return network.call(robot, verb, arguments, CALL_S + (described.lasts_s if described is not None else 0.0))
+    except UnknownVerbError as refusal:
+        text = said(refusal)
+        return error(text if "Near it: " in text else f"{text.rstrip('.')}.{near_verbs(network, robot, verb)}")
 
 
 def _stop(target: object, arguments: object) -> dict[str, Any]:

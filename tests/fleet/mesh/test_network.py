@@ -11,7 +11,8 @@ from typing import Any
 
 import pytest
 
-from strands_robots.errors import ArgumentsError, NoSuchRobotError
+from strands_robots.envelope import error
+from strands_robots.errors import ArgumentsError, LockoutError, NoSuchRobotError, UnknownVerbError
 from strands_robots.fleet.mesh import descriptions, network
 from strands_robots.fleet.mesh.network import MeshNetwork
 from strands_robots.mesh.transport import zenoh_config
@@ -116,6 +117,36 @@ def test_verbs_of_an_older_peer_are_those_of_its_kind() -> None:
     mesh = FakeMesh([row("bar-1", own_verbs=["brewCoffee", 5])], lambda _: older)
     verbs = [*RobotDescription.of(joined(mesh).describe_each(["bar-1"])["bar-1"]).verbs]
     assert "moveTo" in verbs and verbs[-1] == "brewCoffee"
+
+
+def test_locked_peer_is_refused_with_its_epoch_and_the_remedy() -> None:
+    facts = error("step is refused: arm-1 is locked. To resume: ...", locked=True, refused="lockout", epochs=["a" * 32])
+    mesh = FakeMesh([row("arm-1")], lambda _: {"type": "error", "error": "command rejected", "refusal": facts})
+    with pytest.raises(LockoutError, match="To resume: ") as refused:
+        joined(mesh).call("arm-1", "step", {}, 1.0)
+    assert refused.value.envelope["epochs"] == ["a" * 32]
+
+
+@pytest.mark.parametrize("refusal", [None, 5, {}, {"status": "success"}])
+def test_locked_peer_of_an_earlier_release_is_refused_in_its_words(refusal: object) -> None:
+    mesh = FakeMesh([row("arm-1")], lambda _: {"type": "error", "error": "command rejected", "refusal": refusal})
+    with pytest.raises(LockoutError, match="it is locked by an emergency stop"):
+        joined(mesh).call("arm-1", "step", {}, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("verb", "said"),
+    [("brew_coffee", "'brew_coffee'. Near it: brewCoffee"), ("execute", "'execute'. There are: brewCoffee, stop.")],
+)
+def test_verb_that_a_peer_lacks_is_refused_with_those_that_it_has(verb: str, said: str) -> None:
+    def reply(command: dict[str, Any]) -> dict[str, Any]:
+        if command["action"] == "describe":
+            functions = [{"name": name} for name in ("stop", "brewCoffee")]
+            return {"type": "response", "result": {"status": "success", "functions": functions}}
+        return {"status": "error", "error": "validation: action must be one of status, stop."}
+
+    with pytest.raises(UnknownVerbError, match=f"bar-1 has no verb {said}"):
+        joined(FakeMesh([row("bar-1")], reply)).call("bar-1", verb, {}, 1.0)
 
 
 def test_peer_announces_the_verbs_of_its_kind_and_is_not_asked_for_them() -> None:

@@ -8,10 +8,11 @@ from contextlib import contextmanager
 
 import pytest
 from fixtures.face_robots import OURS, FaceSite
-from fixtures.faces import Answer, Face, described_by
+from fixtures.faces import Answer, Face, PageFace, described_by
 from fixtures.waiting import eventually
 
 from strands_robots import connect
+from strands_robots.errors import ControlError
 
 pytestmark = pytest.mark.timeout(300)
 BARISTA, MILL, CARELESS = OURS
@@ -104,6 +105,16 @@ class TestFaceContract:
             assert face.stop(BARISTA).ok, "a stop needs no lease"
         assert face.call(BARISTA, "brewCoffee", cups=1).ok
 
+    def test_page_holds_a_robot_without_joints(self, site: FaceSite, face: Face) -> None:
+        if not isinstance(face, PageFace):
+            return
+        with face.holding(BARISTA) as taken, connect(name="other") as fleet:
+            assert taken.ok, taken
+            assert face.call(BARISTA, "brewCoffee", cups=1).ok, "its call sends the lease"
+            with pytest.raises(ControlError):
+                fleet[BARISTA].call("brewCoffee", cups=1)
+        assert face.call(BARISTA, "brewCoffee", cups=1).ok
+
     def test_stop_ends_a_verb_in_its_middle_and_the_next_one_begins(
         self, site: FaceSite, face: Face, brewing: Callable[[], object]
     ) -> None:
@@ -114,7 +125,8 @@ class TestFaceContract:
                 stopped = face.stop(BARISTA)
                 assert stopped.ok, stopped
                 steps = site.robots.ask("steps")
-            assert answers[0].fields.get("task_status") == "stopped", answers
+            assert not answers[0].ok, "what a stop ended is not done"
+            assert "brewCoffee stopped: it was stopped." in answers[0].text, answers
             assert site.robots.ask("steps") == steps
             before = steps
             brewing = lambda before=before: site.robots.ask("steps") > before  # noqa: E731 - the next turn's
@@ -132,7 +144,8 @@ class TestFaceContract:
         for _ in range(2):
             refused = face.call(BARISTA, "brewCoffee", cups=1)
             assert not refused.ok
-            assert "locked" in refused.text
+            assert "is locked by the emergency stop of" in refused.text
+            assert "To resume: " in refused.text
         assert face.call(BARISTA, "beansLeft").ok
         assert site.robots.ask("steps") == steps
         freed = face.resume(BARISTA)
@@ -170,7 +183,10 @@ class TestFaceContract:
             weighed = face.call(CARELESS, "weigh")
             assert weighed.ok, weighed
             assert (weighed.fields["grams"], weighed.fields["samples"]) == (12.5, [[1.0, 2.0]])
-            assert (weighed.fields["count"], weighed.fields["noise"]) == (3, None)
+            assert weighed.fields["count"] == 3
+            unfit = face.call(CARELESS, "noise")
+            assert not unfit.ok
+            assert "It returned what JSON cannot carry: grams[1] is nan." in unfit.text
         moved = face.call(CARELESS, "peek")
         assert not moved.ok
         assert "declared a read" in moved.text

@@ -23,8 +23,10 @@ export class Drive {
     this.speed.value = "0.3";
     this.speed.addEventListener("change", () => { this.jog.speed = Number(this.speed.value); });
     this.pads = el("div", { class: "pads" });
-    this.node = el("section", { class: "panel drive", "aria-labelledby": "drive-title" }, el("h3", { id: "drive-title", text: S.drive }), this.control,
-      el("div", { class: "tools" }, this.take, el("label", { for: "jog-speed", text: S.speed }), this.speed), this.passphraseField, this.said, this.pads);
+    this.title = el("h3", { id: "drive-title", text: S.drive });
+    this.speedLabel = el("label", { for: "jog-speed", text: S.speed });
+    this.node = el("section", { class: "panel drive", "aria-labelledby": "drive-title" }, this.title, this.control,
+      el("div", { class: "tools" }, this.take, this.speedLabel, this.speed), this.passphraseField, this.said, this.pads);
   }
 
   open(key) {
@@ -34,6 +36,7 @@ export class Drive {
     this.groups.clear();
     this.pads.replaceChildren();
     this.jointNames = this.names = null;
+    this.holdable = false;
     this.say(S.jogHint, "quiet");
   }
 
@@ -50,6 +53,7 @@ export class Drive {
 
   details(detail) {
     this.names = new Set(detail.forms.map((form) => form.name));
+    this.holdable = detail.holdable;
     if (detail.history.length) this.take_joints(detail.history[detail.history.length - 1][1]);
     this.arrange();
   }
@@ -91,7 +95,12 @@ export class Drive {
     // Nobody can let go of a button that is gone.
     if (this.jog.now && this.jog.now.node && !this.jog.now.node.isConnected) this.jog.end("released");
     this.jog.axes = [...this.groups.values()].flatMap((group) => group.axes);
-    this.node.hidden = !names.has("acquireControl") && wanted.size === 0;
+    this.node.hidden = !this.holdable && wanted.size === 0;
+    // Without anything to jog a robot is moved by its verbs alone.
+    this.speed.hidden = this.speedLabel.hidden = wanted.size === 0;
+    setText(this.title, wanted.size ? S.drive : S.control);
+    if (this.said.textContent === S.jogHint && !wanted.size) this.say(S.verbHint, "quiet");
+    if (this.said.textContent === S.verbHint && wanted.size) this.say(S.jogHint, "quiet");
   }
 
   pair(kind, axis, [minus, plus], index, name = "") {

@@ -2,7 +2,7 @@
 import { own } from "./dom.js";
 import { S } from "./strings.js";
 
-const TIME = /^(t|at|ts|since|until|time|timestamp)$|_at$/;
+const TIME = /^(t|at|ts|since|until|issued|time|timestamp)$|_at$/;
 const LEFT_OUT = /^(epoch|estop_id|id|n|nonce|loop|robot_name|seq|statement|signature|key_id|boot_id)$/;
 const EARLIEST = 1e9, LATEST = 4e9;
 const CODE = /^[0-9a-f]{16,}$/i;

@@ -2,6 +2,7 @@
 import { el, setAttr, setLine, setShown, setText } from "./dom.js";
 import { Drive } from "./drive.js";
 import { ageText, kindText, lockText, nameText, taskText, verdictText, verdictTone } from "./fleet.js";
+import { STOPS } from "./forms.js";
 import { Halt } from "./halt.js";
 import { Joints } from "./joints.js";
 import { Pictures } from "./pictures.js";
@@ -11,6 +12,7 @@ import { Verbs } from "./verbs.js";
 
 // The parts are shown together, once the robot has said what it has; one that says nothing is waited for so long.
 const READY_MS = 2000;
+const OF_JOINTS = ["getPose", "moveJoints", "execute", "start"];
 
 export class RobotView {
   constructor(fleet, state, onStop) {
@@ -52,6 +54,7 @@ export class RobotView {
     state.addEventListener("robot", ({ detail }) => { if (detail.key === this.key) this.details(detail); });
     state.addEventListener("joints", ({ detail }) => {
       if (detail.key !== this.key) return;
+      setAttr(this.columns, "data-joints", "yes");
       this.joints.take(detail);
       this.drive.take_joints(detail.joints);
     });
@@ -66,6 +69,7 @@ export class RobotView {
     this.close();
     this.key = key;
     this.placed = false;
+    setAttr(this.columns, "data-joints", "yes");
     for (const part of [this.pictures, this.joints, this.drive, this.verbs]) part.open(key);
     this.ready(false);
     this.waiting = setTimeout(() => this.ready(true), READY_MS);
@@ -94,8 +98,12 @@ export class RobotView {
 
   details(detail) {
     for (const part of [this.pictures, this.joints, this.drive, this.verbs]) part.details(detail);
+    const joints = hasJoints(detail);
+    if (joints) setAttr(this.columns, "data-joints", "yes");
     if (!detail.looked || !this.parts.hidden) return;
-    setAttr(this.columns, "data-camera", detail.cameras.length || detail.forms.some((form) => form.name === "getPicture") ? "yes" : "no");
+    const camera = detail.cameras.length || detail.forms.some((form) => form.name === "getPicture");
+    setAttr(this.columns, "data-camera", camera ? "yes" : "no");
+    setAttr(this.columns, "data-joints", joints ? "yes" : "no");
     this.ready(true);
     this.draw();
   }
@@ -130,3 +138,7 @@ export class RobotView {
     this.timeline.draw(this.key);
   }
 }
+
+// A robot that can do only what is its own has no joints, unless it tells some. Of a device of others all is its own.
+const hasJoints = ({ forms, history, limits, units }) => !forms.length || history.length > 0 || Object.keys({ ...limits, ...units }).length > 0 ||
+  forms.some((form) => OF_JOINTS.includes(form.name) || (form.kind !== "read" && !form.own && !STOPS.includes(form.name)));

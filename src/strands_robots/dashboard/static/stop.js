@@ -54,11 +54,11 @@ export class Stop {
     if (!this.link) return S.connecting;
     const links = Object.entries(this.link.links), down = links.filter(([, up]) => !up).map(([name]) => S.network[name] || name);
     if (down.length === links.length) return [S.noNetwork, this.gone()].filter(Boolean).join(" ");
-    if (down.length) return [S.noAnswerOf(down.join(", ")), this.gone()].filter(Boolean).join(" ");
     // The time stands still: a text that counts would be read out again and again.
-    if (this.link.can_stop) this.silentSince = 0;
-    else this.silentSince = this.silentSince || Date.now() - (this.link.silent_s || 0) * 1000;
-    return this.silentSince ? S.silentNetwork(S.when(new Date(this.silentSince))) : "";
+    this.silentSince = this.link.silent ? this.silentSince || Date.now() - this.link.silent_s * 1000 : 0;
+    // A link that is up may lead to no robot.
+    const silent = this.silentSince ? S.silentNetwork(S.when(new Date(this.silentSince))) : "";
+    return [silent, ...(down.length ? [S.noAnswerOf(down.join(", ")), this.gone()] : [])].filter(Boolean).join(" ");
   }
 
   // The networks that the server could not join, with the reasons.

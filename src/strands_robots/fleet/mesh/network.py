@@ -15,7 +15,7 @@ from dataclasses import replace
 from itertools import count
 from typing import TYPE_CHECKING, Any, Self
 
-from strands_robots.envelope import Envelope, error
+from strands_robots.envelope import Envelope, error, is_error
 from strands_robots.errors import (
     ArgumentsError,
     NoAnswerError,
@@ -44,7 +44,7 @@ from strands_robots.fleet.mesh.requests import PeerRequests
 from strands_robots.fleet.mesh.standing import mesh_network, stand_on_mesh
 from strands_robots.fleet.mesh.stops import lock_peers, stop_peer, stop_peers
 from strands_robots.fleet.mesh_settings import MeshSettings, no_hub
-from strands_robots.fleet.refusals import refusal_of_text, with_meaning
+from strands_robots.fleet.refusals import refusal_of, refusal_of_text, with_meaning
 from strands_robots.fleet.stop_answers import roster_verdict
 from strands_robots.fleet.stop_button import StopSender
 from strands_robots.safety.controller import OnProgress
@@ -53,7 +53,7 @@ from strands_robots.safety.peer_answers import enrolled_peers, lockout_distrust
 from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope
 from strands_robots.safety.stop_roster import StopOutcome
 from strands_robots.tags import read_tags
-from strands_robots.utils import MissingExtraError, ValidationError, finite, near, plain_text
+from strands_robots.utils import MissingExtraError, ValidationError, finite, near, plain_text, shown
 
 if TYPE_CHECKING:
     from strands_robots.mesh import Mesh
@@ -248,11 +248,25 @@ class MeshNetwork:
             if not there:
                 raise self._absent(robot, verb)
             raise NoAnswerError(f"{robot} did not answer", robot=robot, verb=verb)
+        refusal = reply.get("refusal")
+        if reply.get("type") == "error" and isinstance(refusal, dict) and is_error(refusal):
+            raise refusal_of(robot, verb, refusal)
         why = plain_text(reply.get("error") or reply.get("reason"))
         said = error(f"{robot}: {with_meaning(why) or 'refused'}")
+        if reply.get("type") != "error" and why.startswith("validation: "):
+            self._require_verb(robot, verb, action)
         if reply.get("type") == "error" or why.startswith("validation: "):
             raise refusal_of_text(robot, verb, why, said)
         raise UnreachableError(why or "the mesh did not carry the call", robot=robot, verb=verb, envelope=said)
+
+    def _require_verb(self, robot: str, verb: str, action: str) -> None:
+        """Raise :class:`UnknownVerbError` where the robot lacks the verb."""
+        from strands_robots.serving.advertised import verb_names  # noqa: PLC0415 - loaded when it is used
+
+        names = verb_names(functions_of(self._joined_mesh, robot, VERB_S))
+        if names and action not in names:
+            text = f"{robot} has no verb {shown(verb)}.{near(verb, names)}"
+            raise UnknownVerbError(text, robot=robot, verb=verb, envelope=error(text))
 
     def stop(
         self, robot: str, timeout: float = STOP_S, robot_name: str = "", *, insist: bool = False
