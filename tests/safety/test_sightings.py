@@ -23,7 +23,14 @@ from strands_robots.safety import sighting_file
 from strands_robots.safety.identity import ROBOTS, EnrolledKeys, Exemption, KeyFile, SigningIdentity
 from strands_robots.safety.network_key import DEVICE_CONNECT, MESH, NetworkKey
 from strands_robots.safety.sighting_file import Note, Served, own_run, process_start
-from strands_robots.safety.sightings import Known, Moment, Sighting, Sightings, flush_sightings, this_moment
+from strands_robots.safety.sightings import (
+    Known,
+    Moment,
+    Sighting,
+    Sightings,
+    flush_sightings,
+    this_moment,
+)
 from strands_robots.safety.statements import Purpose, signed
 from strands_robots.utils import ValidationError
 

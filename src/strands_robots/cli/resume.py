@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -16,7 +16,7 @@ from strands_robots.cli.readiness import state_problem
 from strands_robots.fleet.all_lockouts import ask_lockouts, by_robot, resume_all, unheard_in
 from strands_robots.fleet.lockout_report import LockoutReport
 from strands_robots.safety.approval import GRANT_S, Grants
-from strands_robots.safety.clearance import clear_here
+from strands_robots.safety.clearance import NOT_LOCKED, clear_here
 from strands_robots.safety.lockout import Lockout, utc
 from strands_robots.safety.persistence import LockoutStore, StoredLockout
 from strands_robots.safety.unheard import Unheard, unheard_since
@@ -198,7 +198,9 @@ def _clear_locally(screen: Screen, wanted: list[str]) -> None:
         cleared = clear_here(operator(), names)
     except (OSError, ValueError) as exc:
         raise CliError(f"Nothing was cleared: {exc}") from exc
-    outcome = {name: (said.startswith("cleared"), said) for name, said in cleared.items()}
+    outcome = {
+        name: (None if said == NOT_LOCKED else said.startswith("cleared"), said) for name, said in cleared.items()
+    }
     _report(screen, outcome, unheard, f"Recorded in the audit as cleared by {operator()}.")
 
 
@@ -210,13 +212,18 @@ def _unheard_here(names: list[str]) -> Unheard:
         return Unheard(problem=unreadable.reason.rstrip("."))
 
 
-def _report(screen: Screen, outcome: dict[str, tuple[bool, str]], unheard: Unheard, then: str, **more: object) -> None:
-    marks = {True: label("free", "green"), False: label("LOCKED", "bold red")}
+def _report(
+    screen: Screen, outcome: Mapping[str, tuple[bool | None, str]], unheard: Unheard, then: str, **more: object
+) -> None:
+    marks = {True: label("free", "green"), False: label("LOCKED", "bold red"), None: ""}
     screen.show(table("", ("robot", "", "what it said"), ((n, marks[ok], said) for n, (ok, said) in outcome.items())))
     devices = {name: {"free": ok, "said": said} for name, (ok, said) in outcome.items()}
     facts = {"devices": devices, "unheard": list(unheard.names), "unheard_problem": unheard.problem, **more}
-    locked = [name for name, (ok, _) in outcome.items() if not ok]
+    locked = [name for name, (ok, _) in outcome.items() if ok is False]
     if locked:
         raise CliError(plain(f"Not resumed: {', '.join(locked)}.", 2000), Exit.REFUSED, **facts)
+    not_locked = [name for name, (ok, _) in outcome.items() if ok is None]
+    if not_locked:
+        raise CliError(plain(f"Nothing is locked here: {', '.join(not_locked)}.", 2000), Exit.REFUSED, **facts)
     screen.data({"status": "success", **facts})
     screen.say(then)

@@ -29,6 +29,7 @@ from strands_robots.fleet.link_flags import described
 from strands_robots.policies import warm_profiles
 from strands_robots.policies.base import SPEED_MAX
 from strands_robots.policies.profiles import load_profiles
+from strands_robots.safety.sightings import DuplicateDeviceError
 from strands_robots.tags import own_tags
 from strands_robots.utils import ValidationError, identifier, number, own_device_id, shown, text
 
@@ -241,6 +242,8 @@ def _on_mesh(screen: Screen, network: Network, body: Any, peer_id: str | None, m
     with ExitStack() as joined:
         try:
             mesh = joined.enter_context(mesh_peer(body, peer_id, mode))
+        except DuplicateDeviceError as exc:
+            raise CliError(f"The robot is not on the network: {exc}") from exc
         except CliError as exc:
             raise CliError(f"{exc} {mesh_port_problem(answers=False)}".strip(), exc.code) from exc
         lacking = mesh_problems()

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from strands_robots.device_connect.agent import connect_agent
     from strands_robots.device_connect.backends import LinkConfig, link_from_environment, loopback_config
     from strands_robots.device_connect.bringup import (
-        DuplicateDeviceError,
         init_device_connect,
         init_device_connect_sync,
         stop_device_connect,
@@ -34,6 +33,7 @@ if TYPE_CHECKING:
     from strands_robots.device_connect.shutdown import LOOP_JOIN_TIMEOUT_S as _LOOP_JOIN_TIMEOUT_S
     from strands_robots.device_connect.shutdown import StopSignal
     from strands_robots.device_connect.simulation_driver import SimulationDeviceDriver
+    from strands_robots.safety.sightings import DuplicateDeviceError
 
 __all__ = [
     "_LOOP_JOIN_TIMEOUT_S",
@@ -57,7 +57,7 @@ _HERE = "strands_robots.device_connect"
 _HOMES = {
     "_LOOP_JOIN_TIMEOUT_S": f"{_HERE}.shutdown",
     "DeviceRuntime": "device_connect_edge",
-    "DuplicateDeviceError": f"{_HERE}.bringup",
+    "DuplicateDeviceError": "strands_robots.safety.sightings",
     "FleetClient": f"{_HERE}.client",
     "LinkConfig": f"{_HERE}.backends",
     "ReachyMiniDriver": f"{_HERE}.reachy_mini_driver",

@@ -40,7 +40,7 @@ from strands_robots.device_connect.safety_registration import (
 )
 from strands_robots.device_connect.shutdown import LOOP_JOIN_TIMEOUT_S
 from strands_robots.device_connect.simulation_driver import SimulationDeviceDriver
-from strands_robots.errors import StrandsRobotsError
+from strands_robots.safety.sightings import DuplicateDeviceError
 from strands_robots.serving.workers import called
 from strands_robots.tags import tags_of
 from strands_robots.utils import ValidationError, choice, own_device_id, redacted
@@ -68,10 +68,6 @@ EXIT_TIMEOUT_S = 3.0
 
 RUNTIME_LOGGER = "device_connect_edge.device."
 """Prefix of the name of the framework's logger of a device."""
-
-
-class DuplicateDeviceError(StrandsRobotsError, RuntimeError):
-    """A device with the wanted id is live on this network and answered."""
 
 
 @dataclass(slots=True)
@@ -133,7 +129,7 @@ async def init_device_connect(  # noqa: PLR0917 - the documented signature
 
     Raises:
         ValidationError: an argument out of its domain, or an unauthenticated transport without an opt-in.
-        DuplicateDeviceError: a live device has this id.
+        DuplicateDeviceError: a live device has this id, or another process of this machine serves it on the mesh.
         TimeoutError: not callable in time, or the broker not reached; nothing is left running.
     """
     choice("peer_type", peer_type, ("robot", "sim"))

@@ -75,6 +75,7 @@ def register_served(driver: DeviceDriver, runtime: Any) -> SafetyRegistration | 
 
     Raises:
         ValidationError: its id is reserved or taken in this process, or only signed stops count and no key is known.
+        DuplicateDeviceError: another process of this machine serves it on the mesh.
     """
     link = link_of(runtime)
     device_id = unreserved("device_id", runtime.device_id, RESERVED_DEVICE_IDS)
@@ -82,7 +83,11 @@ def register_served(driver: DeviceDriver, runtime: Any) -> SafetyRegistration | 
         device_id, driver, link, named=stated_id(runtime), tenant=runtime.tenant, cell=cell_of(driver)
     )
     if made is not None:
-        made.open()
+        try:
+            made.open()
+        except BaseException:
+            made.leave()
+            raise
     if link is None:
         logger.warning(
             "%s has no e-stop connection of its own: its runtime's backend is not one of ours. It is stopped and "
@@ -131,6 +136,8 @@ class SafetyRegistration:
         self._name = name
         self.driver: Any = None
         self._network = None if link is None else network_of(link)
+        if self._network is not None:
+            sightings().refuse_taken(self._network, device_id)
         self.was_here_s = None if self._network is None else sightings().was_here(self._network, device_id)
         """Seconds since this robot was last served from this machine; None where over ten minutes, or never."""
         self.entry: Registered = plane().register(name, robot, key=key, wire_id=device_id, cell=cell)
@@ -164,6 +171,9 @@ class SafetyRegistration:
         """Open the e-stop link, unless it is open; return before it is up.
 
         Until then the runtime's handler and every RPC ``stop`` stop the robot.
+
+        Raises:
+            DuplicateDeviceError: another process of this machine began to serve the robot on the mesh just before.
         """
         # No answer that this link sends waits for the key.
         identity = self.identity
@@ -173,6 +183,7 @@ class SafetyRegistration:
             sightings().serve(
                 self._network, self.device_id, cell=self.cell, signed_only=self.signed_only, public=public
             )
+            sightings().refuse_taken(self._network, self.device_id)
 
     @property
     def signed_only(self) -> bool:

@@ -130,13 +130,12 @@ class Mesh(SensorLoopsMixin):
     def _compose(self) -> None:
         """Make the parts of one stay on the mesh."""
         parts, robot, peer = self._parts, self.robot, self.peer_id
-        hardware = robot is not None and not holds_robots(robot) and self.peer_type != "sim"
+        self._hardware = hardware = robot is not None and not holds_robots(robot) and self.peer_type != "sim"
         self._context = context = Context(
             peer, parts.registry, parts.recorder(peer), Identity(), parts.clock, parts.monotonic
         )
         context.pacer, context.has_robot = parts.pacer, robot is not None
         context.console, context.consoles = ConsoleSigner(parts.clock), ConsoleTrust(parts.clock)
-        self._hardware = hardware
         self._handles: list[Declaration] = []
         self._missed: MeshMissedStops | None = None
         self._inputs: dict[str, dict[str, Any]] = {}
@@ -215,8 +214,7 @@ class Mesh(SensorLoopsMixin):
         fields = self._description.read()
         if self._inputs:
             fields["inputs"] = list(self._inputs.values())
-        topics_published = self._sensors.topics()
-        return {**fields, "topics": topics_published} if topics_published else fields
+        return {**fields, "topics": published} if (published := self._sensors.topics()) else fields
 
     # Life.
 
@@ -230,6 +228,7 @@ class Mesh(SensorLoopsMixin):
         with self._lifecycle_lock:
             if self._context.transport is not None:
                 return
+            self._adapter.refuse_taken(session.network())
             transport = self._parts.acquire()
             if transport is None:
                 return
@@ -658,6 +657,7 @@ def init_mesh(
     Raises:
         ValueError: ``peer_id`` is no identifier, a reserved word or the name of another robot of this process, or
             ``cell`` or a tag is no identifier.
+        DuplicateDeviceError: another process of this machine serves a robot of this id.
     """
     if not mesh or mesh_disabled_by_env():
         return None

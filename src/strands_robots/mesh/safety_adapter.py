@@ -17,7 +17,7 @@ from strands_robots.safety.peer_answers import LockoutAnnouncer, with_lockout_st
 from strands_robots.safety.plane import Registered, SafetyPlane, Stoppable, plane
 from strands_robots.safety.resume import REJECTED
 from strands_robots.safety.scope import EVERY_ROBOT, SCOPE, Scope
-from strands_robots.safety.sightings import sightings
+from strands_robots.safety.sightings import DuplicateDeviceError, sightings
 from strands_robots.safety.statements import Purpose
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.stop_log import stop_logger
@@ -123,13 +123,33 @@ class SafetyAdapter:
         wants = {"signed_stops": True} if self._decision.required else {}
         return {**self._announcer.of(peer_id or self._peer_id, facts), "cell": self._cell, **wants}
 
+    def refuse_taken(self, network: NetworkKey) -> None:
+        """Leave the plane where another process of this machine serves the robot.
+
+        That one keeps the lockout and takes the operator's orders.
+
+        Raises:
+            DuplicateDeviceError: it does.
+        """
+        if self.moves:
+            try:
+                sightings().refuse_taken(network, self._peer_id)
+            except DuplicateDeviceError:
+                self.close()
+                raise
+
     def serve(self, network: NetworkKey) -> None:
-        """Have this machine remember that the robot is served, until :meth:`leave`."""
+        """Have this machine remember that the robot is served, until :meth:`leave`.
+
+        Raises:
+            DuplicateDeviceError: another process of this machine began to serve it just before.
+        """
         if self.moves:
             self._network, public = network, None if self.identity is None else self.identity.public
             self.was_here_s = sightings().was_here(network, self._peer_id)
             wants = self._decision.required
             sightings().serve(network, self._peer_id, cell=self._cell, signed_only=wants, public=public)
+            self.refuse_taken(network)
 
     def leave(self) -> None:
         """Have this machine remember that the robot left in good order."""

@@ -67,6 +67,13 @@ class NetworkKey:
         """True when both have one kind and tenant, and a common endpoint."""
         return (self.kind, self.tenant) == (other.kind, other.tenant) and not set(self.where).isdisjoint(other.where)
 
+    def joins(self, other: NetworkKey) -> bool:
+        """True where callers of both take an id for one robot.
+
+        Of two on Device Connect it is the probe that says so.
+        """
+        return self.tenant == other.tenant and (self.kind != other.kind or (self.kind == MESH and self.may_be(other)))
+
     def may_be(self, other: NetworkKey) -> bool:
         """False for another kind or tenant, or other ports of this machine."""
         if (self.kind, self.tenant) != (other.kind, other.tenant):

@@ -42,6 +42,9 @@ SERVED_MAX = 1024
 RECENT_S = 600.0
 """A robot that was heard longer ago than this does not count."""
 
+UNKNOWN = "unknown"
+"""Start of a live process where the system does not say it."""
+
 LEAVING_S = 1.0
 """Seconds after a robot's orderly end in which its last presence may still be heard."""
 
@@ -86,6 +89,7 @@ _SERVE = """
 INSERT INTO served (network, name, pid, started, boot, uptime, wall, cell, signed_only, ended)
 VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)
 ON CONFLICT (network, name, pid, started) DO UPDATE SET boot = excluded.boot, uptime = excluded.uptime,
+    id = CASE WHEN ended > excluded.ended THEN (SELECT max(id) + 1 FROM served) ELSE id END,
     wall = excluded.wall, cell = excluded.cell, signed_only = excluded.signed_only, ended = excluded.ended
 """
 
@@ -229,6 +233,17 @@ class Served:
         """True while its process lives and serves it."""
         return not self.ended and self.at.boot == now.boot and process_start(self.pid) == self.started != ""
 
+    def holds(self, network: NetworkKey, name: str, now: Moment) -> bool:
+        """True while another process serves this robot, for callers that reach both."""
+        # Where the system does not say when a process started, its number may be another one's by now.
+        sure = self.started != UNKNOWN or self.at.age_s(now) < RECENT_S
+        return (
+            (self.name, self.pid != os.getpid()) == (name, True)
+            and sure
+            and self.network.joins(network)
+            and self.lives(now)
+        )
+
 
 def process_start(pid: int) -> str:
     """Return the start of a process, in ticks since boot; "" where there is none.
@@ -247,8 +262,8 @@ def process_start(pid: int) -> str:
     except (ProcessLookupError, OverflowError):
         return ""
     except PermissionError:
-        return "unknown"
-    return "unknown"
+        return UNKNOWN
+    return UNKNOWN
 
 
 def own_run() -> str:
@@ -332,7 +347,7 @@ class SightingFile:
         return _united(heard, served, now), problem
 
     def served(self) -> list[Served]:
-        """Return the rows of served robots, those that ended included.
+        """Return the rows of served robots, the latest first, those that ended included.
 
         Raises:
             SightingFileError: they could not be read.

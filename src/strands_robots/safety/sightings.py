@@ -22,7 +22,7 @@ from weakref import WeakSet
 from strands_robots.audit import log_safety_event
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety.identity import ROBOTS, EnrolledKeys, KeyFile, local_name, of_tenant
-from strands_robots.safety.network_key import NetworkKey
+from strands_robots.safety.network_key import DEVICE_CONNECT, MESH, NetworkKey
 from strands_robots.safety.sighting_file import (
     RECENT_S,
     ROWS_MAX,
@@ -67,12 +67,23 @@ READ_S = 1.0
 ENDING_S = 0.5
 """Seconds that the end of the process waits for the last write."""
 
+LEAVES_S = 2.0
+"""Seconds that a start waits for a process that may be about to leave its robot."""
+
+LEAVES_EVERY_S = 0.05
+
+KINDS = {DEVICE_CONNECT: "Device Connect", MESH: "the native mesh"}
+
 Facts = tuple[str | None, bool | None, bool | None]
 NEVER: tuple[float, Facts] = (float("-inf"), (None, None, None))
 
 NAME_MAX = 256
 ANSWERS_MAX = 1024
 """Answers whose signature waits to be checked; a further one counts as heard only."""
+
+
+class DuplicateDeviceError(StrandsRobotsError, RuntimeError):
+    """A robot with the wanted id is live and answered, or this machine serves it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -238,6 +249,47 @@ class Sightings:
             return 0.0
         recent = [age for age in ages if age < RECENT_S]
         return max(0.0, min(recent)) if recent else None
+
+    def refuse_taken(self, network: NetworkKey, name: str) -> None:
+        """Refuse a robot id that another live process with this state directory serves.
+
+        The two would sign with one key, so that callers took them for one robot. Call it before :meth:`serve`, and
+        after it: of two that begin at once the later one is refused. It waits two seconds for a process that is just
+        ending, and one at most for the disk; where the file cannot be read nothing is refused.
+
+        Raises:
+            DuplicateDeviceError: naming the process and its network.
+        """
+        until = time.monotonic() + LEAVES_S
+        if (network, name) in self._own:
+            self.flush(READ_S)
+        while (other := self._holder(network, name)) is not None:
+            if time.monotonic() >= until:
+                where = f"{KINDS[other.network.kind]} ({', '.join(other.network.where)})"
+                raise DuplicateDeviceError(
+                    f"{name} is served already by process {other.pid} of this machine, on {where}. Both would have one "
+                    f"key and be taken for one robot: give this one another peer_id, or a state directory of its own "
+                    f"with STRANDS_STATE_DIR."
+                )
+            time.sleep(LEAVES_EVERY_S)
+
+    def _holder(self, network: NetworkKey, name: str) -> Served | None:
+        """Return who else serves a robot, None without one.
+
+        Where this process serves it as well, those that began later do not count.
+        """
+        try:
+            rows = self._within(self.file.served, READ_S)
+        except SightingFileError as exc:
+            logger.warning("%s: %s", name, exc)
+            return None
+        own = self._own.get((network, name))
+        if own is not None:
+            ids = [(row.network, row.name, row.pid, row.started) for row in rows]
+            mine = (network, name, own.pid, own.started)
+            rows = rows[ids.index(mine) :] if mine in ids else []
+        now = self._clock()
+        return next((row for row in rows if row.holds(network, name, now)), None)
 
     def flush(self, within: float = ENDING_S) -> bool:
         """Write what is queued now; False where that takes over ``within`` seconds."""

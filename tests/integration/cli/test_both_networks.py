@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shlex
+import signal
 import subprocess
 import sys
 import threading
@@ -21,8 +23,14 @@ from fixtures.mesh_peer import MeshPeer
 from fixtures.toy_robots import ToyRobot
 from fixtures.waiting import eventually, free_port
 
-from strands_robots.device_connect import init_device_connect_sync, loopback_config, stop_device_connect
+from strands_robots.device_connect import (
+    DuplicateDeviceError,
+    init_device_connect_sync,
+    loopback_config,
+    stop_device_connect,
+)
 from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
+from strands_robots.mesh import init_mesh
 from strands_robots.safety.ed25519 import keygen
 
 pytestmark = [pytest.mark.timeout(600), pytest.mark.usefixtures("patient_halts")]
@@ -48,9 +56,9 @@ class Site:
         self.stack.callback(stop_device_connect, runtime)
         return toy
 
-    def peer(self, name: str, *, same_key: bool = False) -> MeshPeer:
-        """Serve a simulated world on the mesh, from a process with a state directory of its own or with this one."""
-        state = self.state if same_key else self._folder / name
+    def peer(self, name: str) -> MeshPeer:
+        """Serve a simulated world on the mesh, from a process with a state directory of its own."""
+        state = self._folder / name
         state.mkdir(mode=0o700, exist_ok=True)
         settings = {"STRANDS_MESH_PORT": str(self.port), "STRANDS_STATE_DIR": str(state)}
         peer = self.stack.enter_context(MeshPeer(name, "world", settings))
@@ -140,7 +148,12 @@ def test_id_of_one_robot_on_both_networks_is_moved_enrolled_and_resumed_once(
     secret.write_text(PASSPHRASE)
     secret.chmod(0o600)
     monkeypatch.setenv("STRANDS_MESH_RESUME_PUBLIC_KEY", keygen(file, PASSPHRASE))
-    toy, _ = site.device("twin"), site.peer("twin", same_key=True)
+    monkeypatch.setenv("STRANDS_MESH_PORT", str(site.port))
+    toy = site.device("twin")
+    mesh = init_mesh(toy, "twin")
+    assert mesh is not None
+    site.stack.callback(mesh.close)
+    eventually(lambda: site.rows()["twin"]["also_on"] == [MESH], within=60, what="twin on both")
     assert site.machine.json("call", "twin", "start", *TASK)[0] == 0
     assert running(toy)
     assert site.machine.json("enroll")[1]["devices"]["twin"]["outcome"] == "enrolled"
@@ -152,6 +165,38 @@ def test_id_of_one_robot_on_both_networks_is_moved_enrolled_and_resumed_once(
         code, said = site.machine.json(*resume)
         assert (code, said["devices"]["twin"]["free"]) == (0, True), said
     assert site.machine.json("lockout")[1]["live"]["twin"]["locked"] is False
+
+
+def test_second_process_of_a_robot_is_refused_on_the_other_network(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STRANDS_MESH_PORT", str(site.port))
+    site.device("arm-1")
+    code, said = site.refused("serve", "so100", "--mesh", "--peer-id", "arm-1")
+    assert (code, f"arm-1 is served already by process {os.getpid()}" in said) == (1, True), said
+    assert "on Device Connect" in said and "STRANDS_STATE_DIR" in said
+    assert site.rows()["arm-1"]["also_on"] == []
+    settings = {"STRANDS_MESH_PORT": str(site.port), "STRANDS_STATE_DIR": str(site.state)}
+    with MeshPeer("arm-2", "world", settings) as peer:
+        peer.ask("epoch")
+        for _ in range(2):
+            with pytest.raises(DuplicateDeviceError, match="on the native mesh"):
+                site.device("arm-2")
+        mesh_taken = site.refused("serve", "so100", "--mesh", "--peer-id", "arm-2")
+        assert (mesh_taken[0], "on the native mesh" in mesh_taken[1]) == (1, True), mesh_taken
+        # A frozen one would wake and move.
+        peer.signal(signal.SIGSTOP)
+        with pytest.raises(DuplicateDeviceError):
+            site.device("arm-2")
+        peer.kill()
+        site.device("arm-2")
+    assert site.rows()["arm-2"]["also_on"] == []
+
+
+def test_resume_at_the_machine_of_a_robot_that_is_not_locked_says_so(site: Site) -> None:
+    site.device("arm-1")
+    code, said = site.machine.json("resume", "--local", "arm-1")
+    assert (code, said["reason"]) == (1, "Nothing is locked here: arm-1.")
+    assert said["devices"]["arm-1"] == {"free": None, "said": "not locked here"}
+    assert "LOCKED" not in site.machine.run("resume", "--local", "arm-1").stdout
 
 
 def test_device_connect_alone_at_the_port_is_as_quick_as_ever_and_loads_no_mesh(site: Site) -> None:
