@@ -415,10 +415,10 @@ class FleetClient:
 
     def _unanswered(self, device: str, within: float, exc: Exception) -> Exception:
         """Return the error for an unanswered call."""
-        if isinstance(exc, NoResponderError):
-            return NoSuchDeviceError(f"No device {device!r} in tenant {self.link.tenant!r}.")
         if isinstance(exc, ResponderLostError):
             return DeviceTimeoutError(f"{device} got the call and gave no answer: it may have left the network.")
+        if isinstance(exc, NoResponderError):
+            return NoSuchDeviceError(f"No device {device!r} in tenant {self.link.tenant!r}.")
         if isinstance(exc, RequestTimeoutError):
             return DeviceTimeoutError(f"{device} is on the network and did not answer within {within:g} s ({exc}).")
         return exc

@@ -30,7 +30,7 @@ class NoResponderError(StrandsRobotsError, RequestTimeoutError, PublishError):  
     """
 
 
-class ResponderLostError(StrandsRobotsError, RequestTimeoutError):  # type: ignore[misc]  # as above
+class ResponderLostError(NoResponderError):
     """The device that got the request left the network before it replied."""
 
 

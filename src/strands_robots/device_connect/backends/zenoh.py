@@ -49,6 +49,9 @@ FIRST_RETRY_S = 0.005
 LOST_S = 0.5
 """Seconds in which a router says that no device serves a key; a request that ends later had reached one."""
 
+KNOWN_S = 2.0
+"""Seconds after which a peer knows who serves a key, so that its request is sent to nobody else."""
+
 LARGE_BYTES = 2**16
 """From here on, which is more than one batch, a message goes out on a thread: it may have to wait for the link."""
 
@@ -150,17 +153,16 @@ class ZenohBackend(Backend):
         """
         began = time.monotonic()
         deadline, linked_by = began + timeout, began + (self._tries - 1) * self._retry_delay
-        remaining, pause = timeout, min(FIRST_RETRY_S, self._retry_delay)
+        remaining, pause, lost = timeout, min(FIRST_RETRY_S, self._retry_delay), None
         while True:
             try:
                 return await self.request_once(subject, data, remaining)
-            except NoResponderError:
+            except NoResponderError as error:
                 again = time.monotonic() + pause
                 remaining = deadline - again
+                lost = error if isinstance(error, ResponderLostError) else lost
                 if not self._link.is_peer or again > linked_by or remaining <= 0:
-                    raise
-            except ResponderLostError:
-                raise
+                    raise lost or error from None
             except RequestTimeoutError as error:
                 raise RequestTimeoutError(f"no reply on {subject} within {timeout:g} s") from error
             # A peer that links at this very moment is not known here yet.
@@ -186,8 +188,8 @@ class ZenohBackend(Backend):
                 get()
             else:
                 await on_a_thread(get)
-            # A peer knows who serves a key: where no one does, the query ends before it is sent.
-            unsent = request.ended
+            # Where a peer knows of no one who serves the key, the request ends before it is sent.
+            sent = not request.ended_at and self._link.is_peer and self.linked_for_s > KNOWN_S
             answer = await request.future
         except zenoh.ZError as error:
             raise PublishError(f"cannot ask {key}: {error}") from error
@@ -203,7 +205,7 @@ class ZenohBackend(Backend):
             raise UnreadableReplyError(f"{key}: {request.unread}")
         if request.failure:
             raise PublishError(f"{key} refused: {request.failure}")
-        if not unsent and (self._link.is_peer or time.monotonic() - began > LOST_S):
+        if sent or request.ended_at - began > LOST_S:
             raise ResponderLostError(f"what served {subject} left before it replied")
         raise NoResponderError(f"no device answers on {subject}")
 
@@ -342,13 +344,13 @@ class ZenohBackend(Backend):
 class _Request:
     """A pending query: replies come on Zenoh's thread, its future is settled once."""
 
-    __slots__ = ("_outcomes", "answered", "ended", "failure", "future", "unread")
+    __slots__ = ("_outcomes", "answered", "ended_at", "failure", "future", "unread")
 
     def __init__(self, loop: asyncio.AbstractEventLoop, outcomes: Backlog) -> None:
         self._outcomes = outcomes
         self.failure = self.unread = ""
         self.future: asyncio.Future[bytes | None] = loop.create_future()
-        self.answered = self.ended = False
+        self.answered, self.ended_at = False, 0.0
 
     def on_reply(self, reply: Any) -> None:
         """Take a reply. On Zenoh's thread."""
@@ -363,7 +365,8 @@ class _Request:
 
     def on_end(self) -> None:
         """Settle a request that ended without a reply. On Zenoh's thread."""
-        self.ended = True
+        # Here, because the loop may be late to hear of it.
+        self.ended_at = time.monotonic()
         # An answered request has woken the loop already.
         if not self.answered:
             self._outcomes.offer((self, None))
