@@ -186,6 +186,13 @@ def test_reason_of_a_stop_is_kept_by_the_robots_that_it_locks(
     assert [each["reason"] for each in mesh._adapter.lockouts()] == [reason]
 
 
+def test_reason_that_is_too_long_is_cut_and_the_stop_leaves(peers: Fleet) -> None:
+    console = peers.join(None, "console")
+    _, mesh = join(peers, "arm-1", "cell-1")
+    console.emergency_stop(reason="a hand " * 2000)
+    assert mesh._adapter.lockouts()[0]["reason"] == ("a hand " * 2000)[:200]
+
+
 def test_stop_without_a_reason_states_none(peers: Fleet) -> None:
     console = peers.join(None, "console")
     _, mesh = join(peers, "arm-1")

@@ -27,7 +27,7 @@ from strands_robots.mcp.results import Result, facts, picture, quoted, result, r
 from strands_robots.mcp.standing import StandingController
 from strands_robots.mcp.verbs import INSTEAD, described, wanted
 from strands_robots.serving.advertised import AdvertisedVerb
-from strands_robots.serving.stop_arguments import stop_scope
+from strands_robots.serving.stop_arguments import stop_reason, stop_scope
 from strands_robots.utils import shown
 
 PAGE_BYTES = 2600
@@ -164,7 +164,7 @@ def add_stops(server: MCPServer[Any], access: AccessOf) -> None:
         With only or cell, those robots alone; where none of them is there, every robot.
         """
         scope, _ = stop_scope(only, cell)
-        return result(await access(context).caller.emergency_stop(reason, scope))
+        return result(await access(context).caller.emergency_stop(stop_reason(reason)[0], scope))
 
 
 def add_motions(server: MCPServer[Any], access: AccessOf, approvals: Approvals) -> None:

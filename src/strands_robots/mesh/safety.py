@@ -145,9 +145,9 @@ class FleetSafety:
         if not estop_id or estop_id != self._press[0]:
             self._press = (estop_id or new_epoch(), context.clock())
         epoch, pressed = self._press
-        order = StopOrder(
-            epoch, context.peer_id, reason or NO_REASON, "mesh", issued=context.clock(), pressed=pressed, scope=scope
-        )
+        # Cut: a stop that its topic does not carry would reach nobody.
+        reason = stated_reason({"reason": reason}) or NO_REASON
+        order = StopOrder(epoch, context.peer_id, reason, "mesh", issued=context.clock(), pressed=pressed, scope=scope)
         if not scope.only:
             order = self._with_original(order, signing_key)
         if not scope.everything:
