@@ -183,3 +183,13 @@ def test_seen_commands_are_bounded_by_age_and_number() -> None:
     for number in range(10_001):
         seen.first(b'{"sender_id":"x","turn_id":"%d","command":{}}' % number)
     assert seen.first(message) is True
+
+
+def test_bridge_is_cut_off_where_neither_leg_reaches_anyone(
+    buses: tuple[MemoryBus, MemoryBus], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    both = bridge(buses)
+    monkeypatch.setattr(both._local, "anchored", lambda: False)
+    assert not both.cut_off(), "the broker's peers are in reach"
+    both._cloud.close()
+    assert both.cut_off()

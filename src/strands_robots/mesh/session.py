@@ -101,7 +101,7 @@ class _Shared:
                     return None
                 self.transport, self.opened_with = transport, stated
             # A robot of this process may become the hub, though the first user of the session only dialled.
-            self.transport.dials_only = False
+            self.transport.take_part()
             self.references += 1
             return self.transport
 
@@ -173,9 +173,9 @@ def session_alive() -> bool:
 
 
 def cut_off() -> bool:
-    """True while the session is open, and linked to no hub."""
+    """True while the session is open, and linked to no hub or broker."""
     transport = _shared.transport
-    return transport is not None and not transport.anchored()
+    return transport is not None and transport.cut_off()
 
 
 def opened_with() -> Mapping[str, str] | None:

@@ -107,6 +107,10 @@ class Transport(ABC):
     pins_topics = False
     dials_only = False
 
+    def take_part(self) -> None:
+        """Let a robot of this process be found: from now on this may become the hub."""
+        self.dials_only = False
+
     @property
     @abstractmethod
     def session_id(self) -> str | None:
@@ -164,6 +168,10 @@ class Transport(ABC):
     def anchored(self) -> bool:
         """True while tokens of other sessions can reach us."""
         return True
+
+    def cut_off(self) -> bool:
+        """True while no other session can be reached."""
+        return not self.anchored()
 
     def links_back(self) -> int:
         """Return how often a link came up after one had been lost."""

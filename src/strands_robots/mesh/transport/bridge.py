@@ -155,6 +155,9 @@ class BridgeTransport(Transport):
     def dials_only(self, value: bool) -> None:
         self._local.dials_only = value
 
+    def take_part(self) -> None:
+        self._local.take_part()
+
     def connect(self) -> None:
         problems = self._join()
         if not self._joined:
@@ -242,6 +245,9 @@ class BridgeTransport(Transport):
 
     def anchored(self) -> bool:
         return self._local.anchored()
+
+    def cut_off(self) -> bool:
+        return self._local.cut_off() and not self._cloud.is_alive()
 
     def rejoined(self) -> int:
         # Each side has peers that the other one does not reach.

@@ -10,6 +10,7 @@ import secrets
 import threading
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from itertools import count
 from typing import Any
 
@@ -131,6 +132,12 @@ class ZenohTransport(Transport):
         posture = self._posture
         listens = self._hub or (posture is not None and bool(posture.listen))
         return listens or self.linked()
+
+    def take_part(self) -> None:
+        dialled, self.dials_only = self.dials_only, False
+        posture = self._posture
+        if dialled and posture is not None and posture.hub is not None and not self.anchored():
+            threading.Thread(target=self._rescue, name="mesh-rescue", daemon=True).start()
 
     def lost_link_at(self) -> float | None:
         return self._lost_link_at
@@ -271,8 +278,8 @@ class ZenohTransport(Transport):
             return self._open(zenoh_config.child(posture, self._id, DIAL_MS))
         except TransportError:
             if posture.multicast:
-                # The hubs of other machines are found later, if at all.
-                return self._open(zenoh_config.explicit(posture, self._id))
+                # The hubs of other machines are found later, if at all, and so is one that this machine gets.
+                return self._open(zenoh_config.explicit(replace(posture, connect=(str(posture.hub),)), self._id))
             raise TransportError(f"no mesh answers on {posture.hub}.") from None
 
     def _watch_links(self, session: Any, *, of_hub: bool) -> None:
