@@ -12,7 +12,7 @@ from fixtures.barista import Barista, Careless, Stubborn
 
 from strands_robots import Permit, verb
 from strands_robots.contract import adapt
-from strands_robots.envelope import success
+from strands_robots.envelope import success, text_of
 from strands_robots.serving.leave import Command
 from strands_robots.serving.own_verbs import answer_of, own_verbs
 from strands_robots.serving.pipeline import Pipeline, Result
@@ -129,6 +129,13 @@ def test_value_that_holds_itself_is_an_error() -> None:
     loop: list[object] = []
     loop.append(loop)
     assert answer_of("weigh", loop)["status"] == "error"
+
+
+def test_stopped_verb_keeps_the_shape_of_an_answer_whatever_it_returned() -> None:
+    given = {"status": "success", "content": [{"json": {"content": 5, "grams": 1}}]}
+    answer = answer_of("weigh", given, "stopped", "it was stopped")
+    assert (answer["status"], answer["grams"]) == ("error", 1)
+    assert text_of(answer).startswith("weigh stopped: it was stopped.")
 
 
 def test_motion_that_a_stop_ended_is_an_error_with_what_it_returned() -> None:
