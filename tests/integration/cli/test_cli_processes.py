@@ -95,8 +95,8 @@ def test_motion_is_called_watched_and_stopped(machine: Machine, arm: dict[str, A
 
 
 def test_refusals_and_silence_have_their_own_exit_codes(machine: Machine, arm: dict[str, Any]) -> None:
-    assert machine.json("call", "arm-1", "execute", "instruction=wave", "duration=-1")[0] == 1
-    assert machine.json("call", "arm-1", "execute", "instruction=wave", "speed=9")[0] == 1
+    assert machine.json("call", "arm-1", "execute", "instruction=wave", "duration=-1")[0] == 2
+    assert machine.json("call", "arm-1", "execute", "instruction=wave", "speed=9")[0] == 2
     assert machine.json("call", "arm-1", "execute", "instruction=wave", "duration=long")[0] == 2
     assert machine.json("call", "arm-1", "fly")[0] == 1
     assert machine.json("call", "arm-9", "getStatus")[0] == 3

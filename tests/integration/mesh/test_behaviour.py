@@ -167,10 +167,16 @@ def test_tell_runs_an_approved_arm_and_waits_for_its_end(net: Network) -> None:
     assert reply["result"]["task_status"] == "idle"
 
 
-def test_an_arm_does_not_move_without_approval(net: Network) -> None:
-    reply = net.peers["console"].ask("send", "arm-1", {"action": "reset"}, 20)
+def test_an_arm_obeys_nobody_without_approval(net: Network) -> None:
+    reply = net.peers["console"].ask("send", "arm-1", {"action": "acquireControl"}, 20)
     assert reply["type"] == "error"
     assert "operator approval" in reply["error"]
+
+
+def test_a_verb_that_an_arm_lacks_is_refused_without_a_word_of_approval(net: Network) -> None:
+    reply = net.peers["console"].ask("send", "arm-1", {"action": "reset"}, 20)
+    assert reply["result"]["status"] == "error"
+    assert reply["result"]["reason"].startswith("reset is refused: arm-1 lacks what it needs")
 
 
 def test_a_broadcast_collects_every_peer(net: Network) -> None:
