@@ -249,7 +249,7 @@ def test_a_leader_moves_its_follower_in_order_until_a_stop(net: Network) -> None
     net.needs("input")
     console, arm = net.peers["console"], net.peers["arm-1"]
     before = len(arm.ask("actions"))
-    assert arm.ask("follow", "console") is None
+    eventually(lambda: arm.ask("follow", "console") is None, what="the leader has announced itself")
     console.ask("lead")
     eventually(lambda: len(arm.ask("actions")) - before >= 15)
     moved = [action["shoulder.pos"] for action in arm.ask("actions")[before:]]
