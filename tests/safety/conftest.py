@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
+from fixtures.moments import MomentClock
 from fixtures.planes import own_plane
 from fixtures.recording_robot import RecordingRobot
 
 from strands_robots.safety import reporting
 from strands_robots.safety.plane import SafetyPlane
+from strands_robots.safety.sightings import Sightings
 
 Add = Callable[..., RecordingRobot]
 
@@ -39,3 +42,15 @@ def add(plane: SafetyPlane) -> Iterator[Add]:
     yield one
     for robot in made:
         robot.close()
+
+
+@pytest.fixture
+def clock() -> MomentClock:
+    """The clock of ``store``."""
+    return MomentClock()
+
+
+@pytest.fixture
+def store(tmp_path: Path, clock: MomentClock) -> Sightings:
+    """What a machine of the test's own remembers of robots."""
+    return Sightings(tmp_path / "state", clock)

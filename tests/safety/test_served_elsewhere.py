@@ -6,40 +6,20 @@ import os
 import threading
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
+from fixtures.moments import MomentClock
 
 from strands_robots.safety import sighting_file, sightings
 from strands_robots.safety.network_key import DEVICE_CONNECT, MESH, NetworkKey
 from strands_robots.safety.sighting_file import Served, process_start
-from strands_robots.safety.sightings import DuplicateDeviceError, Moment, Sightings, this_moment
+from strands_robots.safety.sightings import DuplicateDeviceError, Sightings
 
 HERE = NetworkKey.of(DEVICE_CONNECT, ["tcp/127.0.0.1:7447"])
 MESHED = NetworkKey.of(MESH, ["tcp/127.0.0.1:7447"])
 
 
-class Clock:
-    """The present moment, as a test sets it."""
-
-    def __init__(self) -> None:
-        self.now = this_moment()
-
-    def __call__(self) -> Moment:
-        return self.now
-
-
-@pytest.fixture
-def clock() -> Clock:
-    return Clock()
-
-
-@pytest.fixture
-def store(tmp_path: Path, clock: Clock) -> Sightings:
-    return Sightings(tmp_path / "state", clock)
-
-
-def served_by_another(store: Sightings, clock: Clock, network: NetworkKey = MESHED) -> Served:
+def served_by_another(store: Sightings, clock: MomentClock, network: NetworkKey = MESHED) -> Served:
     """Write that the parent of this process serves arm-1."""
     row = Served(network, "arm-1", os.getppid(), process_start(os.getppid()), clock())
     store.file.write([], [row], clock())
@@ -62,7 +42,7 @@ def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
     ],
 )
 def test_a_robot_id_that_another_live_process_serves_is_refused(
-    store: Sightings, clock: Clock, theirs: NetworkKey, own: NetworkKey, hasty: None
+    store: Sightings, clock: MomentClock, theirs: NetworkKey, own: NetworkKey, hasty: None
 ) -> None:
     served_by_another(store, clock, theirs)
     with pytest.raises(DuplicateDeviceError) as refusal:
@@ -83,14 +63,14 @@ def test_a_robot_id_that_another_live_process_serves_is_refused(
     ],
 )
 def test_a_robot_that_callers_do_not_confuse_is_not_refused(
-    store: Sightings, clock: Clock, theirs: NetworkKey, own: NetworkKey, hasty: None
+    store: Sightings, clock: MomentClock, theirs: NetworkKey, own: NetworkKey, hasty: None
 ) -> None:
     served_by_another(store, clock, theirs)
     store.refuse_taken(own, "arm-1")
 
 
 def test_the_robot_of_a_process_that_ended_or_died_and_ones_own_are_not_refused(
-    store: Sightings, clock: Clock, monkeypatch: pytest.MonkeyPatch, hasty: None
+    store: Sightings, clock: MomentClock, monkeypatch: pytest.MonkeyPatch, hasty: None
 ) -> None:
     row = served_by_another(store, clock)
     store.file.write([], [replace(row, ended=True), replace(row, started="an earlier process")], clock())
@@ -108,7 +88,7 @@ def test_the_robot_of_a_process_that_ended_or_died_and_ones_own_are_not_refused(
     store.refuse_taken(HERE, "arm-1")
 
 
-def test_a_start_waits_for_a_process_that_is_just_ending(store: Sightings, clock: Clock) -> None:
+def test_a_start_waits_for_a_process_that_is_just_ending(store: Sightings, clock: MomentClock) -> None:
     row = served_by_another(store, clock)
     ending = threading.Timer(0.3, lambda: store.file.write([], [replace(row, ended=True)], clock()))
     ending.start()
@@ -116,7 +96,7 @@ def test_a_start_waits_for_a_process_that_is_just_ending(store: Sightings, clock
     ending.join()
 
 
-def test_of_two_that_begin_at_once_the_later_one_is_refused(store: Sightings, clock: Clock, hasty: None) -> None:
+def test_of_two_that_begin_at_once_the_later_one_is_refused(store: Sightings, clock: MomentClock, hasty: None) -> None:
     served_by_another(store, clock)
     store.serve(HERE, "arm-1")
     with pytest.raises(DuplicateDeviceError):
@@ -129,7 +109,7 @@ def test_of_two_that_begin_at_once_the_later_one_is_refused(store: Sightings, cl
         store.refuse_taken(HERE, "arm-1")
 
 
-def test_the_earlier_of_two_that_begin_at_once_goes_on(store: Sightings, clock: Clock, hasty: None) -> None:
+def test_the_earlier_of_two_that_begin_at_once_goes_on(store: Sightings, clock: MomentClock, hasty: None) -> None:
     store.serve(HERE, "arm-1")
     assert store.flush(5.0)
     row = served_by_another(store, clock)
@@ -144,7 +124,7 @@ def test_the_earlier_of_two_that_begin_at_once_goes_on(store: Sightings, clock: 
 
 
 def test_a_disk_that_hangs_holds_a_start_up_for_a_second_and_refuses_nothing(
-    store: Sightings, clock: Clock, monkeypatch: pytest.MonkeyPatch
+    store: Sightings, clock: MomentClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     served_by_another(store, clock)
     hung = threading.Event()

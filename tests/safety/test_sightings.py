@@ -14,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from fixtures.moments import MomentClock
 from fixtures.waiting import eventually, signalled
 
 from strands_robots.audit import read_audit_log
@@ -29,39 +30,12 @@ from strands_robots.safety.sightings import (
     Sighting,
     Sightings,
     flush_sightings,
-    this_moment,
 )
 from strands_robots.safety.statements import Purpose, signed
 from strands_robots.utils import ValidationError
 
 HERE = NetworkKey.of(DEVICE_CONNECT, ["tcp/127.0.0.1:7447"])
 WEEK_S = 7 * 24 * 3600.0
-
-
-class Clock:
-    """The present moment, as a test sets it."""
-
-    def __init__(self) -> None:
-        self.now = this_moment()
-
-    def __call__(self) -> Moment:
-        return self.now
-
-    def pass_(self, seconds: float) -> None:
-        self.now = self.now.earlier(-seconds)
-
-    def reboot(self, *, wall: float) -> None:
-        self.now = Moment("another-boot", 20.0, wall)
-
-
-@pytest.fixture
-def clock() -> Clock:
-    return Clock()
-
-
-@pytest.fixture
-def store(tmp_path: Path, clock: Clock) -> Sightings:
-    return Sightings(tmp_path / "state", clock)
 
 
 def found(store: Sightings, now: Moment | None = None) -> dict[str, Sighting]:
@@ -75,7 +49,9 @@ def made_up(count: int, at: Moment, first: int = 0) -> list[Note]:
     return [Note(HERE, f"stranger-{number}", at, stoppable=True) for number in range(first, first + count)]
 
 
-def test_a_robot_that_was_heard_is_remembered_for_ten_minutes(store: Sightings, clock: Clock, tmp_path: Path) -> None:
+def test_a_robot_that_was_heard_is_remembered_for_ten_minutes(
+    store: Sightings, clock: MomentClock, tmp_path: Path
+) -> None:
     store.note(HERE, "arm-1", cell="cell-1", signed_only=True, stoppable=True)
     assert store.flush(5.0)
     another = Sightings(tmp_path / "state", clock)
@@ -102,7 +78,7 @@ def test_nothing_remembered_is_no_problem_and_makes_no_file(store: Sightings) ->
     assert not store.file.path.exists()
 
 
-def test_a_forged_presence_takes_no_fact_of_a_robot_away(store: Sightings, clock: Clock) -> None:
+def test_a_forged_presence_takes_no_fact_of_a_robot_away(store: Sightings, clock: MomentClock) -> None:
     store.note(HERE, "arm-1", cell="cell-1", stoppable=True)
     store.flush(5.0)
     clock.pass_(20.0)
@@ -132,7 +108,7 @@ def robot(tmp_path: Path) -> SigningIdentity:
     return KeyFile(ROBOTS, "arm-1", tmp_path / "robot").load_or_make()
 
 
-def test_a_signed_answer_is_told_from_presence(store: Sightings, robot: SigningIdentity, clock: Clock) -> None:
+def test_a_signed_answer_is_told_from_presence(store: Sightings, robot: SigningIdentity, clock: MomentClock) -> None:
     answer = signed(robot, Purpose.LOCKOUT_STATE, "arm-1", {"nonce": "a" * 32})
     store.note_answer(HERE, "arm-1", Purpose.LOCKOUT_STATE, answer, {"nonce": "a" * 32})
     assert found(store)["arm-1"].known is Known.SIGNED
@@ -166,7 +142,7 @@ def test_an_answer_that_proves_nothing_is_heard_only(
     assert found(store)[name].known is Known.HEARD
 
 
-def test_a_served_robot_counts_while_its_process_lives(store: Sightings, clock: Clock) -> None:
+def test_a_served_robot_counts_while_its_process_lives(store: Sightings, clock: MomentClock) -> None:
     store.serve(HERE, "arm-1", cell="cell-1", signed_only=True)
     store.flush(5.0)
     # Frozen: it refreshes nothing, and is there.
@@ -181,7 +157,7 @@ def test_a_served_robot_counts_while_its_process_lives(store: Sightings, clock: 
     )
 
 
-def test_each_living_process_that_serves_a_robot_is_told(store: Sightings, clock: Clock) -> None:
+def test_each_living_process_that_serves_a_robot_is_told(store: Sightings, clock: MomentClock) -> None:
     """One of them may be frozen while the other answers."""
     both = [Served(HERE, "arm-1", pid, process_start(pid), clock()) for pid in (os.getpid(), os.getppid())]
     store.file.write([], both, clock())
@@ -193,7 +169,7 @@ def test_each_living_process_that_serves_a_robot_is_told(store: Sightings, clock
     assert row.processes == ((own_run(), os.getpid()),)
 
 
-def test_an_orderly_end_takes_a_robot_out_though_others_heard_it(store: Sightings, clock: Clock) -> None:
+def test_an_orderly_end_takes_a_robot_out_though_others_heard_it(store: Sightings, clock: MomentClock) -> None:
     store.note(HERE, "arm-1", stoppable=True)
     store.serve(HERE, "arm-1")
     store.flush(5.0)
@@ -207,7 +183,7 @@ def test_an_orderly_end_takes_a_robot_out_though_others_heard_it(store: Sighting
     assert found(elsewhere)["arm-1"].known is Known.HEARD
 
 
-def test_a_robot_knows_at_its_start_that_it_was_here(store: Sightings, clock: Clock) -> None:
+def test_a_robot_knows_at_its_start_that_it_was_here(store: Sightings, clock: MomentClock) -> None:
     assert store.was_here(HERE, "arm-1") is None
     store.serve(HERE, "arm-1")
     store.flush(5.0)
@@ -228,7 +204,7 @@ def test_a_robot_knows_at_its_start_that_it_was_here(store: Sightings, clock: Cl
     ],
 )
 def test_a_robot_knows_after_a_reboot_that_it_was_here(
-    store: Sightings, clock: Clock, wall_passed: float, age: float | None
+    store: Sightings, clock: MomentClock, wall_passed: float, age: float | None
 ) -> None:
     store.serve(HERE, "arm-1")
     store.note(HERE, "arm-2")
@@ -242,14 +218,14 @@ def test_a_robot_knows_after_a_reboot_that_it_was_here(
     )
 
 
-def test_a_reset_of_the_wall_clock_changes_no_age(store: Sightings, clock: Clock) -> None:
+def test_a_reset_of_the_wall_clock_changes_no_age(store: Sightings, clock: MomentClock) -> None:
     store.note(HERE, "arm-1")
     store.flush(5.0)
     clock.now = Moment(clock.now.boot, clock.now.uptime + 30.0, 0.0)
     assert found(store)["arm-1"].age_s == pytest.approx(30.0)
 
 
-def test_served_robots_are_written_again(store: Sightings, clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_served_robots_are_written_again(store: Sightings, clock: MomentClock, monkeypatch: pytest.MonkeyPatch) -> None:
     store.serve(HERE, "arm-1")
     store.flush(5.0)
     clock.pass_(100.0)
@@ -262,7 +238,7 @@ def test_served_robots_are_written_again(store: Sightings, clock: Clock, monkeyp
 
 
 def test_ten_thousand_made_up_names_cost_no_true_row_and_little_memory(
-    store: Sightings, robot: SigningIdentity, clock: Clock
+    store: Sightings, robot: SigningIdentity, clock: MomentClock
 ) -> None:
     store.note(HERE, "heard-first", stoppable=True)
     answer = signed(robot, Purpose.LOCKOUT_STATE, "signed", {})
@@ -288,7 +264,7 @@ def test_ten_thousand_made_up_names_cost_no_true_row_and_little_memory(
     assert {"heard-first", "signed", "served"} <= found(store).keys()
 
 
-def test_made_up_keys_push_out_no_name_that_was_heard_long_and_are_told(store: Sightings, clock: Clock) -> None:
+def test_made_up_keys_push_out_no_name_that_was_heard_long_and_are_told(store: Sightings, clock: MomentClock) -> None:
     store.file.write([Note(HERE, "true-robot", clock())], [], clock())
     for each in range(5):
         fakes = [replace(note, signed=clock()) for note in made_up(1024, clock(), first=1024 * each)]
@@ -315,7 +291,7 @@ def test_strangers_key_counts_only_where_no_robot_is_enrolled(store: Sightings, 
     assert rows == {"arm-1": 0, "own-1": 1}
 
 
-def test_stale_names_make_place_first(store: Sightings, clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stale_names_make_place_first(store: Sightings, clock: MomentClock, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sighting_file, "ROWS_MAX", 10)
     store.file.write(made_up(10, clock()), [], clock())
     clock.pass_(700.0)
@@ -323,7 +299,7 @@ def test_stale_names_make_place_first(store: Sightings, clock: Clock, monkeypatc
     assert set(found(store)) == {"arm-1"}
 
 
-def test_a_damaged_file_is_told_put_aside_and_begun_again(store: Sightings, clock: Clock) -> None:
+def test_a_damaged_file_is_told_put_aside_and_begun_again(store: Sightings, clock: MomentClock) -> None:
     store.note(HERE, "arm-1")
     store.flush(5.0)
     store.file.path.write_bytes(b"no database" * 1000)
@@ -560,7 +536,7 @@ def test_every_network_key_is_read_back_as_it_was_written(endpoints: list[str], 
     assert found(store)["arm-1"].network == key
 
 
-def test_rows_of_unreadable_networks_are_told_for_ten_minutes(store: Sightings, clock: Clock) -> None:
+def test_rows_of_unreadable_networks_are_told_for_ten_minutes(store: Sightings, clock: MomentClock) -> None:
     store.file.write([Note(NetworkKey("sea", ("a:1",)), "boat-1", clock()), Note(HERE, "arm-1", clock())], [], clock())
     rows, problem = store.file.read(clock())
     assert [each.name for each in rows] == ["arm-1"]

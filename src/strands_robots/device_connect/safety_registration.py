@@ -136,8 +136,6 @@ class SafetyRegistration:
         self._name = name
         self.driver: Any = None
         self._network = None if link is None else network_of(link)
-        if self._network is not None:
-            sightings().refuse_taken(self._network, device_id)
         self.was_here_s = None if self._network is None else sightings().was_here(self._network, device_id)
         """Seconds since this robot was last served from this machine; None where over ten minutes, or never."""
         self.entry: Registered = plane().register(name, robot, key=key, wire_id=device_id, cell=cell)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
+from contextlib import contextmanager
 from typing import Any
 
 from strands_robots.envelope import is_error
@@ -132,11 +133,16 @@ class SafetyAdapter:
             DuplicateDeviceError: it does.
         """
         if self.moves:
-            try:
-                sightings().refuse_taken(network, self._peer_id)
-            except DuplicateDeviceError:
-                self.close()
-                raise
+            with self._left_where_taken():
+                self.was_here_s = sightings().was_here(network, self._peer_id)
+
+    @contextmanager
+    def _left_where_taken(self) -> Iterator[None]:
+        try:
+            yield
+        except DuplicateDeviceError:
+            self.close()
+            raise
 
     def serve(self, network: NetworkKey) -> None:
         """Have this machine remember that the robot is served, until :meth:`leave`.
@@ -146,10 +152,10 @@ class SafetyAdapter:
         """
         if self.moves:
             self._network, public = network, None if self.identity is None else self.identity.public
-            self.was_here_s = sightings().was_here(network, self._peer_id)
             wants = self._decision.required
             sightings().serve(network, self._peer_id, cell=self._cell, signed_only=wants, public=public)
-            self.refuse_taken(network)
+            with self._left_where_taken():
+                sightings().refuse_taken(network, self._peer_id)
 
     def leave(self) -> None:
         """Have this machine remember that the robot left in good order."""

@@ -237,12 +237,8 @@ class Served:
         """True while another process serves this robot, for callers that reach both."""
         # Where the system does not say when a process started, its number may be another one's by now.
         sure = self.started != UNKNOWN or self.at.age_s(now) < RECENT_S
-        return (
-            (self.name, self.pid != os.getpid()) == (name, True)
-            and sure
-            and self.network.joins(network)
-            and self.lives(now)
-        )
+        another = self.name == name and self.pid != os.getpid() and self.network.joins(network)
+        return another and sure and self.lives(now)
 
 
 def process_start(pid: int) -> str:

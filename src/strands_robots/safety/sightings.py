@@ -239,31 +239,52 @@ class Sightings:
         None where that is over ten minutes ago, or never. Call it before :meth:`serve`: it is how a fresh start knows
         that a stop may have been missed. It waits a second at most for the disk, and where the file cannot be read it
         returns 0, so that the robot asks.
+
+        Raises:
+            DuplicateDeviceError: as :meth:`refuse_taken`, which it includes.
         """
-        now = self._clock()
-        try:
-            rows = [*self._within(self.file.served, READ_S), *self._changed.copy().values()]
-            ages = [row.at.age_s(now) for row in rows if row.name == name and row.network.meets(network)]
-        except SightingFileError as exc:
-            logger.warning("%s: %s", name, exc)
+        rows = self._free(network, name)
+        if rows is None:
             return 0.0
+        now, known = self._clock(), [*rows, *self._changed.copy().values()]
+        ages = [row.at.age_s(now) for row in known if row.name == name and row.network.meets(network)]
         recent = [age for age in ages if age < RECENT_S]
         return max(0.0, min(recent)) if recent else None
 
     def refuse_taken(self, network: NetworkKey, name: str) -> None:
         """Refuse a robot id that another live process with this state directory serves.
 
-        The two would sign with one key, so that callers took them for one robot. Call it before :meth:`serve`, and
-        after it: of two that begin at once the later one is refused. It waits two seconds for a process that is just
-        ending, and one at most for the disk; where the file cannot be read nothing is refused.
+        The two would sign with one key, so that callers took them for one robot. Ask before :meth:`serve`, by
+        :meth:`was_here`, and after it: of two that begin at once the later one is refused. It waits two seconds for a
+        process that is just ending, and one at most for the disk; where the file cannot be read nothing is refused.
 
         Raises:
             DuplicateDeviceError: naming the process and its network.
         """
-        until = time.monotonic() + LEAVES_S
         if (network, name) in self._own:
             self.flush(READ_S)
-        while (other := self._holder(network, name)) is not None:
+        self._free(network, name)
+
+    def _free(self, network: NetworkKey, name: str) -> list[Served] | None:
+        """Return the rows of served robots once nobody else serves a robot.
+
+        None where they cannot be read. Where this process serves it as well, those that began later do not count.
+        """
+        until = time.monotonic() + LEAVES_S
+        while True:
+            try:
+                rows = self._within(self.file.served, READ_S)
+            except SightingFileError as exc:
+                logger.warning("%s: %s", name, exc)
+                return None
+            now, own, earlier = self._clock(), self._own.get((network, name)), rows
+            if own is not None:
+                ids = [(row.network, row.name, row.pid, row.started) for row in rows]
+                mine = (network, name, own.pid, own.started)
+                earlier = rows[ids.index(mine) :] if mine in ids else []
+            other = next((row for row in earlier if row.holds(network, name, now)), None)
+            if other is None:
+                return rows
             if time.monotonic() >= until:
                 where = f"{KINDS[other.network.kind]} ({', '.join(other.network.where)})"
                 raise DuplicateDeviceError(
@@ -272,24 +293,6 @@ class Sightings:
                     f"with STRANDS_STATE_DIR."
                 )
             time.sleep(LEAVES_EVERY_S)
-
-    def _holder(self, network: NetworkKey, name: str) -> Served | None:
-        """Return who else serves a robot, None without one.
-
-        Where this process serves it as well, those that began later do not count.
-        """
-        try:
-            rows = self._within(self.file.served, READ_S)
-        except SightingFileError as exc:
-            logger.warning("%s: %s", name, exc)
-            return None
-        own = self._own.get((network, name))
-        if own is not None:
-            ids = [(row.network, row.name, row.pid, row.started) for row in rows]
-            mine = (network, name, own.pid, own.started)
-            rows = rows[ids.index(mine) :] if mine in ids else []
-        now = self._clock()
-        return next((row for row in rows if row.holds(network, name, now)), None)
 
     def flush(self, within: float = ENDING_S) -> bool:
         """Write what is queued now; False where that takes over ``within`` seconds."""
