@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -54,3 +56,22 @@ def clock() -> MomentClock:
 def store(tmp_path: Path, clock: MomentClock) -> Sightings:
     """What a machine of the test's own remembers of robots."""
     return Sightings(tmp_path / "state", clock)
+
+
+@pytest.fixture
+def child() -> Iterator[Callable[..., subprocess.Popen[str]]]:
+    """Start Python programs, which the end of the test kills."""
+    children: list[subprocess.Popen[str]] = []
+
+    def start(program: str, *arguments: str) -> subprocess.Popen[str]:
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+        started = subprocess.Popen([sys.executable, "-c", program, *arguments], text=True, **pipes)
+        children.append(started)
+        return started
+
+    yield start
+    for each in children:
+        each.kill()
+        each.wait()
+        for pipe in filter(None, (each.stdin, each.stdout)):
+            pipe.close()

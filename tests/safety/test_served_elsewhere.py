@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import os
+import signal
+import subprocess
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from fixtures.moments import MomentClock
+from fixtures.waiting import said, signalled
 
 from strands_robots.safety import sighting_file, sightings
 from strands_robots.safety.network_key import DEVICE_CONNECT, MESH, NetworkKey
@@ -46,12 +51,12 @@ def test_a_robot_id_that_another_live_process_serves_is_refused(
 ) -> None:
     served_by_another(store, clock, theirs)
     with pytest.raises(DuplicateDeviceError) as refusal:
-        store.refuse_taken(own, "arm-1")
+        store.was_here(own, "arm-1")
     said = str(refusal.value)
     where = "the native mesh (127.0.0.1:7447)" if theirs is MESHED else "Device Connect (127.0.0.1:7447)"
     assert said.startswith(f"arm-1 is served already by process {os.getppid()} of this machine, on {where}.")
     assert "another peer_id" in said and "STRANDS_STATE_DIR" in said
-    store.refuse_taken(own, "arm-2")
+    store.was_here(own, "arm-2")
 
 
 @pytest.mark.parametrize(
@@ -66,7 +71,7 @@ def test_a_robot_that_callers_do_not_confuse_is_not_refused(
     store: Sightings, clock: MomentClock, theirs: NetworkKey, own: NetworkKey, hasty: None
 ) -> None:
     served_by_another(store, clock, theirs)
-    store.refuse_taken(own, "arm-1")
+    store.was_here(own, "arm-1")
 
 
 def test_the_robot_of_a_process_that_ended_or_died_and_ones_own_are_not_refused(
@@ -74,53 +79,94 @@ def test_the_robot_of_a_process_that_ended_or_died_and_ones_own_are_not_refused(
 ) -> None:
     row = served_by_another(store, clock)
     store.file.write([], [replace(row, ended=True), replace(row, started="an earlier process")], clock())
-    store.refuse_taken(HERE, "arm-1")
+    store.was_here(HERE, "arm-1")
     store.serve(HERE, "arm-1")
-    store.refuse_taken(HERE, "arm-1")
-    store.refuse_taken(MESHED, "arm-1")
+    store.was_here(HERE, "arm-1")
+    store.was_here(MESHED, "arm-1")
     store.leave(HERE, "arm-1")
     # Where the system does not say when a process began, one that was killed is forgotten with its last writing.
     monkeypatch.setattr(sighting_file, "process_start", lambda pid: sighting_file.UNKNOWN)
     store.file.write([], [replace(row, started=sighting_file.UNKNOWN)], clock())
     with pytest.raises(DuplicateDeviceError):
-        store.refuse_taken(HERE, "arm-1")
+        store.was_here(HERE, "arm-1")
     clock.now = clock.now.earlier(-700.0)
-    store.refuse_taken(HERE, "arm-1")
+    store.was_here(HERE, "arm-1")
 
 
 def test_a_start_waits_for_a_process_that_is_just_ending(store: Sightings, clock: MomentClock) -> None:
     row = served_by_another(store, clock)
     ending = threading.Timer(0.3, lambda: store.file.write([], [replace(row, ended=True)], clock()))
     ending.start()
-    store.refuse_taken(HERE, "arm-1")
+    store.was_here(HERE, "arm-1")
     ending.join()
 
 
-def test_of_two_that_begin_at_once_the_later_one_is_refused(store: Sightings, clock: MomentClock, hasty: None) -> None:
-    served_by_another(store, clock)
-    store.serve(HERE, "arm-1")
-    with pytest.raises(DuplicateDeviceError):
-        store.refuse_taken(HERE, "arm-1")
-    # It began anew, so it is the later one, though it was here before.
-    store.leave(HERE, "arm-1")
-    assert store.flush(5.0)
-    store.serve(HERE, "arm-1")
-    with pytest.raises(DuplicateDeviceError):
-        store.refuse_taken(HERE, "arm-1")
+STARTING = """
+import sys, time
+from pathlib import Path
+from strands_robots.safety import sightings
+from strands_robots.safety.network_key import NetworkKey
+sightings.BATCH_S = 600.0
+store = sightings.Sightings(Path(sys.argv[1]))
+store.serve(NetworkKey.parse(sys.argv[2]), "arm-1")
+print("began", flush=True)
+sys.stdin.readline()
+print("written" if store.flush(5.0) else "not written", flush=True)
+time.sleep(600)
+"""
 
 
-def test_the_earlier_of_two_that_begin_at_once_goes_on(store: Sightings, clock: MomentClock, hasty: None) -> None:
+def test_of_two_that_begin_at_once_the_later_one_waits_for_the_row_of_the_first_and_is_refused(
+    store: Sightings, child: Callable[..., subprocess.Popen[str]]
+) -> None:
+    first = child(STARTING, str(store.directory), MESHED.text)
+    said(first, "began")
+    assert store.was_here(HERE, "arm-1") is None
+    writing = threading.Timer(0.3, lambda: print(file=first.stdin, flush=True))
+    writing.start()
+    with pytest.raises(DuplicateDeviceError, match=f"by process {first.pid} of this machine, on the native mesh"):
+        store.serve(HERE, "arm-1")
+    said(first, "written")
+
+
+def test_a_start_is_refused_while_a_frozen_process_begins_and_not_once_it_is_killed(
+    store: Sightings, child: Callable[..., subprocess.Popen[str]], hasty: None
+) -> None:
+    first = child(STARTING, str(store.directory), MESHED.text)
+    said(first, "began")
+    signalled(first, signal.SIGSTOP)
+    for _ in range(2):
+        with pytest.raises(DuplicateDeviceError, match="another process of this machine, which is just starting it"):
+            store.serve(HERE, "arm-1")
+    # Robots of other names and tenants do not wait for it.
+    store.serve(HERE, "arm-2")
+    store.serve(NetworkKey.of(DEVICE_CONNECT, HERE.where, "other"), "arm-1")
+    first.kill()
+    first.wait()
+    store.serve(HERE, "arm-1")
+    store.serve(MESHED, "arm-1")
+    assert store.flush(5.0)
+
+
+def test_a_start_keeps_no_descriptor_once_it_is_written(store: Sightings) -> None:
     store.serve(HERE, "arm-1")
     assert store.flush(5.0)
-    row = served_by_another(store, clock)
-    store.refuse_taken(HERE, "arm-1")
-    # The other one had served it before and begins again: it is the later one none the less.
-    store.leave(HERE, "arm-1")
-    store.file.write([], [replace(row, ended=True)], clock())
+    before = len(list(Path("/proc/self/fd").iterdir()))
+    for _ in range(3):
+        store.serve(HERE, "arm-1")
+        store.serve(MESHED, "arm-1")
+        assert store.flush(5.0)
+        store.leave(HERE, "arm-1")
+    assert len(list(Path("/proc/self/fd").iterdir())) <= before
+
+
+def test_a_file_that_cannot_be_locked_refuses_no_start(store: Sightings, caplog: pytest.LogCaptureFixture) -> None:
+    store.directory.mkdir(mode=0o700)
+    (store.directory / "starting.lock").mkdir()
     store.serve(HERE, "arm-1")
+    assert "arm-1: it is not known whether another process serves it" in caplog.text
     assert store.flush(5.0)
-    store.file.write([], [row], clock())
-    store.refuse_taken(HERE, "arm-1")
+    assert store.was_here(MESHED, "arm-1") is None
 
 
 def test_a_disk_that_hangs_holds_a_start_up_for_a_second_and_refuses_nothing(
@@ -128,8 +174,8 @@ def test_a_disk_that_hangs_holds_a_start_up_for_a_second_and_refuses_nothing(
 ) -> None:
     served_by_another(store, clock)
     hung = threading.Event()
-    monkeypatch.setattr(store.file, "served", lambda: hung.wait(30.0) and [])
+    monkeypatch.setattr(store.file, "served", lambda name: hung.wait(30.0) and [])
     began = time.monotonic()
-    store.refuse_taken(HERE, "arm-1")
+    store.was_here(HERE, "arm-1")
     assert time.monotonic() - began < 2.0
     hung.set()

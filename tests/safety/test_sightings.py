@@ -9,13 +9,13 @@ import subprocess
 import sys
 import time
 import tracemalloc
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from fixtures.moments import MomentClock
-from fixtures.waiting import eventually, signalled
+from fixtures.waiting import eventually, said, signalled
 
 from strands_robots.audit import read_audit_log
 from strands_robots.device_connect.backends import LinkConfig, loopback_config
@@ -397,28 +397,6 @@ connection.execute("UPDATE heard SET departed = 1")
 print("held", flush=True)
 time.sleep(600)
 """
-
-
-@pytest.fixture
-def child() -> Iterator[Callable[..., subprocess.Popen[str]]]:
-    children: list[subprocess.Popen[str]] = []
-
-    def start(program: str, *arguments: str) -> subprocess.Popen[str]:
-        started = subprocess.Popen([sys.executable, "-c", program, *arguments], stdout=subprocess.PIPE, text=True)
-        children.append(started)
-        return started
-
-    yield start
-    for each in children:
-        each.kill()
-        each.wait()
-        if each.stdout:
-            each.stdout.close()
-
-
-def said(child: subprocess.Popen[str], word: str) -> None:
-    assert child.stdout is not None
-    assert child.stdout.readline().strip() == word
 
 
 def test_two_processes_write_at_once_and_lose_nothing(

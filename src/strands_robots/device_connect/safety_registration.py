@@ -181,7 +181,6 @@ class SafetyRegistration:
             sightings().serve(
                 self._network, self.device_id, cell=self.cell, signed_only=self.signed_only, public=public
             )
-            sightings().refuse_taken(self._network, self.device_id)
 
     @property
     def signed_only(self) -> bool:

@@ -153,9 +153,8 @@ class SafetyAdapter:
         if self.moves:
             self._network, public = network, None if self.identity is None else self.identity.public
             wants = self._decision.required
-            sightings().serve(network, self._peer_id, cell=self._cell, signed_only=wants, public=public)
             with self._left_where_taken():
-                sightings().refuse_taken(network, self._peer_id)
+                sightings().serve(network, self._peer_id, cell=self._cell, signed_only=wants, public=public)
 
     def leave(self) -> None:
         """Have this machine remember that the robot left in good order."""

@@ -10,7 +10,7 @@ import contextlib
 import hashlib
 import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from functools import lru_cache
@@ -342,8 +342,8 @@ class SightingFile:
             )
         return _united(heard, served, now), problem
 
-    def served(self) -> list[Served]:
-        """Return the rows of served robots, the latest first, those that ended included.
+    def served(self, name: str) -> list[Served]:
+        """Return the rows of a served robot, the latest first, ended ones included.
 
         Raises:
             SightingFileError: they could not be read.
@@ -351,13 +351,15 @@ class SightingFile:
         if not self.path.exists() and not self.path.is_symlink():
             return []
         with self._opened() as connection:
-            return self._served(connection)
+            return self._served(connection, "name = :name", {"name": name})
 
-    def _served(self, connection: sqlite3.Connection) -> list[Served]:
+    def _served(
+        self, connection: sqlite3.Connection, where: str = "1", facts: Mapping[str, object] | None = None
+    ) -> list[Served]:
         rows = connection.execute(
             "SELECT network, name, pid, started, boot, uptime, wall, cell, signed_only, ended FROM served"
-            " ORDER BY id DESC LIMIT ?",
-            (2 * SERVED_MAX,),
+            f" WHERE {where} ORDER BY id DESC LIMIT :most",
+            {**(facts or {}), "most": 2 * SERVED_MAX},
         )
         found = []
         for network, name, pid, started, since_boot, since, wall, cell, signed_only, ended in rows:
@@ -370,7 +372,9 @@ class SightingFile:
         """Forget served robots whose process is gone and ten minutes are over."""
         gone = [
             (each.network.text, each.name, each.pid, each.started)
-            for each in self._served(connection)
+            for each in self._served(
+                connection, "boot != :boot OR uptime < :since", {"boot": now.boot, "since": now.uptime - RECENT_S}
+            )
             if each.at.age_s(now) >= RECENT_S and not each.lives(now)
         ]
         connection.executemany("DELETE FROM served WHERE network = ? AND name = ? AND pid = ? AND started = ?", gone)

@@ -36,6 +36,7 @@ from strands_robots.safety.sighting_file import (
     process_start,
     this_moment,
 )
+from strands_robots.safety.start_locks import StartLocks
 from strands_robots.safety.statements import STATED_WITHIN_S, Purpose, own_key
 from strands_robots.state_files import state_dir
 from strands_robots.stop_log import stop_logger
@@ -107,6 +108,7 @@ class Sightings:
     def __init__(self, directory: Path, clock: Callable[[], Moment] = this_moment) -> None:
         self.directory = directory
         self.file = SightingFile(directory)
+        self._starts = StartLocks(directory)
         self.problem = ""
         """Empty, or the reason why the last write did not succeed."""
         self._clock = clock
@@ -201,11 +203,18 @@ class Sightings:
         signed_only: bool = False,
         public: bytes | None = None,
     ) -> None:
-        """Record that this process serves a robot, until :meth:`leave`; return at once.
+        """Record that this process serves a robot, until :meth:`leave`.
+
+        Of two processes that begin at once the later one is refused. It waits for what is on disk already, as
+        :meth:`was_here`; its own row is written later.
 
         Args:
             public: its key; it undoes an exemption that the operator set for the enrolled robot with this key.
+
+        Raises:
+            DuplicateDeviceError: as :meth:`was_here`.
         """
+        self._rows_where_free(network, name, begins=True)
         row = Served(network, name, os.getpid(), process_start(os.getpid()), self._clock(), cell, signed_only)
         with self._lock:
             self._own[network, name] = self._changed[network, name] = row
@@ -241,9 +250,10 @@ class Sightings:
         returns 0, so that the robot asks.
 
         Raises:
-            DuplicateDeviceError: as :meth:`refuse_taken`, which it includes.
+            DuplicateDeviceError: another live process with this state directory serves it, and callers would take the
+                two, which sign with one key, for one robot. A process that is just ending gets two seconds.
         """
-        rows = self._free(network, name)
+        rows = self._rows_where_free(network, name, begins=False)
         if rows is None:
             return 0.0
         now, known = self._clock(), [*rows, *self._changed.copy().values()]
@@ -251,48 +261,41 @@ class Sightings:
         recent = [age for age in ages if age < RECENT_S]
         return max(0.0, min(recent)) if recent else None
 
-    def refuse_taken(self, network: NetworkKey, name: str) -> None:
-        """Refuse a robot id that another live process with this state directory serves.
+    def _rows_where_free(self, network: NetworkKey, name: str, *, begins: bool) -> list[Served] | None:
+        """Return the rows of a robot once nobody else serves it; None if unreadable.
 
-        The two would sign with one key, so that callers took them for one robot. Ask before :meth:`serve`, by
-        :meth:`was_here`, and after it: of two that begin at once the later one is refused. It waits two seconds for a
-        process that is just ending, and one at most for the disk; where the file cannot be read nothing is refused.
+        Args:
+            begins: take its start lock, until its row is written.
 
         Raises:
-            DuplicateDeviceError: naming the process and its network.
-        """
-        if (network, name) in self._own:
-            self.flush(READ_S)
-        self._free(network, name)
-
-    def _free(self, network: NetworkKey, name: str) -> list[Served] | None:
-        """Return the rows of served robots once nobody else serves a robot.
-
-        None where they cannot be read. Where this process serves it as well, those that began later do not count.
+            DuplicateDeviceError: as :meth:`was_here`; or another process held the lock for two seconds.
         """
         until = time.monotonic() + LEAVES_S
         while True:
             try:
-                rows = self._within(self.file.served, READ_S)
-            except SightingFileError as exc:
-                logger.warning("%s: %s", name, exc)
+                taken, rows = self._within(lambda: self._looked(network, name, begins=begins), READ_S)
+            except OSError as exc:
+                logger.warning("%s: it is not known whether another process serves it: %s", name, exc)
                 return None
-            now, own, earlier = self._clock(), self._own.get((network, name)), rows
-            if own is not None:
-                ids = [(row.network, row.name, row.pid, row.started) for row in rows]
-                mine = (network, name, own.pid, own.started)
-                earlier = rows[ids.index(mine) :] if mine in ids else []
-            other = next((row for row in earlier if row.holds(network, name, now)), None)
-            if other is None:
+            now = self._clock()
+            other = next((row for row in rows if row.holds(network, name, now)), None)
+            if taken and other is None:
                 return rows
             if time.monotonic() >= until:
-                where = f"{KINDS[other.network.kind]} ({', '.join(other.network.where)})"
+                self._starts.free(network, name)
+                who = "another process of this machine, which is just starting it"
+                if other is not None:
+                    where = f"{KINDS[other.network.kind]} ({', '.join(other.network.where)})"
+                    who = f"process {other.pid} of this machine, on {where}"
                 raise DuplicateDeviceError(
-                    f"{name} is served already by process {other.pid} of this machine, on {where}. Both would have one "
-                    f"key and be taken for one robot: give this one another peer_id, or a state directory of its own "
-                    f"with STRANDS_STATE_DIR."
+                    f"{name} is served already by {who}. Both would have one key and be taken for one robot: give this "
+                    f"one another peer_id, or a state directory of its own with STRANDS_STATE_DIR."
                 )
             time.sleep(LEAVES_EVERY_S)
+
+    def _looked(self, network: NetworkKey, name: str, *, begins: bool) -> tuple[bool, list[Served]]:
+        # The lock first: who had it before has written by now.
+        return not begins or self._starts.take(network, name), self.file.served(name)
 
     def flush(self, within: float = ENDING_S) -> bool:
         """Write what is queued now; False where that takes over ``within`` seconds."""
@@ -323,7 +326,7 @@ class Sightings:
         problem = "" if written else (self.problem or "sightings.db was not written in time")
         try:
             found, missing = self._within(lambda: self.file.read(now or self._clock()), READ_S)
-        except SightingFileError as exc:
+        except OSError as exc:
             return [], str(exc)
         return found, problem or missing
 
@@ -382,6 +385,8 @@ class Sightings:
         try:
             problem = self._write(notes, answers, served)
         finally:
+            for network, name in served:
+                self._starts.free(network, name)
             self._written(notes, answers, served, problem)
         return problem
 
@@ -477,12 +482,12 @@ class Sightings:
     def _within(self, work: Callable[[], T], seconds: float) -> T:
         """Run ``work`` on a thread; a disk that hangs holds up no command."""
         done: list[T] = []
-        failed: list[SightingFileError] = []
+        failed: list[OSError] = []
 
         def run() -> None:
             try:
                 done.append(work())
-            except SightingFileError as exc:
+            except OSError as exc:
                 failed.append(exc)
 
         thread = threading.Thread(target=run, name="sightings-read", daemon=True)
