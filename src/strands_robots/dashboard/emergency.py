@@ -9,9 +9,9 @@ from typing import Any
 
 from strands_robots.dashboard.feeds import Feeds
 from strands_robots.dashboard.fleet_model import FleetModel, key_of
-from strands_robots.fleet.all_stops import for_all
-from strands_robots.fleet.fleet_verdict import NetworkVerdict
-from strands_robots.fleet.stop_button import StopButton
+from strands_robots.fleet.safety_console import StopButton
+from strands_robots.fleet.stops import for_all
+from strands_robots.fleet.verdicts import NetworkVerdict
 from strands_robots.safety.answers import Answer
 from strands_robots.safety.controller import UNCONFIRMED_S, Progress, StopReport
 from strands_robots.safety.orders import new_epoch
@@ -31,7 +31,7 @@ class FleetStop:
 
     The networks' controllers send on connections and threads of their own. A press runs until every expected robot has
     answered, and a further one meanwhile is part of it. On a network that comes later it leaves as
-    :class:`~strands_robots.fleet.stop_button.StopButtons` says.
+    :class:`~strands_robots.fleet.safety_console.StopButtons` says.
     """
 
     def __init__(self, model: FleetModel, feeds: Feeds) -> None:

@@ -15,11 +15,9 @@ from strands_robots.dashboard.fleet_model import FleetModel, key_of
 from strands_robots.dashboard.verb_forms import forms_of_verbs
 from strands_robots.envelope import Envelope, is_error
 from strands_robots.errors import RefusalError
-from strands_robots.fleet.adapter import DEVICE_CONNECT, EVERY, FoundRobot, NetworkAdapter, RobotEvent
-from strands_robots.fleet.joint_features import joint_limits, joint_units
-from strands_robots.fleet.lockout_report import Resumed
+from strands_robots.fleet.adapter import DEVICE_CONNECT, EVERY, FoundRobot, NetworkAdapter, Resumed, RobotEvent
 from strands_robots.fleet.refusals import answered
-from strands_robots.fleet.robot_task import task_of
+from strands_robots.fleet.reports import joint_limits, joint_units, task_of
 from strands_robots.safety.identity import KeyFileError
 from strands_robots.serving.advertised import RobotDescription
 

@@ -20,7 +20,7 @@ from strands_robots.dashboard.fleet_model import FleetModel, RobotRow, key_of
 from strands_robots.envelope import Envelope, error
 from strands_robots.errors import AmbiguousRobotError
 from strands_robots.fleet.adapter import NetworkAdapter
-from strands_robots.fleet.bearers import bears
+from strands_robots.fleet.networks import bears
 from strands_robots.fleet.shared_id import DECIDED_S, SharedId, decided
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.stopping import grade

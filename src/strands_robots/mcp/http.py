@@ -26,6 +26,7 @@ from starlette.types import Message, Receive, Scope, Send
 
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.fleet.networks import Networks
+from strands_robots.fleet.standing import StandingController
 from strands_robots.mcp.access import ClientAccess
 from strands_robots.mcp.approval import Approvals
 from strands_robots.mcp.caller import Caller
@@ -33,7 +34,6 @@ from strands_robots.mcp.connections import CONNECTION, IDLE_S, BoundedServer, Ca
 from strands_robots.mcp.resources import RobotResources
 from strands_robots.mcp.server import GONE, MESSAGE_MAX, STOPS, THREADS, build
 from strands_robots.mcp.sessions import Sessions
-from strands_robots.mcp.standing import StandingController
 from strands_robots.mcp.tokens import Token, TokenFile
 from strands_robots.utils import is_loopback_host
 

@@ -19,12 +19,12 @@ from mcp.types import InputRequiredResult, ToolAnnotations
 from pydantic import Field
 
 from strands_robots.envelope import Envelope, error, is_error, success
-from strands_robots.fleet.all_lockouts import ask_lockouts, by_robot
+from strands_robots.fleet.lockouts import ask_lockouts, by_robot
+from strands_robots.fleet.standing import StandingController
 from strands_robots.mcp.access import AccessOf
 from strands_robots.mcp.approval import Approvals, Wish
 from strands_robots.mcp.caller import acquire_arguments
 from strands_robots.mcp.results import Result, facts, picture, quoted, result, row
-from strands_robots.mcp.standing import StandingController
 from strands_robots.mcp.verbs import INSTEAD, described, wanted
 from strands_robots.serving.advertised import AdvertisedVerb
 from strands_robots.serving.stop_arguments import stop_reason, stop_scope

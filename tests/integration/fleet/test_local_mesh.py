@@ -19,7 +19,7 @@ from strands_robots import connect
 from strands_robots.device_connect import init_device_connect_sync, loopback_config, stop_device_connect
 from strands_robots.errors import UnreachableError
 from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
-from strands_robots.fleet.mesh.local import BROADCAST, LocalMesh, no_hub, no_peers
+from strands_robots.fleet.mesh.config import BROADCAST, LocalMesh, no_hub, no_peers
 from strands_robots.mesh import topics
 from strands_robots.mesh.session import clear_peers
 

@@ -8,8 +8,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from strands_robots.envelope import Envelope, text_of
-from strands_robots.fleet.cached_keys import Keys
-from strands_robots.fleet.lockout_report import LockoutReport, Resumed, before_resume
+from strands_robots.fleet.adapter import LockoutReport, Resumed, before_resume
+from strands_robots.fleet.shared_id import Keys
 from strands_robots.safety.identity import KeyFileError
 from strands_robots.safety.lockout import OVERFLOW, Lockout
 from strands_robots.safety.orders import new_epoch
