@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import shlex
-import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, wait
+from concurrent.futures import wait
 from contextlib import closing, contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
@@ -22,6 +21,7 @@ from strands_robots.cli.readiness import meeting_user
 from strands_robots.envelope import Envelope, error
 from strands_robots.errors import RefusalError
 from strands_robots.fleet.adapter import SOURCE, TOOL, NetworkAdapter, StopRequest
+from strands_robots.fleet.joining import on_own_thread
 from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.stops import estop_all, stop_all
 from strands_robots.fleet.verdicts import (
@@ -366,15 +366,7 @@ def _watched(
     screen: Screen, networks: Networks, pressed: Callable[[], FleetVerdict], latest: Mapping[str, Progress]
 ) -> FleetVerdict:
     """Press on a thread that never waits for drawing; draw the answers."""
-    verdict: Future[FleetVerdict] = Future()
-
-    def press() -> None:
-        try:
-            verdict.set_result(pressed())
-        except BaseException as exc:  # noqa: BLE001 - raised again by the future
-            verdict.set_exception(exc)
-
-    threading.Thread(target=press, name="estop", daemon=True).start()
+    verdict = on_own_thread(pressed)
     from rich.live import Live  # noqa: PLC0415 - loaded when a screen is redrawn
 
     with Live(stop_table({}, "EMERGENCY STOP"), console=screen.out, auto_refresh=False) as live:

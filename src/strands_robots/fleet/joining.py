@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
+from contextlib import suppress
 from functools import partial
 from typing import TypeVar
 
@@ -20,8 +21,8 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 
-def on_own_thread(work: Callable[[], R]) -> Future[R]:
-    """Begin ``work`` on a thread of its own, or do it here where none starts."""
+def on_own_thread(work: Callable[[], R], *, here: bool = False) -> Future[R]:
+    """Begin ``work`` on a thread of its own, or do it ``here``, as where none starts."""
     done: Future[R] = Future()
     # From now on it cannot be cancelled.
     done.set_running_or_notify_cancel()
@@ -32,10 +33,11 @@ def on_own_thread(work: Callable[[], R]) -> Future[R]:
         except BaseException as exc:  # noqa: BLE001 - it is raised where the result is taken
             done.set_exception(exc)
 
-    try:
-        threading.Thread(target=run, name="fleet-work", daemon=True).start()
-    except RuntimeError:
-        run()
+    if not here:
+        with suppress(RuntimeError):
+            threading.Thread(target=run, name="fleet-work", daemon=True).start()
+            return done
+    run()
     return done
 
 
@@ -45,31 +47,11 @@ def side_by_side(work: Callable[[T], R], items: Sequence[T]) -> list[R]:
     A pool of threads takes no work once the interpreter ends; a stop must be possible even then, so what gets no
     thread is done one after the other.
     """
-    done: dict[int, R] = {}
-    failed: dict[int, BaseException] = {}
-
-    def one(place: int) -> None:
-        try:
-            done[place] = work(items[place])
-        except BaseException as exc:  # noqa: BLE001 - it is raised on the caller's thread
-            failed[place] = exc
-
-    started, rest = [], list(range(len(items)))
-    while len(rest) > 1:
-        thread = threading.Thread(target=one, args=(rest[0],), name="fleet-work", daemon=True)
-        try:
-            thread.start()
-        except RuntimeError:
-            break
-        started.append(thread)
-        rest.pop(0)
-    for place in rest:
-        one(place)
-    for thread in started:
-        thread.join()
-    if failed:
-        raise failed[min(failed)]
-    return [done[place] for place in range(len(items))]
+    last = len(items) - 1
+    begun = [on_own_thread(partial(work, each), here=place == last) for place, each in enumerate(items)]
+    for each in begun:
+        each.exception()
+    return [each.result() for each in begun]
 
 
 def those(test: Callable[[T], bool], items: Sequence[T], *, every: bool) -> list[T]:

@@ -110,24 +110,25 @@ class StandingController:
             try:
                 with network.standing(self._signing_key, partial(self._known, name)) as sender:
                     self._on_standing(network, sender)
-                    # Read by screens meanwhile: replaced, not changed.
-                    self.senders = {**self.senders, name: sender}
                     if name in self.failures:
-                        self.failures = _without(self.failures, name)
                         logger.warning("%s reports whom it misses on %s again.", self._source, name)
+                    self._note(name, sender, None)
                     tried.set()
                     self._closing.wait()
             except Exception as exc:  # noqa: BLE001 - logged and said; the other networks have their controller
                 log = logger.debug if str(exc) == str(self.failures.get(name)) else logger.exception
                 log("%s does not report whom it misses on %s; it tries again.", self._source, name)
-                self.failures = {**self.failures, name: exc}
+                self._note(name, None, exc)
                 tried.set()
                 self._closing.wait(again)
                 again = min(2 * again, AGAIN_MAX_S)
-            finally:
-                self.senders = _without(self.senders, name)
+        self._note(name, None, None)
         tried.set()
 
-
-def _without(values: Mapping[str, Any], name: str) -> dict[str, Any]:
-    return {each: value for each, value in values.items() if each != name}
+    def _note(self, network: str, sender: StopSender | None, failure: Exception | None) -> None:
+        # Read by screens meanwhile: replaced, not changed.
+        with self._lock:
+            senders = {**self.senders, network: sender}
+            failures = {**self.failures, network: failure}
+            self.senders = {name: each for name, each in senders.items() if each is not None}
+            self.failures = {name: each for name, each in failures.items() if each is not None}

@@ -13,7 +13,7 @@ import pytest
 
 from strands_robots.envelope import error
 from strands_robots.errors import ArgumentsError, LockoutError, NoSuchRobotError, UnknownVerbError
-from strands_robots.fleet.mesh import network, requests
+from strands_robots.fleet.mesh import network, peers
 from strands_robots.fleet.mesh.network import MeshNetwork
 from strands_robots.mesh import session
 from strands_robots.mesh.transport import zenoh_config
@@ -69,7 +69,7 @@ def quick_discovery(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_silent_peers_hold_up_a_list_for_a_bounded_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(requests, "LIST_S", 0.1)
+    monkeypatch.setattr(peers, "LIST_S", 0.1)
     names = [f"bar-{n}" for n in range(100)]
 
     def send(peer: str, command: dict[str, Any], seconds: float) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import pytest
 
 from strands_robots.envelope import Envelope
 from strands_robots.fleet.adapter import StopRequest
-from strands_robots.fleet.mesh import network, requests, stops
+from strands_robots.fleet.mesh import network, peers, stops
 from strands_robots.fleet.mesh.network import MeshNetwork
 from strands_robots.fleet.mesh.stops import mesh_network
 from strands_robots.mesh.transport import zenoh_config
@@ -85,7 +85,7 @@ def timed_mesh(monkeypatch: pytest.MonkeyPatch) -> Callable[..., TimedMesh]:
     def make(arrivals: dict[str, float], **options: Any) -> TimedMesh:
         made = TimedMesh(arrivals, **options)
         monkeypatch.setattr(stops, "time", made)
-        monkeypatch.setattr(requests, "time", made)
+        monkeypatch.setattr(peers, "time", made)
         monkeypatch.setattr(network, "time", made)
         return made
 
@@ -145,7 +145,7 @@ def test_robot_that_connects_late_to_a_listener_is_stopped(
     mesh = timed_mesh({"arm-1": 0.4, "arm-2": 5.0, "arm-3": 8.5})
     assert locked(mesh)["robots"] == dict.fromkeys(("arm-1", "arm-2", "arm-3"), "stopped")
     for arrival in mesh.arrivals.values():
-        assert any(0 <= at - arrival <= stops.AGAIN_S + requests.LOOK_S for at in mesh.stops), mesh.stops
+        assert any(0 <= at - arrival <= stops.AGAIN_S + peers.LOOK_S for at in mesh.stops), mesh.stops
     assert len(mesh.stops) == 4
 
 

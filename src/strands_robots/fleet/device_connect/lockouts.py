@@ -26,11 +26,6 @@ logger = logging.getLogger(__name__)
 KEYS_UNUSABLE = "the enrolled keys cannot be used"
 
 
-def lockable_robots(fleet: FleetClient, seconds: float = 2.0) -> list[str]:
-    """Return the devices on the network that can be locked and resumed."""
-    return [peer.id for peer in fleet.peers(seconds) if peer.lockable]
-
-
 def ask_robots(
     fleet: FleetClient, names: Iterable[str], seconds: float, *, signed: bool = False
 ) -> list[LockoutReport]:

@@ -317,10 +317,8 @@ class DeviceConnectNetwork:
 
     def lockable(self, timeout: float = FIND_S) -> list[str]:
         """Return the devices that have a ``resume``."""
-        from strands_robots.fleet.device_connect.lockouts import lockable_robots  # noqa: PLC0415 - a call need not load it
-
         with _carried():
-            return lockable_robots(self._connected, timeout)
+            return [peer.id for peer in self._connected.peers(timeout) if peer.lockable]
 
     def lockouts(self, robots: Iterable[str], timeout: float, *, signed: bool = False) -> list[LockoutReport]:
         """Ask each device for its status."""

@@ -6,20 +6,23 @@ stated endpoint or multicast.
 
 from __future__ import annotations
 
+import asyncio
 import json
 import math
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from itertools import count
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 from strands_robots.envelope import Envelope, error, is_error
 from strands_robots.errors import (
     ArgumentsError,
     NoAnswerError,
     NoSuchRobotError,
+    RefusalError,
     UnknownVerbError,
     UnreachableError,
 )
@@ -41,12 +44,11 @@ from strands_robots.fleet.adapter import (
 )
 from strands_robots.fleet.mesh.config import MeshSettings, no_hub
 from strands_robots.fleet.mesh.events import follow
-from strands_robots.fleet.mesh.lockouts import ask_peers, lockable_peers, resume_peers
-from strands_robots.fleet.mesh.requests import (
+from strands_robots.fleet.mesh.lockouts import ask_peer, ask_peers, lockable_peers, resume_peers
+from strands_robots.fleet.mesh.peers import (
     CALLER,
     CONSOLE,
     LOOK_S,
-    PeerRequests,
     awaited,
     discover,
     functions_of,
@@ -65,6 +67,7 @@ from strands_robots.fleet.mesh.stops import (
     stop_peers,
 )
 from strands_robots.fleet.refusals import refusal_of, refusal_of_text, with_meaning
+from strands_robots.fleet.shared_id import CachedKeys
 from strands_robots.fleet.verdicts import roster_verdict
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.peer_answers import enrolled_peers, lockout_distrust
@@ -93,6 +96,85 @@ ALWAYS_SENT = ("stop", "releaseTorque")
 
 _ALIASES = {"getStatus": "status", "getState": "state", "getFeatures": "features"}
 """Reads of every robot by their names on Device Connect, which the mesh has always called otherwise."""
+
+
+IN_FLIGHT = 64
+"""Requests of one kind that wait for an answer at a time; threads are started as they are needed."""
+
+STOPS_IN_FLIGHT = 1024
+"""The same of stops: as many as a page has robots, so that the last one begins as soon as the first."""
+
+T = TypeVar("T")
+
+
+class PeerRequests:
+    """Calls, stops and questions of one peer; none waits for one of another kind."""
+
+    def __init__(self) -> None:
+        self._calls = ThreadPoolExecutor(IN_FLIGHT, "mesh call")
+        self._stops = ThreadPoolExecutor(STOPS_IN_FLIGHT, "mesh stop")
+        self._questions = ThreadPoolExecutor(IN_FLIGHT, "mesh question")
+        self._keys = CachedKeys(enrolled_peers)
+
+    async def call(self, work: Callable[[], Envelope]) -> Envelope:
+        """Return what ``work`` answers.
+
+        Raises:
+            RefusalError: as ``work``; no answer for whatever else it raises.
+        """
+
+        def refused() -> Envelope | RefusalError:
+            try:
+                return work()
+            except RefusalError as refusal:
+                return refusal
+
+        answer = await _done(self._calls, refused, NoAnswerError)
+        if isinstance(answer, RefusalError):
+            raise answer
+        return answer
+
+    async def stop(self, mesh: Mesh, robot: str, seconds: float, robot_name: str = "") -> Envelope:
+        """Stop a peer; *stopped* counts only where an enrolled robot has signed it."""
+        return await _done(
+            self._stops,
+            lambda: stop_peer(mesh, robot, seconds, robot_name),
+            lambda why: error(why, stopped=None),
+        )
+
+    async def lockout(self, mesh: Mesh, robot: str, seconds: float) -> LockoutReport:
+        """Ask a peer for its status."""
+        return await _done(
+            self._questions,
+            lambda: ask_peer(mesh, robot, seconds, self._keys.read()),
+            lambda why: LockoutReport(robot, problem=why),
+        )
+
+    def close(self) -> None:
+        """Begin no more requests."""
+        for pool in (self._calls, self._stops, self._questions):
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+async def _done(pool: ThreadPoolExecutor, work: Callable[[], T], failed: Callable[[str], T]) -> T:
+    """Return what ``work`` returns on a thread of the pool.
+
+    Where it does not, return what ``failed`` makes of the reason.
+    """
+    try:
+        begun = pool.submit(work)
+    except RuntimeError:
+        return failed(CLOSED)
+    try:
+        return await asyncio.wrap_future(begun)
+    except asyncio.CancelledError:
+        # Of the pool that is closed, not of the task that waits.
+        task = asyncio.current_task()
+        if task is not None and task.cancelling():
+            raise
+        return failed(CLOSED)
+    except Exception as exc:  # noqa: BLE001 - a request that fails is answered, whatever it raised
+        return failed(plain_text(str(exc)) or type(exc).__name__)
 
 
 class MeshNetwork:

@@ -14,7 +14,7 @@ from strands_robots.bounded_json import json_object
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.fleet.adapter import StopRequest
 from strands_robots.fleet.mesh.lockouts import lockable_peers
-from strands_robots.fleet.mesh.requests import LOOK_S, discover, must_answer, only_calls
+from strands_robots.fleet.mesh.peers import LOOK_S, discover, must_answer, only_calls
 from strands_robots.fleet.verdicts import measured, stop_outcome, unanswered
 from strands_robots.safety.answers import Answer
 from strands_robots.safety.controller import DEADLINE_S, OnProgress, Progress, StopReport
