@@ -193,7 +193,7 @@ class Lost(Exception):
 def test_network_that_fails_is_absent_and_the_others_go_on(
     fleet: Fleet, device_connect: ScriptedNetwork, mesh: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def lost(*_arguments: object) -> Any:
+    def lost(*_arguments: object, **_options: object) -> Any:
         raise Lost("cable")
 
     with monkeypatch.context() as patch:

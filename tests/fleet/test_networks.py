@@ -20,7 +20,6 @@ from strands_robots.fleet import networks as module
 from strands_robots.fleet.adapter import (
     CLOSED,
     DEVICE_CONNECT,
-    FIND_S,
     MESH,
     STOP_S,
     FoundRobot,
@@ -332,6 +331,14 @@ def test_listener_that_fails_keeps_no_other_from_hearing(
     assert "A listener failed for device_connect" in caplog.text
 
 
+def test_events_can_be_ended_twice(near: ScriptedNetwork) -> None:
+    with Networks([near]) as networks:
+        end = networks.subscribe("*", lambda event: None)
+        end()
+        end()
+        assert near.subscribers == []
+
+
 class TestStays:
     """Networks of a face that lasts: what is not there yet is joined when it comes."""
 
@@ -372,6 +379,20 @@ class TestStays:
             assert networks.joined == ()
             near.unreachable = ""
             eventually(lambda: networks.joined == (near,), what="the broker")
+
+    def test_events_of_a_network_that_comes_later_are_received(self, near: ScriptedNetwork) -> None:
+        far = ScriptedNetwork(MESH, {"arm-2": OURS})
+        far.unreachable = "no hub"
+        events: list[str] = []
+        with Networks([near, far], stays=True) as networks:
+            end = networks.subscribe("*", lambda event: events.append(event.robot))
+            near.say("arm-1", "stateUpdate")
+            far.unreachable = ""
+            eventually(lambda: bool(far.subscribers), what="the subscription on the mesh")
+            far.say("arm-2", "stateUpdate")
+            assert events == ["arm-1", "arm-2"]
+            end()
+            assert (near.subscribers, far.subscribers) == ([], [])
 
     def test_network_is_not_tried_again_once_the_face_has_ended(self, near: ScriptedNetwork) -> None:
         far = ScriptedNetwork(MESH)
@@ -417,7 +438,7 @@ class TestRouting:
     ) -> None:
         for robot, there in {"arm-1": near, "arm-2": far, "both": near}.items():
             assert asyncio.run(networks.of_async(robot)) is there
-            assert asyncio.run(networks.describe_async(robot, 5.0)).functions == OURS
+            assert asyncio.run(there.describe_async(robot, 5.0)).functions == OURS
         assert near.asked == far.asked == []
 
     def test_own_verb_is_called_where_it_was_described(
@@ -538,7 +559,7 @@ def test_search_that_fails_on_one_network_gives_the_robots_of_the_other(
 ) -> None:
     far = ScriptedNetwork(MESH, {"arm-2": OURS})
 
-    def broken(timeout: float = FIND_S) -> list[FoundRobot]:
+    def broken(timeout: float, *, peers: bool) -> list[FoundRobot]:
         raise KeyError("bug")
 
     with Networks([near, far]) as networks:

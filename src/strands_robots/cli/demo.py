@@ -1,4 +1,4 @@
-"""``demo``: run the example in which an agent puts a cube on a plate, through a stop and a lockout."""
+"""``demo``: run the example of an agent that puts a cube on a plate."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 from strands_robots.envelope import Envelope, error
 from strands_robots.errors import NoSuchRobotError, RefusalError, UnreachableError
-from strands_robots.fleet.adapter import CLOSED, FIND_S, STOP_S, FoundRobot, NetworkAdapter
+from strands_robots.fleet.adapter import CLOSED, FIND_S, STOP_S, Detail, FoundRobot, NetworkAdapter, OnEvent
 from strands_robots.fleet.joining import Joining, on_own_thread, side_by_side, those
 from strands_robots.serving.known_verbs import READS, RESUMES, STOPS
 from strands_robots.utils import near, plain_text
@@ -441,10 +441,6 @@ class Networks:
                 raise
         return await call(other)
 
-    async def describe_async(self, robot: str, within: float) -> FoundRobot:
-        """Return a robot as it describes itself now; raises as :meth:`of`."""
-        return await (await self.of_async(robot)).describe_async(robot, within)
-
     async def of_async(self, robot: str, verb: str = "", *, moves: bool = False) -> NetworkAdapter:
         """Do as :meth:`of`, without blocking the event loop."""
         if (network := self._at_once(robot, moves=moves)) is not None:
@@ -537,6 +533,39 @@ class Networks:
             or dict(list(unknown.items())[:1])
             or {each.name: _not_left(each, self.absent) for each in self.stated}
         )
+
+    def subscribe(self, robot: str, on_event: OnEvent, detail: Detail = Detail.EVENTS) -> Callable[[], None]:
+        """Receive a robot's events on every network, also on those that are joined later.
+
+        Returns:
+            What ends it.
+        """
+        ends, lock, over = list[Callable[[], None]](), threading.Lock(), threading.Event()
+
+        def follow(network: NetworkAdapter) -> None:
+            try:
+                end = network.subscribe(robot, on_event, detail)
+            except RefusalError as exc:
+                logger.warning("Events on %s cannot be received: %s", network.name, exc)
+                return
+            with lock:
+                if not over.is_set():
+                    ends.append(end)
+                    return
+            end()
+
+        self.on_joined(follow)
+
+        def end_all() -> None:
+            with self._change:
+                self._listeners[:] = [each for each in self._listeners if each is not follow]
+            with lock:
+                over.set()
+                begun, ends[:] = list(ends), []
+            for end in begun:
+                end()
+
+        return end_all
 
     def _attempts(self) -> tuple[Joining, ...]:
         """Return the attempts to join each network; none once they were left."""

@@ -21,7 +21,7 @@ from strands_robots import settings
 from strands_robots._mesh_switch import mesh_env_request
 from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH, NetworkAdapter
 from strands_robots.fleet.device_connect.config import LinkFlags
-from strands_robots.fleet.mesh.config import local_key, no_hub
+from strands_robots.fleet.mesh.config import LocalMesh, local_key, no_hub
 from strands_robots.state_files import WRITABLE
 from strands_robots.utils import (
     MissingExtraError,
@@ -406,16 +406,18 @@ def networks_of(
     elif MESH in unasked and not _on_a_mesh():
         # Its code is not loaded: most machines have no mesh.
         if stays or not (why := no_hub()):
-            from strands_robots.fleet.mesh.config import LocalMesh  # noqa: PLC0415 - as above
-
-            networks.append(cast("NetworkAdapter", LocalMesh(source, console=console)))
+            networks.append(cast("NetworkAdapter", LocalMesh(partial(_mesh_network, source, None, console=console))))
         else:
             absent[MESH], keys[MESH] = why, local_key
     else:
-        from strands_robots.fleet.mesh.network import MeshNetwork  # noqa: PLC0415 - loaded when it is used
-
-        networks.append(MeshNetwork(source, stated, console=console))
+        networks.append(_mesh_network(source, stated, console=console))
     return Networks(networks, absent, keys, stays=stays, unasked=unasked)
+
+
+def _mesh_network(source: str, stated: Mapping[str, str] | None, *, console: bool) -> NetworkAdapter:
+    from strands_robots.fleet.mesh.network import MeshNetwork  # noqa: PLC0415 - loaded when it is used
+
+    return MeshNetwork(source, stated, console=console)
 
 
 def networks_for_stop(

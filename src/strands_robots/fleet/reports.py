@@ -1,4 +1,4 @@
-"""What a robot reports: its task, its joints, and its events, bounded in number and in bytes."""
+"""Reports of a robot: its task, its joints, and its events, which are bounded."""
 
 from __future__ import annotations
 

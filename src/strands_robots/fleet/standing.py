@@ -24,7 +24,9 @@ OnStanding = Callable[[NetworkAdapter, StopSender], None]
 
 
 class StandingController:
-    """Safety controller of a program, on each of its networks; it reports whom it misses when others stop robots.
+    """Safety controller of a program, on each of its networks.
+
+    It reports whom it misses when others stop robots.
 
     On each network a thread opens the link, again and again until that succeeds, and closes it.
 
@@ -68,7 +70,10 @@ class StandingController:
         return "; ".join(f"{name}: {problem}" for name, problem in why.items() if problem)
 
     def open(self) -> None:
-        """Begin to open the links: where stops have a connection of their own now, else once a network is joined."""
+        """Begin to open the links.
+
+        Where stops have a connection of their own that is now, else once a network is joined.
+        """
         for each in self._networks.stated:
             if self._waits and each.has_stop_link:
                 self.stand(each)

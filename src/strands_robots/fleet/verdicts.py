@@ -1,4 +1,4 @@
-"""Verdicts of stops: answers graded, measured by the roster, and joined by robot and network."""
+"""Verdicts of stops: answers measured by the roster, by robot and by network."""
 
 from __future__ import annotations
 

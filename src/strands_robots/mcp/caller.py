@@ -141,7 +141,7 @@ class Caller:
         Raises:
             RefusalError: it does not.
         """
-        return await self.networks.describe_async(robot, ANSWER_S)
+        return await (await self.networks.of_async(robot)).describe_async(robot, ANSWER_S)
 
     async def received(self, robot: str, verb: str, params: Mapping[str, Any]) -> ReceivedCall:
         """Return a motion as its robot receives it; raises as :meth:`Networks.of`."""

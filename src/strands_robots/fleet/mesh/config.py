@@ -1,4 +1,7 @@
-"""The mesh of a caller: a profile's settings, and this machine's, looked for before its code is loaded."""
+"""The mesh of a caller: that of a profile, or this machine's.
+
+This machine's is looked for before any code of the mesh is loaded.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,7 @@ import json
 import socket
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from strands_robots import settings
@@ -16,7 +19,7 @@ from strands_robots.safety import network_key
 from strands_robots.safety.network_key import NetworkKey
 
 if TYPE_CHECKING:
-    from strands_robots.fleet.mesh.network import MeshNetwork
+    from strands_robots.fleet.adapter import NetworkAdapter
     from strands_robots.safety.network_key import NetworkKey
 
 CONNECT_S = 0.2
@@ -106,17 +109,16 @@ class LocalMesh:
     Its methods are those of :class:`~strands_robots.fleet.mesh.network.MeshNetwork`, once it was joined.
 
     Args:
-        source: the first part of this peer's id.
-        console: it is a safety controller, whose id is ``source``.
+        make: makes that network, once a mesh is there.
     """
 
     name = MESH
     has_stop_link = False
     tells_absence = False
 
-    def __init__(self, source: str, *, console: bool = False) -> None:
-        self._source, self._console = source, console
-        self._found: MeshNetwork | None = None
+    def __init__(self, make: Callable[[], NetworkAdapter]) -> None:
+        self._make = make
+        self._found: NetworkAdapter | None = None
 
     def open(self) -> None:
         """Join; raise :class:`UnreachableError` where the mesh has no peer."""
@@ -126,9 +128,7 @@ class LocalMesh:
             # A port with certificates is none of Device Connect's.
             if why := "" if settings.raw("STRANDS_MESH_TLS_CA") else no_peers():
                 raise NetworkBusyError(why) if why == _hangs() else UnreachableError(why)
-            from strands_robots.fleet.mesh.network import MeshNetwork  # noqa: PLC0415 - loaded when it is used
-
-            self._found = MeshNetwork(self._source, console=self._console)
+            self._found = self._make()
         self._found.open()
 
     def close(self) -> None:

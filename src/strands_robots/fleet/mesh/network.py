@@ -418,7 +418,10 @@ class MeshNetwork:
         return stop_peers(self.peer, self._fresh)
 
     def emergency_stop(self, request: StopRequest) -> StopOutcome:
-        """Stop and lock the peers; the mesh tells no progress, and its own deadlines count."""
+        """Stop and lock the peers.
+
+        The mesh tells no progress, and its own deadlines count.
+        """
         return lock_peers(self.peer, request, self._fresh)
 
     def verdict(self, outcome: StopOutcome) -> Envelope:
@@ -513,7 +516,11 @@ class MeshNetwork:
 
 
 def _dialled(source: str, *, console: bool) -> Mesh:
-    """Join the mesh as a peer without a robot; raise :class:`UnreachableError` where there is none."""
+    """Join the mesh as a peer without a robot.
+
+    Raises:
+        UnreachableError: there is none.
+    """
     from strands_robots.mesh import session  # noqa: PLC0415 - the network is loaded when it is used
     from strands_robots.mesh.core import Mesh, Parts  # noqa: PLC0415 - as above
     from strands_robots.mesh.transport import TransportError  # noqa: PLC0415 - as above

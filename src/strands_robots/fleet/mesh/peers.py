@@ -1,4 +1,4 @@
-"""Peers of the mesh: waited for, and their verbs, as they describe them or those of their kind."""
+"""Peers of the mesh: waited for, and their verbs."""
 
 from __future__ import annotations
 

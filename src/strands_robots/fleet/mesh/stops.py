@@ -1,4 +1,4 @@
-"""Stops of all robots on the mesh, measured by the roster, and its safety controllers."""
+"""Stops of all robots on the mesh, and its safety controllers."""
 
 from __future__ import annotations
 
