@@ -10,10 +10,10 @@ import pytest
 from device_connect_edge.messaging.exceptions import NotConnectedError
 from fixtures.waiting import until
 
-from strands_robots.device_connect import beat as beat_module
+from strands_robots.device_connect import presence as beat_module
 from strands_robots.device_connect.backends import LinkConfig
-from strands_robots.device_connect.beat import Beating, beat_of, named_in
 from strands_robots.device_connect.discovery import BEATS_MAX, Discovery
+from strands_robots.device_connect.presence import Beating, beat_of, named_in
 
 LINK = LinkConfig(connect=("tcp/127.0.0.1:7447",))
 

@@ -29,8 +29,7 @@ from .. import settings
 from ..utils import ValidationError
 from .backends import LinkConfig, backend_for, jsonrpc
 from .backends.dispatch import Answer, send
-from .beat import Beating, beat_of
-from .presence import PresenceView, encoded_capabilities, lock_stated, presence_builder
+from .presence import Beating, PresenceView, beat_of, encoded_capabilities, lock_stated, presence_builder
 
 HOLD_EVENTS_S = 5.0
 """Seconds of a lost link for which events wait; a server that restarts is back sooner, and older events mislead."""

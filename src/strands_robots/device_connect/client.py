@@ -24,8 +24,8 @@ from strands_robots.bounded_json import LONG_MAX, json_object
 from strands_robots.device_connect.backends import LinkConfig, open_client
 from strands_robots.device_connect.backends.base import NoResponderError, ResponderLostError
 from strands_robots.device_connect.discovery import DESCRIBE_S, HEARTBEATS_S, Discovery, Peer, parts
-from strands_robots.device_connect.enrollment import network_of
-from strands_robots.device_connect.shutdown import LOOP_JOIN_TIMEOUT_S
+from strands_robots.device_connect.links import network_of
+from strands_robots.device_connect.process import LOOP_JOIN_TIMEOUT_S
 from strands_robots.envelope import Envelope, error
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety.sightings import sightings

@@ -21,8 +21,8 @@ from device_connect_edge.messaging.exceptions import MessagingError
 from strands_robots import settings
 from strands_robots.bounded_json import json_object
 from strands_robots.device_connect.backends.base import Backend, NoResponderError, UnreadableReplyError
-from strands_robots.device_connect.beat import BEAT_S, HEARTBEAT_S, named_in
-from strands_robots.device_connect.enrollment import network_of
+from strands_robots.device_connect.links import network_of
+from strands_robots.device_connect.presence import BEAT_S, HEARTBEAT_S, named_in
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety.sightings import sightings
 from strands_robots.tags import read_tags

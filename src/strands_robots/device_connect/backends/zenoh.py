@@ -29,9 +29,8 @@ from ...zenoh_session import direct
 from . import jsonrpc, zenoh_session
 from .base import Backend, NoResponderError, ResponderLostError, Undo, UnreadableReplyError, too_long
 from .config import LinkConfig
-from .dial import why_silent, words_of
+from .dial import reason_of, why_silent, words_of
 from .dispatch import REPLY_SUBJECT, Backlog, CommandServer, OrderedFeed, on_a_thread
-from .reasons import reason_of
 
 logger = logging.getLogger(__name__)
 
