@@ -87,7 +87,7 @@ def meeting_problem(link: LinkConfig) -> str:
     """Return who else has the meeting port; empty for a robot process of this user."""
     if link.meet_port is None:
         return ""
-    from strands_robots.device_connect.backends.zenoh_session import meets  # noqa: PLC0415 - loaded when it is used
+    from strands_robots.device_connect.backends.zenoh import meets  # noqa: PLC0415 - loaded when it is used
 
     kind, until = meets(link), time.monotonic() + MEET_S
     while kind == "stranger" and time.monotonic() < until:

@@ -76,7 +76,6 @@ RECEIVERS = {
     "device_connect/backends/base.py": "feeds and servers: 1 MiB, a stop 64 KiB",
     "device_connect/backends/nats.py": "1 MiB by the parser of frames, a reply 4 MiB",
     "device_connect/backends/zenoh.py": "1 MiB, looked at before it is copied, a reply 4 MiB",
-    "device_connect/backends/zenoh_session.py": "the sinks of zenoh.py",
     "device_connect/bringup.py": "by the back end; nothing is parsed",
     "device_connect/client.py": "by the back end",
     "device_connect/discovery.py": "by the back end",

@@ -33,7 +33,7 @@ from ._compat import EncryptedClient, direct_parser, payload_of
 from .base import Backend, NoResponderError, Undo, UnreadableReplyError, too_long
 from .config import DEFAULT_URL, LinkConfig
 from .dial import client_context, reason_of
-from .dispatch import REPLY_SUBJECT, CommandServer, OrderedFeed, Throttled
+from .dispatch import REPLY_SUBJECT, CommandServer, Fanout, OrderedFeed, Throttled
 
 logger = logging.getLogger(__name__)
 
@@ -247,7 +247,7 @@ class NatsConnection:
         self._opening: asyncio.Task[None] | None = None
         self._closing = False
         self._declaring = asyncio.Lock()
-        self._topics: dict[str, _Topic] = {}
+        self._topics: dict[str, Fanout] = {}
         self._log = Throttled(logger)
         self.denied: dict[str, str] = {}
         """What the server said to refuse a message, by its subject; the last ones."""
@@ -294,8 +294,8 @@ class NatsConnection:
         async with self._declaring:
             topic = self._topics.get(subject)
             if topic is None:
-                topic = _Topic()
-                topic.subscription = await self._subscribe(subject, "", topic.accept)
+                topic = Fanout()
+                topic.subscription = await self._subscribe(subject, "", topic.deliver)
                 self._topics[subject] = topic
             topic.sinks = (*topic.sinks, sink)
         return partial(self._forget, subject, topic, sink)
@@ -314,7 +314,7 @@ class NatsConnection:
         with contextlib.suppress(nats.errors.Error):
             await subscription.unsubscribe()
 
-    async def _forget(self, subject: str, topic: _Topic, sink: Sink) -> None:
+    async def _forget(self, subject: str, topic: Fanout, sink: Sink) -> None:
         async with self._declaring:
             topic.sinks = tuple(each for each in topic.sinks if each is not sink)
             if topic.sinks or self._topics.get(subject) is not topic:
@@ -386,21 +386,6 @@ class NatsConnection:
             logger.warning("The NATS server at %s is gone. It is tried again every %g s.", where, RECONNECT_WAIT_S)
         for on_link in tuple(self._users.values()):
             await on_link(back)
-
-
-class _Topic:
-    """One subscription and the sinks that share it."""
-
-    __slots__ = ("sinks", "subscription")
-
-    def __init__(self) -> None:
-        self.sinks: tuple[Sink, ...] = ()
-        self.subscription: Any = None
-
-    def accept(self, message: Msg) -> None:
-        """Hand a message to every sink."""
-        for sink in self.sinks:
-            sink(message)
 
 
 _CONNECTIONS: dict[tuple[asyncio.AbstractEventLoop, LinkConfig], NatsConnection] = {}
