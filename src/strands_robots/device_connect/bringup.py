@@ -499,11 +499,11 @@ def _forget_warnings(name: str) -> None:
 
 
 def _depart_at_exit() -> None:
-    own = {runtime: host for runtime, host in _hosts.items() if host.home is not None}
-    for host in own.values():
+    started = {runtime: host for runtime, host in _hosts.items() if host.home is not None}
+    for host in started.values():
         with contextlib.suppress(RuntimeError):  # its loop closed a moment ago
             host.loop.call_soon_threadsafe(host.end.set)
     until = time.monotonic() + EXIT_TIMEOUT_S
-    for runtime, host in own.items():
+    for runtime, host in started.items():
         if not host.ended.wait(max(until - time.monotonic(), 0.0)):
             logger.warning("Device %s could not announce its departure.", runtime.device_id)

@@ -29,14 +29,14 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-BEAT_S = 1.0
-"""Seconds between two beats of a process."""
+PROCESS_HEARTBEAT_S = 1.0
+"""Seconds between two heartbeats of a process."""
 
 HEARTBEAT_S = 5.0
 """Seconds between two heartbeats of a single device, by the framework's default."""
 
 MARK = b'"devices"'
-"""Part of every beat; a heartbeat without it is that of one device."""
+"""Part of every heartbeat of a process; one without it is that of one device."""
 
 KEEP_S = 60.0
 """Seconds that the collector goes on after the last question of a device."""
@@ -78,7 +78,7 @@ def presence_builder(
         identity: stays as it is.
         status: returns it, for each message anew.
     """
-    device, own = json.dumps(device_id), json.dumps(identity)
+    device, stated = json.dumps(device_id), json.dumps(identity)
 
     def build() -> bytes:
         now = time.time()
@@ -87,20 +87,20 @@ def presence_builder(
             "ts": now,
             "d2d": True,
         }
-        described = f'{{"device_id": {device}, "capabilities": {capabilities()}, "identity": {own}'
+        described = f'{{"device_id": {device}, "capabilities": {capabilities()}, "identity": {stated}'
         return f"{described}, {json.dumps(changing)[1:]}".encode()
 
     return build
 
 
 @dataclass(frozen=True, slots=True)
-class Beating:
-    """One device of a beat.
+class LivingDevice:
+    """One device of a process's heartbeat.
 
     Attributes:
         device_id: its id.
         messaging: its connected client.
-        lives: returns False while its robot cannot be read; the beat leaves it out then.
+        lives: returns False while its robot cannot be read; the heartbeat leaves it out then.
         fields: returns what a heartbeat of this device carries.
     """
 
@@ -110,35 +110,35 @@ class Beating:
     fields: Callable[[], Mapping[str, Any]]
 
 
-class Beat:
-    """The beat of one loop and one link."""
+class ProcessHeartbeat:
+    """The heartbeat of one loop and one link: which of their devices live."""
 
     def __init__(self, link: LinkConfig) -> None:
         self._link = link
-        self._devices: dict[str, Beating] = {}
+        self._devices: dict[str, LivingDevice] = {}
         self._task: asyncio.Task[None] | None = None
 
-    def join(self, device: Beating) -> None:
+    def join(self, device: LivingDevice) -> None:
         """Name ``device`` from now on."""
         self._devices[device.device_id] = device
         if self._task is None:
-            self._task = asyncio.create_task(self._run(), name="beat")
+            self._task = asyncio.create_task(self._run(), name="process-heartbeat")
 
-    def leave(self, device: Beating) -> None:
-        """Name ``device`` no more; the last one ends the beat."""
+    def leave(self, device: LivingDevice) -> None:
+        """Name ``device`` no more; the last one ends the heartbeat."""
         if self._devices.get(device.device_id) is device:
             del self._devices[device.device_id]
         if not self._devices and self._task is not None:
             self._task.cancel()
             self._task = None
-            _BEATS.pop((asyncio.get_running_loop(), self._link), None)
+            _HEARTBEATS.pop((asyncio.get_running_loop(), self._link), None)
 
     async def _run(self) -> None:
         loop = asyncio.get_running_loop()
         due = loop.time()
         while True:
             await self._send()
-            due = max(due + BEAT_S, loop.time())
+            due = max(due + PROCESS_HEARTBEAT_S, loop.time())
             await asyncio.sleep(due - loop.time())
 
     async def _send(self) -> None:
@@ -147,26 +147,26 @@ class Beat:
             return
         first = living[0]
         try:
-            beat = {"device_id": first.device_id, "ts": time.time(), **first.fields()}
-            beat["devices"] = [each.device_id for each in living]
+            message = {"device_id": first.device_id, "ts": time.time(), **first.fields()}
+            message["devices"] = [each.device_id for each in living]
             await first.messaging.publish(
-                f"device-connect.{self._link.tenant}.{first.device_id}.heartbeat", json.dumps(beat).encode()
+                f"device-connect.{self._link.tenant}.{first.device_id}.heartbeat", json.dumps(message).encode()
             )
         except (MessagingError, TypeError, ValueError) as exc:
-            # Without a link there is nobody to tell; what a robot's state makes unsendable is told by its heartbeat.
-            logger.debug("a beat was not sent: %s", exc)
+            # Without a link there is no reader; the device's own heartbeat reports a state that cannot be sent.
+            logger.debug("a heartbeat was not sent: %s", exc)
 
 
-_BEATS: dict[tuple[asyncio.AbstractEventLoop, LinkConfig], Beat] = {}
+_HEARTBEATS: dict[tuple[asyncio.AbstractEventLoop, LinkConfig], ProcessHeartbeat] = {}
 
 
-def beat_of(link: LinkConfig) -> Beat:
-    """Return the running loop's beat on ``link``."""
-    return _BEATS.setdefault((asyncio.get_running_loop(), link), Beat(link))
+def process_heartbeat(link: LinkConfig) -> ProcessHeartbeat:
+    """Return the running loop's heartbeat on ``link``."""
+    return _HEARTBEATS.setdefault((asyncio.get_running_loop(), link), ProcessHeartbeat(link))
 
 
-def named_in(data: bytes) -> Iterable[str]:
-    """Return the devices in a beat; none for the heartbeat of a single one."""
+def devices_in(data: bytes) -> Iterable[str]:
+    """Return the devices in the heartbeat of a process; none for the heartbeat of a single one."""
     if MARK not in data:
         return ()
     devices = json_object(data).get("devices")
@@ -322,18 +322,18 @@ class PresenceView:
         known = await collector.list_devices()
         add(collector)
         if replayed is not None:
-            told = self._others(replayed)
+            report = self._others(replayed)
             for each in known:
-                result = told(str(each.get("device_id", "")))
+                result = report(str(each.get("device_id", "")))
                 if asyncio.iscoroutine(result):
                     await result
 
     def _others(self, callback: OnPeer) -> OnPeer:
-        def told(device_id: str) -> Any:
+        def report(device_id: str) -> Any:
             # The collector has no way to take a listener away again.
             return callback(device_id) if device_id != self._device_id and self._collector is not None else None
 
-        return told
+        return report
 
     async def _settled(self) -> Any:
         collector = await self._asked()

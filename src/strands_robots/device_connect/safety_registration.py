@@ -82,14 +82,14 @@ def register_served(driver: DeviceDriver, runtime: Any) -> SafetyRegistration | 
     """
     link = link_of(runtime)
     device_id = unreserved("device_id", runtime.device_id, RESERVED_DEVICE_IDS)
-    made = register_safety(
+    registration = register_safety(
         device_id, driver, link, named=stated_id(runtime), tenant=runtime.tenant, cell=cell_of(driver)
     )
-    if made is not None:
+    if registration is not None:
         try:
-            made.open()
+            registration.open()
         except BaseException:
-            made.leave()
+            registration.leave()
             raise
     if link is None:
         logger.warning(
@@ -97,7 +97,7 @@ def register_served(driver: DeviceDriver, runtime: Any) -> SafetyRegistration | 
             "locked by the runtime's events, and answers no controller.",
             runtime.device_id,
         )
-    return made
+    return registration
 
 
 def cell_of(driver: DeviceDriver, cell: str | None = None) -> str:
@@ -111,9 +111,9 @@ def cell_of(driver: DeviceDriver, cell: str | None = None) -> str:
 
 
 def _key(device_id: str, driver: DeviceDriver, robot: Any, *, named: bool) -> str | None:
-    own = getattr(robot, "safety_key", None)
-    if isinstance(own, str) and own:
-        return own
+    stated = getattr(robot, "safety_key", None)
+    if isinstance(stated, str) and stated:
+        return stated
     if getattr(driver, "hardware", True):
         return hardware_key(str(getattr(robot, "tool_name_str", "robot")), device_id if named else "unnamed")
     return simulation_key(device_id) if named else None

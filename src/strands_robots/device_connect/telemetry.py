@@ -97,7 +97,7 @@ async def report_changes(
     most_hz: float,
     same: Callable[[T, T], bool] = operator.eq,
 ) -> None:
-    """Tell what ``look`` returns, whenever it is another one. Ends when cancelled.
+    """Report what ``look`` returns, whenever it is another one. Ends when cancelled.
 
     Args:
         look: returns the state, or None when there is none to tell.
@@ -108,25 +108,25 @@ async def report_changes(
         same: returns True for two states of which the second one need not be told.
     """
     loop = asyncio.get_running_loop()
-    told: T | None = None
+    reported: T | None = None
     due = loop.time()
     while True:
         changed.clear()
         began = loop.time()
         state = await look()
-        moved = state is not None and (told is None or not same(told, state))
+        moved = state is not None and (reported is None or not same(reported, state))
         if state is not None and moved:
             await tell(state)
         if state is None or moved:
-            told = state
+            reported = state
         hz = rate(moved)
         if hz > 0:
             due = max(due + 1.0 / hz, loop.time())
             woken = await _set_within(changed, due - loop.time())
         else:
             while not (woken := await _set_within(changed, AGAIN_S)):
-                if told is not None:
-                    await tell(told)
+                if reported is not None:
+                    await tell(reported)
         if woken:
             await asyncio.sleep(max(began + 1.0 / most_hz - loop.time(), 0.0))
             due = loop.time()
