@@ -16,7 +16,7 @@ from strands_robots.audit.journal import Journal
 from strands_robots.audit.verification import verify
 from strands_robots.audit.witness import WITNESS, compare, stated_head, witnessed
 from strands_robots.safety.controller import SafetyController
-from strands_robots.safety.estop_listener import ESTOP, VERDICT, notification
+from strands_robots.safety.stop_link import ESTOP, VERDICT, notification
 
 HEAD = {"log": "a" * 32, "count": 7, "last": "b" * 64}
 

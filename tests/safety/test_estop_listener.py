@@ -16,8 +16,8 @@ from strands_robots.safety.estop_listener import (
     FailureBudget,
     FairQueue,
     LatchAnswers,
-    StopEvent,
 )
+from strands_robots.safety.stop_link import StopEvent
 
 
 def drained(events: FairQueue) -> list[StopEvent]:

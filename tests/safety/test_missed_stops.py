@@ -21,7 +21,6 @@ from strands_robots.safety import ed25519, missed_stops
 from strands_robots.safety.answer_slots import AnswerSlots
 from strands_robots.safety.clearance import clear_here
 from strands_robots.safety.controller import SafetyController
-from strands_robots.safety.estop_listener import ESTOP, VERDICT, notification
 from strands_robots.safety.lockout import MAX_EPOCHS
 from strands_robots.safety.missed_stops import (
     ANSWER,
@@ -37,6 +36,7 @@ from strands_robots.safety.network_key import DEVICE_CONNECT, NetworkKey
 from strands_robots.safety.orders import StopRules, new_epoch, params_of
 from strands_robots.safety.originals import ORIGINAL_MAX_BYTES, STOPS_MAX, Original, Originals
 from strands_robots.safety.persistence import LockoutStore, ResumedEpochs
+from strands_robots.safety.stop_link import ESTOP, VERDICT, notification
 from strands_robots.state_files import uptime
 
 Join = Callable[..., BusMachine]

@@ -12,7 +12,7 @@ from fixtures.waiting import eventually
 
 from strands_robots.safety import ed25519, standing_roster
 from strands_robots.safety.consoles import console_key
-from strands_robots.safety.estop_listener import ESTOP, VERDICT, FailureBudget, notification
+from strands_robots.safety.estop_listener import FailureBudget
 from strands_robots.safety.network_key import DEVICE_CONNECT, NetworkKey
 from strands_robots.safety.orders import new_epoch, signed_stop
 from strands_robots.safety.roster import Roster, RosterRow
@@ -28,6 +28,7 @@ from strands_robots.safety.roster_report import (
 from strands_robots.safety.sightings import Known
 from strands_robots.safety.standing_roster import StandingRoster
 from strands_robots.safety.statements import Purpose, signed
+from strands_robots.safety.stop_link import ESTOP, VERDICT, notification
 
 NETWORK = NetworkKey.of(DEVICE_CONNECT, ["tcp/127.0.0.1:7447"])
 

@@ -10,7 +10,7 @@ import pytest
 
 from strands_robots.safety import controller as controller_module
 from strands_robots.safety.controller import SafetyController
-from strands_robots.safety.estop_listener import OnEvent, OnState
+from strands_robots.safety.stop_link import OnEvent, OnState
 from strands_robots.safety.turns import SWITCH_S, LongTurns, PausedCollector, ShortTurns
 
 

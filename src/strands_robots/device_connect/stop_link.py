@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING, Any
 from device_connect_edge.messaging import MessagingError
 
 from strands_robots.device_connect.backends import LinkConfig
-from strands_robots.safety.estop_listener import CHECK_IN_ANSWER, ESTOP, VERDICT, OnEvent, OnState, StopLink
 from strands_robots.safety.missed_stops import ANSWER, QUESTION
 from strands_robots.safety.orders import PARSED_MAX_BYTES
 from strands_robots.safety.roster_report import STOP_ROSTER
+from strands_robots.safety.stop_link import CHECK_IN_ANSWER, ESTOP, VERDICT, OnEvent, OnState, StopLink
 from strands_robots.stop_log import stop_logger
 
 if TYPE_CHECKING:

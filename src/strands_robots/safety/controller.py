@@ -16,18 +16,7 @@ from typing import Any
 
 from strands_robots.audit import log_witness
 from strands_robots.safety.answers import ANSWERS_MAX, Answer, Answers, Received
-from strands_robots.safety.estop_listener import (
-    CHECK_IN,
-    CHECK_IN_ANSWER,
-    ESTOP,
-    VERDICT,
-    FailureBudget,
-    OnEvent,
-    RenewableLink,
-    ReportingLink,
-    StopLink,
-    notification,
-)
+from strands_robots.safety.estop_listener import FailureBudget
 from strands_robots.safety.head_witness import HeadWitness
 from strands_robots.safety.identity import KeyFileError
 from strands_robots.safety.missed_stops import ANSWER, QUESTION, MissedStops
@@ -48,6 +37,17 @@ from strands_robots.safety.scope import (
 )
 from strands_robots.safety.silence import Sending
 from strands_robots.safety.statements import Proof, Purpose, proof_of
+from strands_robots.safety.stop_link import (
+    CHECK_IN,
+    CHECK_IN_ANSWER,
+    ESTOP,
+    VERDICT,
+    OnEvent,
+    RenewableLink,
+    ReportingLink,
+    StopLink,
+    notification,
+)
 from strands_robots.safety.turns import shorten_turns
 from strands_robots.stop_log import stop_logger
 from strands_robots.utils import ValidationError, device_id, number, shown

@@ -8,14 +8,12 @@ the stop executor: two hand-offs.
 from __future__ import annotations
 
 import functools
-import json
 import secrets
 import threading
 import time
-import uuid
 from collections import deque
-from collections.abc import Callable, Collection, Hashable, Mapping
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from collections.abc import Callable, Hashable, Mapping
+from typing import Any, NamedTuple
 
 from strands_robots.audit import audit_head, own_log_id, queue_safety_event
 from strands_robots.safety.awake import AWAKE
@@ -24,30 +22,28 @@ from strands_robots.safety.head_witness import CheckInAnswers, HeadWitness
 from strands_robots.safety.identity import SigningIdentity
 from strands_robots.safety.missed_stops import ANSWER, QUESTION, MissedStops
 from strands_robots.safety.network_key import NetworkKey
-from strands_robots.safety.orders import (
-    LISTENER,
-    PARSED_MAX_BYTES,
-    RobotReport,
-    StopOrder,
-    StopRefused,
-    StopRules,
-    params_of,
-)
+from strands_robots.safety.orders import LISTENER, PARSED_MAX_BYTES, RobotReport, StopOrder, StopRefused, StopRules
 from strands_robots.safety.plane import SafetyPlane, plane
 from strands_robots.safety.question_ports import Member, RobotsPort
 from strands_robots.safety.sighting_file import own_run
 from strands_robots.safety.statements import Purpose, signed
+from strands_robots.safety.stop_link import (
+    CHECK_IN,
+    CHECK_IN_ANSWER,
+    ESTOP,
+    EVENTS,
+    JSON_RPC,
+    VERDICT,
+    StopCodec,
+    StopEvent,
+    StopLink,
+    notification,
+)
 from strands_robots.safety.turns import shorten_turns
 from strands_robots.stop_log import stop_logger
 from strands_robots.utils import shown
 
 logger = stop_logger(__name__)
-
-ESTOP = "emergencyStop"
-VERDICT = "emergencyStopVerdict"
-CHECK_IN = "safetyCheckIn"
-CHECK_IN_ANSWER = "safetyCheckInAnswer"
-EVENTS = (ESTOP, CHECK_IN, CHECK_IN_ANSWER, QUESTION, ANSWER)
 
 ANSWER_AGAIN_S = 0.01
 """Seconds between two answers of a robot to the same stop."""
@@ -74,71 +70,6 @@ REFUSED_PAUSE_S = 0.0005
 
 LATCH_ANSWERS_PER_S = 200
 LATCH_ANSWERS_REMEMBERED = 4096
-
-OnEvent = Callable[[str, str, bytes | int], None]
-"""Called with event, source and bytes on a thread of the link; it must return at once and may not raise.
-
-In place of more than :data:`~.orders.PARSED_MAX_BYTES` a link gives their number.
-"""
-
-OnState = Callable[[bool], None]
-"""Called with the link's state, True for up, on a thread of the link, at each change.
-
-Also with True while it is up, when a connection is new or a peer that was lost is back.
-"""
-
-
-class StopLink(Protocol):
-    """A connection that carries stops and nothing else, supplied by a network.
-
-    No method blocks on the network, and none raises for the connection's state.
-    """
-
-    @property
-    def up(self) -> bool:
-        """True while a peer can be reached."""
-
-    def open(self, events: Collection[str], on_event: OnEvent, on_state: OnState) -> None:
-        """Subscribe to these events of the tenant; return before the link is up."""
-
-    def publish(self, source: str, event: str, payload: bytes) -> bool:
-        """Send as ``source`` now; False, without a later try, when the link is down."""
-
-    def close(self) -> None:
-        """Close the connection and end the link's thread. Safe to call twice."""
-
-
-@runtime_checkable
-class RenewableLink(Protocol):
-    """A link that can be made anew while it is used."""
-
-    def renew(self) -> None:
-        """Open a connection in place of the present one; return at once."""
-
-
-@runtime_checkable
-class ReportingLink(Protocol):
-    """A link of a network that tells a sender what it refuses."""
-
-    @property
-    def denied(self) -> str:
-        """The broker's refusal of a stop of this connection, or ""."""
-
-
-def notification(event: str, params: Mapping[str, Any], event_id: str = "") -> bytes:
-    """Encode an event as a JSON-RPC 2.0 notification with ``event_id`` and ``ts``."""
-    stamp = {"event_id": event_id or uuid.uuid4().hex, "ts": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())}
-    return json.dumps({"jsonrpc": "2.0", "method": event, "params": {**params, **stamp}}).encode()
-
-
-class StopEvent(NamedTuple):
-    """Event from a link: name, source, bytes, monotonic s at receipt, network."""
-
-    event: str
-    source: str
-    payload: bytes | int
-    at: float
-    network: str = ""
 
 
 class _Bucket:
@@ -201,9 +132,18 @@ class FairQueue:
         """Return True when this source has a bucket of its own."""
         return source in self._vouched
 
-    def put(self, event: str, source: str, payload: bytes | int, *, urgent: bool = True, network: str = "") -> None:
+    def put(
+        self,
+        event: str,
+        source: str,
+        payload: bytes | int,
+        *,
+        urgent: bool = True,
+        network: str = "",
+        codec: StopCodec = JSON_RPC,
+    ) -> None:
         """Add an event; of those that are not urgent, a full bucket drops the new."""
-        received = StopEvent(event, source, payload, time.monotonic(), network)
+        received = StopEvent(event, source, payload, time.monotonic(), network, codec)
         bucket = self._vouched.get(source)
         if bucket is None:
             # Within one text: the hash of a pair keeps the same names together whatever the salt.
@@ -349,8 +289,11 @@ class ListenerRegistration:
         *,
         network: NetworkKey | None,
         was_here: bool,
+        codec: StopCodec,
+        asks: bool,
     ) -> None:
         self.robot_id = robot_id
+        self.codec, self.asks = codec, asks
         self.network = network
         self.was_here = was_here
         self.identity = identity
@@ -367,6 +310,14 @@ class ListenerRegistration:
         self._listener.unregister(self)
 
 
+class OpenLink(NamedTuple):
+    """An open link: its network, its codec, and the missed stops of its devices."""
+
+    network: str
+    codec: StopCodec
+    missed: MissedStops
+
+
 class EstopListener:
     """Receives every ``emergencyStop`` of the tenant and has the plane act on it.
 
@@ -380,7 +331,7 @@ class EstopListener:
         self._make_rules = rules
         self._registering = threading.Lock()
         self._registrations: tuple[ListenerRegistration, ...] = ()
-        self._open: dict[Hashable, MissedStops] = {}
+        self._open: dict[Hashable, OpenLink] = {}
         self._refusals = RefusalLog()
         self._budget = FailureBudget()
         self._latch_answers = LatchAnswers()
@@ -410,12 +361,16 @@ class EstopListener:
         opened: bool = True,
         network: NetworkKey | None = None,
         was_here: bool = False,
+        codec: StopCodec = JSON_RPC,
+        asks: bool = True,
     ) -> ListenerRegistration:
         """Serve a robot over the link of ``key``; ``make`` the link if it is new.
 
         Args:
             network: of the link; missed stops are asked for and answered within it alone, and not without one.
             was_here: the robot was served from this machine in the ten minutes before.
+            codec: of the link's network; that of the first device counts for the link.
+            asks: False for what moves nothing, which asks for no missed stops and has no verdict to send.
             identity: returns what signs the robot's verdicts; None leaves them unsigned.
             opened: False to have a new link opened by :meth:`ListenerRegistration.open` only.
         """
@@ -424,7 +379,9 @@ class EstopListener:
                 self._start()
             link = next((each.link for each in self._registrations if each.key == key), None)
             made = make() if link is None else link
-            registration = ListenerRegistration(self, robot_id, key, made, identity, network=network, was_here=was_here)
+            registration = ListenerRegistration(
+                self, robot_id, key, made, identity, network=network, was_here=was_here, codec=codec, asks=asks
+            )
             self._registrations = (*self._registrations, registration)
         if opened:
             registration.open()
@@ -434,10 +391,12 @@ class EstopListener:
         """Open the link of a registration, unless it is open."""
         with self._registering:
             if registration in self._registrations and registration.key in self._open:
-                self._open[registration.key].started()
+                self._open[registration.key].missed.started()
             elif registration in self._registrations:
-                missed = self._open[registration.key] = self._missed_stops(registration)
-                receive = functools.partial(self.receive, network=_text(registration.network), missed=missed)
+                missed = self._missed_stops(registration)
+                link = OpenLink(_text(registration.network), registration.codec, missed)
+                self._open[registration.key] = link
+                receive = functools.partial(self.receive, link=link)
                 registration.link.open(EVENTS, receive, lambda up: missed.link_up() if up else missed.link_down())
 
     def unregister(self, registration: ListenerRegistration) -> None:
@@ -447,14 +406,14 @@ class EstopListener:
                 return
             self._registrations = tuple(each for each in self._registrations if each is not registration)
             last_of_link = all(each.key != registration.key for each in self._registrations)
-            missed = self._open.pop(registration.key, None) if last_of_link else None
+            opened = self._open.pop(registration.key, None) if last_of_link else None
             events, thread = (self._queue, self._thread) if not self._registrations else (None, None)
             if events is not None:
                 self._queue = self._thread = None
         if last_of_link:
             registration.link.close()
-        if missed is not None:
-            missed.close()
+        if opened is not None:
+            opened.missed.close()
         if events is not None:
             self._end_watch()
             self._end_short_turns()
@@ -469,51 +428,58 @@ class EstopListener:
 
     def awake(self) -> None:
         """Ask which stops were missed, after a time in which the process did not run."""
-        for missed in tuple(self._open.values()):
-            missed.ask("the process did not run for a while")
+        for link in tuple(self._open.values()):
+            link.missed.ask("the process did not run for a while")
 
-    def accept_params(
-        self,
-        source: str,
-        params: Mapping[str, Any],
-        path: str,
-        raw: bytes | int | None = None,
-        network: NetworkKey | None = None,
-    ) -> None:
-        """Act on a parsed emergency stop of another path; return at once.
+    def accept(self, stop: StopEvent, path: str, fields: Mapping[str, Any] | None = None) -> None:
+        """Act on an emergency stop of any network; return at once.
 
-        A source whose signatures keep failing is not checked again here for up to a second: its stops arrive at the
-        listener's own link as well.
+        The listener's thread calls it for what its links received. A network that receives stops over a further
+        connection calls it there: a source whose signatures keep failing is not checked again on that path for up to a
+        second, because its stops arrive at the listener's own link as well.
 
         Args:
-            source: who stops, as declared.
-            params: its parameters, as far as it has any.
             path: how it arrived.
-            raw: the message, or its number of bytes where it was too long to be read.
-            network: where it arrived.
+            fields: of its payload, where they were read already.
         """
-        if self._plane.under_way(params.get("estop_id")):
+        codec, source = stop.codec, stop.source
+        stated = codec.fields(stop.payload) if fields is None else fields
+        if self._plane.under_way(stated.get("estop_id")):
             return
-        if self._rules.signed and not self._budget.allows(source, time.monotonic()):
+        events = self._queue if path == LISTENER else None
+        if events is None and codec.vouches(self._rules) and not self._budget.allows(source, time.monotonic()):
             return
-        order = self._rules.order(source, params, path, raw, network=_text(network))
-        if isinstance(order, StopRefused):
-            self._budget.record(source, time.monotonic())
-            self._refusals.record(order, ESTOP)
-        else:
-            self._plane.begin(order, self._answer)
+        order = codec.order(self._rules, stop, stated, path)
+        if isinstance(order, StopOrder):
+            on_report = self._answer if codec.answers else _no_answer
+            codec.begun(order, stated, self._plane.begin(order, on_report))
+            if events is not None and codec.vouches(self._rules):
+                events.vouch(source)
+        elif order is not None:
+            if not codec.refused(order):
+                self._refusals.record(order, stop.event)
+            if events is None:
+                self._budget.record(source, time.monotonic())
+            elif not events.vouched_for(source):
+                # In a flood the link's thread needs the interpreter to receive what comes behind it.
+                time.sleep(REFUSED_PAUSE_S)
 
     def stop_here(self, order: StopOrder) -> None:
         """Act on a stop that a device of this process raises; return at once."""
         self._plane.begin(order, self._answer)
 
     def receive(
-        self, event: str, source: str, payload: bytes | int, network: str = "", missed: MissedStops | None = None
+        self,
+        event: str,
+        source: str,
+        payload: bytes | int,
+        link: OpenLink | None = None,
     ) -> None:
         """Take an event from a link's thread; returns at once."""
-        if missed is not None and event in (QUESTION, ANSWER):
-            missed.receive(event, source, payload)
+        if link is not None and event in (QUESTION, ANSWER):
+            link.missed.receive(event, source, payload)
             return
+        network, codec = ("", JSON_RPC) if link is None else (link.network, link.codec)
         events = self._queue
         if events is None:
             return
@@ -526,21 +492,20 @@ class EstopListener:
                 self._heads.record("", now)
                 events.put(event, source, payload, urgent=False)
             return
-        why = self._rules.source_refusal(source)
-        if why is None:
-            events.put(event, source, payload, urgent=event == ESTOP, network=network)
+        if not codec.names_source or self._rules.source_refusal(source) is None:
+            events.put(event, source, payload, urgent=event == ESTOP, network=network, codec=codec)
         elif self._refusals.due(source):
-            events.put(event, source, payload, urgent=False)
+            events.put(event, source, payload, urgent=False, codec=codec)
 
     def _missed_stops(self, registration: ListenerRegistration) -> MissedStops:
-        key, link = registration.key, registration.link
+        key, link, codec = registration.key, registration.link, registration.codec
 
         def members() -> list[Member]:
-            here = [each for each in self._registrations if each.key == key and each.network is not None]
+            here = [each for each in self._registrations if each.key == key and each.asks and each.network is not None]
             return [Member(each.robot_id, self._wire_id(each.robot_id), each.identity, each.was_here) for each in here]
 
         def publish(event: str, source: str, fields: Mapping[str, Any]) -> bool:
-            return link.publish(source, event, notification(event, fields))
+            return link.publish(source, event, codec.encode(event, fields))
 
         port = RobotsPort(
             self._plane,
@@ -549,8 +514,9 @@ class EstopListener:
             members=members,
             publish=publish,
             on_report=self._answer,
+            codec=codec,
         )
-        return MissedStops(port)
+        return MissedStops(port, codec.fields)
 
     def _start(self) -> None:
         self._rules = self._make_rules()
@@ -568,44 +534,32 @@ class EstopListener:
             try:
                 if received.event == CHECK_IN_ANSWER:
                     for first in self._registrations[:1]:
-                        self._witness.receive(received.source, params_of(received.payload), by=first.robot_id)
+                        fields = received.codec.fields(received.payload)
+                        self._witness.receive(received.source, fields, by=first.robot_id)
                     continue
                 if received.event == CHECK_IN:
                     if self._check_in(received) and self._rules.signed:
                         events.vouch(received.source)
                     continue
-                params = params_of(received.payload)
-                if self._plane.under_way(params.get("estop_id")):
-                    continue
-                order = self._rules.order(
-                    received.source, params, LISTENER, received.payload, received.at, network=received.network
-                )
-                if isinstance(order, StopRefused):
-                    self._refusals.record(order, received.event)
-                    if not events.vouched_for(received.source):
-                        # In a flood the link's thread needs the interpreter to receive what comes behind it.
-                        time.sleep(REFUSED_PAUSE_S)
-                else:
-                    self._plane.begin(order, self._answer)
-                    if self._rules.signed:
-                        events.vouch(received.source)
+                self.accept(received, LISTENER)
             except Exception:
                 logger.critical("The e-stop listener failed on an event of %s.", shown(received.source), exc_info=True)
 
     def _check_in(self, received: StopEvent) -> bool:
         """Record a check-in; False when it does not count."""
-        source, params = received.source, params_of(received.payload)
+        source, params = received.source, received.codec.fields(received.payload)
         why = self._check_ins.refusal(source, params)
         if why is not None:
             self._refusals.record(StopRefused(source, why), received.event)
             return False
         self._plane.checkin.record(source, received.at)
         self._rules.compare_clock(source, params, received.at)
-        for first in self._registrations[:1]:  # the robots of a process share one audit
+        # The robots of a process share one audit.
+        for first in [each for each in self._registrations if each.codec.answers][:1]:
             name = self._wire_id(first.robot_id)
             answer = self._check_in_answers.answer(name, params.get("estop_id"), first.identity())
             if answer is not None:
-                first.link.publish(name, CHECK_IN_ANSWER, notification(CHECK_IN_ANSWER, answer))
+                first.link.publish(name, CHECK_IN_ANSWER, first.codec.encode(CHECK_IN_ANSWER, answer))
         return True
 
     def _wire_id(self, robot_id: str) -> str:
@@ -634,7 +588,7 @@ class EstopListener:
         self._answered[key] = now
         _bound(self._answered)
         for each in self._registrations:
-            if each.robot_id == report.robot_id:
+            if each.robot_id == report.robot_id and each.codec.answers:
                 device_id = self._wire_id(report.robot_id)
                 each.link.publish(device_id, VERDICT, self._verdict(report, device_id, each.identity()))
 
@@ -659,6 +613,10 @@ class EstopListener:
 
 def _text(network: NetworkKey | None) -> str:
     return "" if network is None else network.text
+
+
+def _no_answer(report: RobotReport) -> None:
+    """Its network asks each robot for its verdict."""
 
 
 def _bound(remembered: dict[Any, Any]) -> None:

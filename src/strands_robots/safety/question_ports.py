@@ -18,9 +18,10 @@ from strands_robots.safety.identity import (
     local_name,
 )
 from strands_robots.safety.network_key import NetworkKey
-from strands_robots.safety.orders import MISSED, RobotReport, StopOrder, StopRefused, StopRules, params_of, stated_epoch
+from strands_robots.safety.orders import MISSED, RobotReport, StopOrder, StopRefused, StopRules
 from strands_robots.safety.originals import ORIGINAL_MAX_BYTES, STOPS_MAX, Original, Originals
 from strands_robots.safety.plane import SafetyPlane
+from strands_robots.safety.stop_link import ESTOP, JSON_RPC, StopCodec, StopEvent
 from strands_robots.state_files import uptime
 from strands_robots.stop_log import stop_logger
 
@@ -96,6 +97,7 @@ class RobotsPort:
         members: returns those that are served there now.
         publish: sends fields as an event of a name on that network.
         on_report: answers a stop, as for one that came directly.
+        codec: reads the stops of that network.
     """
 
     def __init__(
@@ -107,8 +109,10 @@ class RobotsPort:
         members: Callable[[], Sequence[Member]],
         publish: Callable[[str, str, Mapping[str, Any]], bool],
         on_report: Callable[[RobotReport], None],
+        codec: StopCodec = JSON_RPC,
     ) -> None:
         self._plane, self._rules, self._network = of, rules, "" if network is None else network.text
+        self._codec = codec
         self._members, self._publish, self._on_report = members, publish, on_report
         self._keys = KnownKeys(DEFAULT_TENANT if network is None else network.tenant, rules.keys)
 
@@ -145,23 +149,25 @@ class RobotsPort:
             return False
         if self._rules.source_refusal(source) is not None:
             return False
-        params = params_of(payload)
-        epoch = stated_epoch(source, params)
+        codec = self._codec
+        fields = codec.fields(payload)
+        epoch = codec.epoch(source, fields)
         if not epoch:
             return False
+        stop = StopEvent(ESTOP, source, payload, time.monotonic(), self._network, codec)
         return self.lock(
             epoch,
-            lambda: self._rules.order(source, params, MISSED, payload, network=self._network, age_s=age_s),
+            lambda: codec.order(self._rules, stop, fields, MISSED, age_s),
             Stated(payload, age_s, answerer),
         )
 
-    def lock(self, epoch: str, decide: Callable[[], StopOrder | StopRefused], stated: Stated) -> bool:
+    def lock(self, epoch: str, decide: Callable[[], StopOrder | StopRefused | None], stated: Stated) -> bool:
         """Lock by a missed stop unless all know it; False when it does not count."""
         if all(each.latch.knows(epoch) for each in self._plane.robots.values()):
             self._plane.stated_again(self._network, epoch, stated.payload, stated.age_s)
             return True
         order = decide()
-        if isinstance(order, StopRefused):
+        if not isinstance(order, StopOrder):
             return False
         run = self._plane.begin(order, self._on_report)
         for robot_id in run.robot_ids if run is not None else ():

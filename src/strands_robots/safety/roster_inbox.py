@@ -75,7 +75,7 @@ class RosterInbox:
                 trusted = frozenset()
                 continue
             trusted = trusted or trusted_controllers()
-            fields = {} if isinstance(event.payload, int) else self._read(event.payload)
+            fields = self._read(event.payload) if isinstance(event.payload, bytes) else {}
             report = read_report(event.source, fields, trusted)
             with self._lock:
                 on_report = None if report is None else self._stops.get(report.estop_id)

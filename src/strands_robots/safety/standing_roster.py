@@ -13,7 +13,7 @@ from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety import ed25519
 from strands_robots.safety.answers import ANSWERS_MAX, Answers, Received
 from strands_robots.safety.consoles import console_key
-from strands_robots.safety.estop_listener import ESTOP, FailureBudget
+from strands_robots.safety.estop_listener import FailureBudget
 from strands_robots.safety.identity import SigningIdentity
 from strands_robots.safety.orders import StopRules, params_of, stated_epoch
 from strands_robots.safety.roster import Roster, RosterRow
@@ -21,6 +21,7 @@ from strands_robots.safety.roster_report import report_fields
 from strands_robots.safety.scope import EVERY_ROBOT, SCOPE, Scope
 from strands_robots.safety.sightings import Known
 from strands_robots.safety.statements import Purpose, signed
+from strands_robots.safety.stop_link import ESTOP
 from strands_robots.safety.stop_roster import counts
 from strands_robots.stop_log import stop_logger
 

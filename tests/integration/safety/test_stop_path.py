@@ -14,8 +14,9 @@ from fixtures.waiting import eventually
 from strands_robots.device_connect.backends import LinkConfig
 from strands_robots.device_connect.stop_link import stop_link
 from strands_robots.hardware import HardwareRobot
-from strands_robots.safety.estop_listener import ESTOP, EstopListener, notification
+from strands_robots.safety.estop_listener import EstopListener
 from strands_robots.safety.orders import new_epoch
+from strands_robots.safety.stop_link import ESTOP, notification
 
 ARCHITECTURE = Path(__file__).parents[3] / "docs" / "architecture.md"
 
