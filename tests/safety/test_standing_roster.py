@@ -11,15 +11,15 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from fixtures.waiting import eventually
 
 from strands_robots.safety import ed25519, standing_roster
-from strands_robots.safety.consoles import console_key
 from strands_robots.safety.estop_listener import FailureBudget
+from strands_robots.safety.identity import console_key
 from strands_robots.safety.network_key import DEVICE_CONNECT, NetworkKey
 from strands_robots.safety.orders import new_epoch, signed_stop
 from strands_robots.safety.roster import Roster, RosterRow
-from strands_robots.safety.roster_inbox import RosterInbox
 from strands_robots.safety.roster_report import (
     REPORT_MAX_BYTES,
     STOP_ROSTER,
+    RosterInbox,
     RosterReport,
     read_report,
     report_fields,

@@ -36,8 +36,7 @@ from strands_robots.device_connect.safety_registration import (
 from strands_robots.device_connect.state_reports import report_changes, sweep
 from strands_robots.device_connect.telemetry import RolloutPump
 from strands_robots.envelope import Envelope, error, jsonable, success
-from strands_robots.safety.approval import Approval
-from strands_robots.safety.authorization import ANONYMOUS, Authorization, caller_name
+from strands_robots.safety.authorization import ANONYMOUS, Approval, Authorization, caller_name
 from strands_robots.safety.gate import MotionRequest
 from strands_robots.safety.lockout import LockoutLatch
 from strands_robots.safety.orders import REASON_MAX, epoch_of

@@ -19,10 +19,10 @@ from strands_robots.envelope import Envelope
 from strands_robots.safety.estop_listener import ListenerRegistration, estop_listener
 from strands_robots.safety.gate import MotionGate
 from strands_robots.safety.identity import DEFAULT_TENANT, SigningIdentity, local_name, robot_identity
+from strands_robots.safety.lockout import is_epoch
 from strands_robots.safety.orders import REASON_MAX, StopOrder, epoch_of
 from strands_robots.safety.persistence import hardware_key, simulation_key
 from strands_robots.safety.plane import Registered, plane
-from strands_robots.safety.resume import is_epoch
 from strands_robots.safety.scope import own_cell
 from strands_robots.safety.sightings import sightings
 from strands_robots.safety.statements import Purpose, signed

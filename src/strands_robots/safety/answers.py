@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from strands_robots.safety.clocks import RoundTrip, seconds_of
+from strands_robots.safety.orders import RoundTrip, seconds_of
 from strands_robots.safety.statements import Proof, Purpose, proof_of
 
 ANSWERS_MAX = 4096

@@ -16,16 +16,15 @@ from typing import Any
 
 from strands_robots.audit import log_witness
 from strands_robots.safety.answers import ANSWERS_MAX, Answer, Answers, Received
+from strands_robots.safety.checkin import HeadWitness
 from strands_robots.safety.estop_listener import FailureBudget
-from strands_robots.safety.head_witness import HeadWitness
 from strands_robots.safety.identity import KeyFileError
 from strands_robots.safety.missed_stops import ANSWER, QUESTION, MissedStops
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.orders import REASON_MAX, answered_field, new_epoch, params_of, signed_stop
-from strands_robots.safety.presses import Press, Presses
 from strands_robots.safety.question_ports import ControllerPort
-from strands_robots.safety.roster_inbox import OnReport, RosterInbox
-from strands_robots.safety.roster_report import STOP_ROSTER
+from strands_robots.safety.roster import Sending
+from strands_robots.safety.roster_report import STOP_ROSTER, OnReport, RosterInbox
 from strands_robots.safety.scope import (
     EVERY_ROBOT,
     WIDEN_S,
@@ -35,7 +34,6 @@ from strands_robots.safety.scope import (
     none_known,
     report_widened,
 )
-from strands_robots.safety.silence import Sending
 from strands_robots.safety.statements import Proof, Purpose, proof_of
 from strands_robots.safety.stop_link import (
     CHECK_IN,
@@ -606,3 +604,31 @@ class _Running:
         return Progress(
             self.estop_id, answers, open_, link_up, elapsed_ms, self.left_ms, alarms, self.scope, self.widened
         )
+
+
+PRESSES_MAX = 64
+"""Presses remembered, so that a stop that goes on under its id keeps the time of its press."""
+
+
+@dataclass(frozen=True, slots=True)
+class Press:
+    """The moment of a press, in monotonic and in wall-clock seconds."""
+
+    at: float
+    wall: float
+
+
+class Presses:
+    """The latest presses by the ids of their stops; thread-safe."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._presses: dict[str, Press] = {}
+
+    def note(self, estop_id: str) -> Press:
+        """Record the press of a stop, once; every later call returns the same moment."""
+        with self._lock:
+            press = self._presses.setdefault(estop_id, Press(time.monotonic(), time.time()))
+            while len(self._presses) > PRESSES_MAX:
+                del self._presses[next(iter(self._presses))]
+        return press

@@ -17,8 +17,7 @@ from typing import Any, NamedTuple
 
 from strands_robots.audit import audit_head, own_log_id, queue_safety_event
 from strands_robots.safety.awake import AWAKE
-from strands_robots.safety.checkin import CheckInRules
-from strands_robots.safety.head_witness import CheckInAnswers, HeadWitness
+from strands_robots.safety.checkin import CheckInAnswers, CheckInRules, HeadWitness
 from strands_robots.safety.identity import SigningIdentity
 from strands_robots.safety.missed_stops import ANSWER, QUESTION, MissedStops
 from strands_robots.safety.network_key import NetworkKey

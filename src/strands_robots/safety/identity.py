@@ -19,6 +19,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
+from strands_robots import settings
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety import ed25519
 from strands_robots.safety.network_key import NetworkKey
@@ -455,3 +456,31 @@ def _write_once(path: Path, content: bytes) -> None:
             os.link(draft, path)
     finally:
         draft.unlink()
+
+
+PUBLIC_KEYS = "STRANDS_MESH_CONSOLE_PUBLIC_KEYS"
+
+
+def console_key() -> KeyFile:
+    """Return the file with the key of this user's consoles on this machine."""
+    return KeyFile("consoles", "console")
+
+
+def enrolled_consoles() -> EnrolledKeys:
+    """Return the file with the public keys of consoles on other machines."""
+    return EnrolledKeys(state_dir() / "consoles")
+
+
+def stated_consoles() -> frozenset[bytes]:
+    """Return the public keys that the environment names."""
+    return frozenset(ed25519.public_keys(settings.items(PUBLIC_KEYS), PUBLIC_KEYS))
+
+
+def kept_consoles() -> frozenset[bytes]:
+    """Return the own public key, if there is one, and the enrolled ones.
+
+    Raises:
+        KeyFileError, OSError: a key file cannot be used.
+    """
+    own = console_key().load()
+    return frozenset({*enrolled_consoles().load().values(), *([own.public] if own is not None else [])})

@@ -8,6 +8,7 @@ signed resume can name and only an operator at the machine clears.
 from __future__ import annotations
 
 import math
+import re
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
@@ -45,6 +46,14 @@ Span = tuple[float, float]
 
 ANY_TIME: Span = (LONG_AGO, math.inf)
 """Times of the stops that an overflow stands for, where none is known."""
+
+
+_HEX32 = re.compile(r"[0-9a-f]{32}\Z")
+
+
+def is_epoch(value: object) -> bool:
+    """True for 32 lower-case hex digits."""
+    return isinstance(value, str) and bool(_HEX32.match(value))
 
 
 @dataclass(frozen=True, slots=True)

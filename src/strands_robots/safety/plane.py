@@ -15,16 +15,22 @@ from strands_robots import settings
 from strands_robots.audit import queue_safety_event
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.safety.checkin import CheckIn
-from strands_robots.safety.clearance import CLEARED, LEFT, NOT_KEPT, NOT_LOCKED, ClearanceInbox
 from strands_robots.safety.gate import MotionGate
 from strands_robots.safety.lockout import Lockout, LockoutLatch
 from strands_robots.safety.orders import LISTENER, MISSED, RobotReport, StopOrder, new_epoch
-from strands_robots.safety.originals import Original, Originals
-from strands_robots.safety.persistence import LockoutStore, ResumedEpochs, StoredLockout
-from strands_robots.safety.reporting import UNPACED, OnReport, Reporter, StopRun
-from strands_robots.safety.resume import REJECTED, Admitted, ResumeVerifier
+from strands_robots.safety.persistence import LockoutStore, Original, Originals, ResumedEpochs, StoredLockout
+from strands_robots.safety.reporting import UNPACED, OnReport, Reporter, StopCount, StopRun
+from strands_robots.safety.resume import (
+    CLEARED,
+    LEFT,
+    NOT_KEPT,
+    NOT_LOCKED,
+    REJECTED,
+    Admitted,
+    ClearanceInbox,
+    ResumeVerifier,
+)
 from strands_robots.safety.sightings import sightings
-from strands_robots.safety.stop_count import StopCount
 from strands_robots.safety.stop_executor import StopExecutor, stop_executor
 from strands_robots.safety.stop_targets import Haltable, body_of, holds_several, note_motion
 from strands_robots.safety.stopping import StopVerdict

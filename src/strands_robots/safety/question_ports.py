@@ -19,7 +19,7 @@ from strands_robots.safety.identity import (
 )
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.orders import MISSED, RobotReport, StopOrder, StopRefused, StopRules
-from strands_robots.safety.originals import ORIGINAL_MAX_BYTES, STOPS_MAX, Original, Originals
+from strands_robots.safety.persistence import ORIGINAL_MAX_BYTES, STOPS_MAX, Original, Originals
 from strands_robots.safety.plane import SafetyPlane
 from strands_robots.safety.stop_link import ESTOP, JSON_RPC, StopCodec, StopEvent
 from strands_robots.state_files import uptime

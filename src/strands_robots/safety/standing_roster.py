@@ -12,9 +12,8 @@ from typing import Any
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety import ed25519
 from strands_robots.safety.answers import ANSWERS_MAX, Answers, Received
-from strands_robots.safety.consoles import console_key
 from strands_robots.safety.estop_listener import FailureBudget
-from strands_robots.safety.identity import SigningIdentity
+from strands_robots.safety.identity import SigningIdentity, console_key
 from strands_robots.safety.orders import StopRules, params_of, stated_epoch
 from strands_robots.safety.roster import Roster, RosterRow
 from strands_robots.safety.roster_report import report_fields

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Generic, TypeVar
 
-from strands_robots.safety.ready_threads import ReadyThreads
+from strands_robots.safety.stop_executor import ReadyThreads
 from strands_robots.stop_log import stop_logger
 
 logger = stop_logger(__name__)
