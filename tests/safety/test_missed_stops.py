@@ -21,10 +21,8 @@ from strands_robots.safety import ed25519, missed_stops
 from strands_robots.safety.controller import SafetyController
 from strands_robots.safety.lockout import MAX_EPOCHS
 from strands_robots.safety.missed_stops import (
-    ANSWER,
     ANSWER_MAX_BYTES,
     ANSWERS_ENOUGH,
-    QUESTION,
     STOPS_MAX_BYTES,
     Answerer,
     AnswerSlots,
@@ -42,7 +40,7 @@ from strands_robots.safety.persistence import (
     ResumedEpochs,
 )
 from strands_robots.safety.resume import clear_here
-from strands_robots.safety.stop_link import ESTOP, VERDICT, notification
+from strands_robots.safety.stop_link import ANSWER, ESTOP, QUESTION, VERDICT, notification
 from strands_robots.state_files import uptime
 
 Join = Callable[..., BusMachine]

@@ -14,6 +14,7 @@ from typing import Any
 
 from strands_robots.audit import audit_head, log_witness, own_log_id
 from strands_robots.audit.verification import witnessed
+from strands_robots.rate_limits import EventBudget
 from strands_robots.safety.identity import SigningIdentity
 from strands_robots.safety.orders import StopRules
 from strands_robots.safety.statements import Purpose, signed
@@ -117,6 +118,9 @@ KNOWN_S = 300.0
 """Seconds after which an audit that is in no answer any more takes no part in the choice."""
 
 LOGS_MAX = 256
+HEADS_PER_S = 20
+"""Answers to check-ins that are read in a second; robots send them, and a flood of them costs no more."""
+
 CLAIMS_PER_MIN = 32
 """Unproven heads that are written in a minute, so that a flood of invented ones does not fill the audit."""
 
@@ -150,7 +154,7 @@ class HeadWitness:
         self._lock = threading.Lock()
         self._known: dict[str, float] = {}
         self._written: dict[str, tuple[float, str]] = {}
-        self._claims = (float("-inf"), 0)
+        self._claims = EventBudget(CLAIMS_PER_MIN, window_s=WRITE_EVERY_S)
 
     def receive(self, robot_id: str, answer: Mapping[str, Any], *, by: str, proven: bool = False) -> bool:
         """Take an answer to a check-in; True when its head was written down.
@@ -170,18 +174,12 @@ class HeadWitness:
             if not self._always and own not in chosen(head.log, {*self._known, own}):
                 return False
             at, last = self._written.get(head.log, (float("-inf"), ""))
-            if now - at < WRITE_EVERY_S or last == head.last or not (proven or self._claim_allowed(now)):
+            if now - at < WRITE_EVERY_S or last == head.last or not (proven or self._claims.take("", now)):
                 return False
             self._written = {log: each for log, each in self._written.items() if log in self._known}
             self._written[head.log] = (now, head.last)
         self._write(by, robot_id, answer["audit"], signed=proven)
         return True
-
-    def _claim_allowed(self, now: float) -> bool:
-        since, count = self._claims
-        since, count = (now, 0) if now - since >= WRITE_EVERY_S else (since, count)
-        self._claims = (since, count + 1)
-        return count < CLAIMS_PER_MIN
 
 
 def chosen(log: str, audits: set[str]) -> list[str]:

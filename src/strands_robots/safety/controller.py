@@ -15,16 +15,16 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from strands_robots.audit import log_witness
+from strands_robots.rate_limits import EventBudget
 from strands_robots.safety.answers import ANSWERS_MAX, Answer, Answers, Received
-from strands_robots.safety.checkin import HeadWitness
-from strands_robots.safety.estop_listener import FailureBudget
+from strands_robots.safety.checkin import HEADS_PER_S, HeadWitness
 from strands_robots.safety.identity import KeyFileError
-from strands_robots.safety.missed_stops import ANSWER, QUESTION, MissedStops
+from strands_robots.safety.missed_stops import MissedStops
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.orders import REASON_MAX, answered_field, new_epoch, params_of, signed_stop
 from strands_robots.safety.question_ports import ControllerPort
 from strands_robots.safety.roster import Sending
-from strands_robots.safety.roster_report import STOP_ROSTER, OnReport, RosterInbox
+from strands_robots.safety.roster_report import OnReport, RosterInbox
 from strands_robots.safety.scope import (
     EVERY_ROBOT,
     WIDEN_S,
@@ -36,9 +36,12 @@ from strands_robots.safety.scope import (
 )
 from strands_robots.safety.statements import Proof, Purpose, proof_of
 from strands_robots.safety.stop_link import (
+    ANSWER,
     CHECK_IN,
     CHECK_IN_ANSWER,
     ESTOP,
+    QUESTION,
+    STOP_ROSTER,
     VERDICT,
     OnEvent,
     RenewableLink,
@@ -193,7 +196,7 @@ class SafetyController:
         self._closing = threading.Event()
         self._check_in: threading.Thread | None = None
         self._unanswered_s = 0.0
-        self._witness, self._heads = HeadWitness(always=True), FailureBudget()
+        self._witness, self._heads = HeadWitness(always=True), EventBudget(HEADS_PER_S)
         self._reports = RosterInbox()
         self._others: OnEvent | None = None
         self._link, self._linked = make_link(), False
@@ -487,10 +490,8 @@ class SafetyController:
 
     def _witness_head(self, source: str, params: Any) -> None:
         """Write down the head in an answer to a check-in; a flood is left out."""
-        now = time.monotonic()
-        if not isinstance(params, dict) or not self._heads.allows("", now):
+        if not isinstance(params, dict) or not self._heads.take("", time.monotonic()):
             return
-        self._heads.record("", now)
         proof = proof_of(Purpose.CHECK_IN_ANSWER, source, params, self._keys.get(source))
         if proof is not Proof.WRONG:
             self._witness.receive(source, params, by=self.controller_id, proven=proof is Proof.SIGNED)

@@ -8,18 +8,17 @@ the stop executor: two hand-offs.
 from __future__ import annotations
 
 import functools
-import secrets
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Hashable, Mapping
 from typing import Any, NamedTuple
 
 from strands_robots.audit import audit_head, own_log_id, queue_safety_event
+from strands_robots.rate_limits import EventBudget
 from strands_robots.safety.awake import AWAKE
-from strands_robots.safety.checkin import CheckInAnswers, CheckInRules, HeadWitness
+from strands_robots.safety.checkin import HEADS_PER_S, CheckInAnswers, CheckInRules, HeadWitness
 from strands_robots.safety.identity import SigningIdentity
-from strands_robots.safety.missed_stops import ANSWER, QUESTION, MissedStops
+from strands_robots.safety.missed_stops import MissedStops
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.orders import LISTENER, PARSED_MAX_BYTES, RobotReport, StopOrder, StopRefused, StopRules
 from strands_robots.safety.plane import SafetyPlane, plane
@@ -27,12 +26,15 @@ from strands_robots.safety.question_ports import Member, RobotsPort
 from strands_robots.safety.sighting_file import own_run
 from strands_robots.safety.statements import Purpose, signed
 from strands_robots.safety.stop_link import (
+    ANSWER,
     CHECK_IN,
     CHECK_IN_ANSWER,
     ESTOP,
     EVENTS,
     JSON_RPC,
+    QUESTION,
     VERDICT,
+    FairQueue,
     StopCodec,
     StopEvent,
     StopLink,
@@ -53,169 +55,18 @@ ANSWER_AGAIN_EACH_S = 0.002
 ANSWER_AGAIN_MAX_S = 0.25
 
 REFUSAL_INTERVAL_S = 10.0
-SOURCES_MAX = 256
-"""Sources remembered; past it the oldest is forgotten or all new ones share an entry, so that names take no memory."""
+"""Seconds in which the refusals of one source are recorded once, and the others counted."""
 
-BUCKETS = 64
-BUCKET_CAPACITY = 16
-LATER_EVERY = 8
-"""Of so many events that are taken from a full bucket one is not urgent, so that a flood of stops starves none."""
+REMEMBERED_MAX = 256
 
-VOUCHED_MAX = 16
-"""Sources with a share of their own in the queue: the first that signed validly."""
+FAILURES_PER_S, FAILURES_IN_ALL_PER_S = 20, 100
+"""Failed signature checks of a source, and of all, in a second."""
 
 REFUSED_PAUSE_S = 0.0005
 """Seconds that the listener rests after a refused stop of a source that has not signed validly."""
 
 LATCH_ANSWERS_PER_S = 200
 LATCH_ANSWERS_REMEMBERED = 4096
-
-
-class _Bucket:
-    """Events of the sources that share it: stops, and what is not urgent.
-
-    Only the listener's thread takes; appending is atomic.
-    """
-
-    __slots__ = ("_later", "_taken", "_urgent")
-
-    def __init__(self) -> None:
-        self._urgent: deque[StopEvent] = deque(maxlen=BUCKET_CAPACITY)
-        self._later: deque[StopEvent] = deque(maxlen=BUCKET_CAPACITY // 2)
-        self._taken = 0
-
-    def put(self, event: StopEvent, urgent: bool) -> None:
-        """Add an event: in place of the oldest stop, or where there is room."""
-        if urgent:
-            self._urgent.append(event)
-        elif len(self._later) < BUCKET_CAPACITY // 2:
-            self._later.append(event)
-
-    def take(self) -> StopEvent | None:
-        """Remove the newest stop, or in its turn the oldest of the others."""
-        if not (self._urgent or self._later):
-            return None
-        self._taken += 1
-        if self._later and (not self._urgent or self._taken % LATER_EVERY == 0):
-            return self._later.popleft()
-        return self._urgent.pop()
-
-
-class FairQueue:
-    """Bounded queue of the listener: fair between sources, newest first.
-
-    A flood of forged stops must not delay a true one. Sources share a fixed number of buckets by a keyed hash; buckets
-    are served in turn, one event each, the newest stop first. What overflows a bucket is its oldest stop; a controller
-    repeats its stop, so a true one arrives again. A source that was vouched for has a bucket of its own, and every
-    second turn is of such a one: names that are made up share the other turns. No method but :meth:`get` blocks.
-    """
-
-    def __init__(self) -> None:
-        self._salt = secrets.token_hex(8)
-        self._buckets = [_Bucket() for _ in range(BUCKETS)]
-        self._vouched: dict[str, _Bucket] = {}
-        self._turns: tuple[_Bucket, ...] = ()
-        self._waiting = threading.Event()
-        self._turn = self._vouched_turn = 0
-        self._crowd_next = False
-        self._closed = False
-
-    def vouch(self, source: str) -> None:
-        """Give a source that signed validly a bucket of its own."""
-        if source not in self._vouched and len(self._vouched) < VOUCHED_MAX:
-            bucket = _Bucket()
-            self._turns = (*self._turns, bucket)
-            self._vouched[source] = bucket
-
-    def vouched_for(self, source: str) -> bool:
-        """Return True when this source has a bucket of its own."""
-        return source in self._vouched
-
-    def put(
-        self,
-        event: str,
-        source: str,
-        payload: bytes | int,
-        *,
-        urgent: bool = True,
-        network: str = "",
-        codec: StopCodec = JSON_RPC,
-    ) -> None:
-        """Add an event; of those that are not urgent, a full bucket drops the new."""
-        received = StopEvent(event, source, payload, time.monotonic(), network, codec)
-        bucket = self._vouched.get(source)
-        if bucket is None:
-            # Within one text: the hash of a pair keeps the same names together whatever the salt.
-            bucket = self._buckets[hash(self._salt + source) % len(self._buckets)]
-        # Adding to a bucket and setting an event are atomic; no lock is shared with the listener's thread.
-        bucket.put(received, urgent)
-        # While it is set, the listener's next look is still to come: most messages of a flood need not wake it.
-        if not self._waiting.is_set():
-            self._waiting.set()
-
-    def get(self) -> StopEvent | None:
-        """Return the next event, waiting for one; None once closed and empty."""
-        while True:
-            self._crowd_next = not self._crowd_next
-            for take in (self._of_crowd, self._of_vouched) if self._crowd_next else (self._of_vouched, self._of_crowd):
-                event = take()
-                if event is not None:
-                    return event
-            if self._closed:
-                return None
-            self._waiting.wait()
-            self._waiting.clear()
-            # What was put between the look and the clearing is found by the next look; what comes later sets it.
-
-    def _of_crowd(self) -> StopEvent | None:
-        for _ in self._buckets:
-            self._turn = (self._turn + 1) % len(self._buckets)
-            event = self._buckets[self._turn].take()
-            if event is not None:
-                return event
-        return None
-
-    def _of_vouched(self) -> StopEvent | None:
-        turns = self._turns
-        for _ in turns:
-            self._vouched_turn = (self._vouched_turn + 1) % len(turns)
-            event = turns[self._vouched_turn].take()
-            if event is not None:
-                return event
-        return None
-
-    def close(self) -> None:
-        """Let :meth:`get` return None when nothing is left."""
-        self._closed = True
-        self._waiting.set()
-
-
-class FailureBudget:
-    """Failed signature checks of each source and of all in a second.
-
-    Without the sum, a flood under made-up names would have each of them checked.
-    """
-
-    def __init__(self, per_s: int = 20, in_all_per_s: int = 100) -> None:
-        self._per_s, self._in_all_per_s = per_s, in_all_per_s
-        self._failures: dict[str, tuple[float, int]] = {}
-        self._in_all = (float("-inf"), 0)
-
-    def allows(self, source: str, now: float) -> bool:
-        """Return True while one more message of ``source`` may be checked."""
-        since, count = self._failures.get(source, (now, 0))
-        if count >= self._per_s and now - since < 1.0:
-            return False
-        since, count = self._in_all
-        return count < self._in_all_per_s or now - since >= 1.0
-
-    def record(self, source: str, now: float) -> None:
-        """Count a failure of ``source``."""
-        since, count = self._failures.pop(source, (now, 0))
-        self._failures[source] = (since, count + 1) if now - since < 1.0 else (now, 1)
-        _bound(self._failures)
-        since, count = self._in_all
-        self._in_all = (since, count + 1) if now - since < 1.0 else (now, 1)
 
 
 class LatchAnswers:
@@ -226,16 +77,12 @@ class LatchAnswers:
     """
 
     def __init__(self, per_s: int = LATCH_ANSWERS_PER_S) -> None:
-        self._per_s = per_s
-        self._since, self._count = float("-inf"), 0
+        self._budget = EventBudget(per_s)
         self._unanswered: dict[tuple[str, str], None] = {}
 
     def allows(self, robot_id: str, epoch: str, now: float) -> bool:
         """Return True when this stop is answered now, else remember it."""
-        if now - self._since >= 1.0:
-            self._since, self._count = now, 0
-        if self._count < self._per_s:
-            self._count += 1
+        if self._budget.take("", now):
             return True
         key = (robot_id, epoch)
         if key in self._unanswered:
@@ -244,35 +91,6 @@ class LatchAnswers:
         if len(self._unanswered) > LATCH_ANSWERS_REMEMBERED:
             del self._unanswered[next(iter(self._unanswered))]
         return False
-
-
-class RefusalLog:
-    """Count of refused messages; each source is reported once in ten seconds."""
-
-    def __init__(self) -> None:
-        self._sources: dict[str, list[float]] = {}
-
-    def due(self, source: str) -> bool:
-        """Return True when this refusal should be recorded; else count it."""
-        entry = self._entry(source)
-        if time.monotonic() >= entry[0]:
-            return True
-        entry[1] += 1
-        return False
-
-    def record(self, refused: StopRefused, event: str) -> None:
-        """Log and audit a refusal, unless one of this source was recorded a moment ago."""
-        if not self.due(refused.source):
-            return
-        entry = self._entry(refused.source)
-        more, entry[:] = int(entry[1]), [time.monotonic() + REFUSAL_INTERVAL_S, 0.0]
-        logger.warning("%s of %s does not count: %s.", event, shown(refused.source), refused.why)
-        facts = {"event": event, "source": refused.source[:256], "why": refused.why, "more_since": more}
-        queue_safety_event("estop_refused", "stop-lane", facts)
-
-    def _entry(self, source: str) -> list[float]:
-        name = source if source in self._sources or len(self._sources) < SOURCES_MAX else ""
-        return self._sources.setdefault(name, [float("-inf"), 0.0])
 
 
 class ListenerRegistration:
@@ -331,12 +149,12 @@ class EstopListener:
         self._registering = threading.Lock()
         self._registrations: tuple[ListenerRegistration, ...] = ()
         self._open: dict[Hashable, OpenLink] = {}
-        self._refusals = RefusalLog()
-        self._budget = FailureBudget()
+        self._refusals = EventBudget(1, window_s=REFUSAL_INTERVAL_S, pooled=True)
+        self._budget = EventBudget(FAILURES_PER_S, FAILURES_IN_ALL_PER_S)
         self._latch_answers = LatchAnswers()
         self._rules = StopRules(allow=(), keys=())
         self._check_ins = CheckInRules(self._rules)
-        self._witness, self._check_in_answers, self._heads = HeadWitness(), CheckInAnswers(), FailureBudget()
+        self._witness, self._check_in_answers, self._heads = HeadWitness(), CheckInAnswers(), EventBudget(HEADS_PER_S)
         self._answered: dict[tuple[str, str], float] = {}
         self._redundant: dict[tuple[str, str], None] = {}
         self._repeated: dict[Hashable, bytes] = {}
@@ -456,9 +274,9 @@ class EstopListener:
                 events.vouch(source)
         elif order is not None:
             if not codec.refused(order):
-                self._refusals.record(order, stop.event)
+                self._record_refusal(order, stop.event)
             if events is None:
-                self._budget.record(source, time.monotonic())
+                self._budget.count(source, time.monotonic())
             elif not events.vouched_for(source):
                 # In a flood the link's thread needs the interpreter to receive what comes behind it.
                 time.sleep(REFUSED_PAUSE_S)
@@ -485,16 +303,30 @@ class EstopListener:
         if not isinstance(payload, int) and len(payload) > PARSED_MAX_BYTES:
             payload = len(payload)
         if event == CHECK_IN_ANSWER:
-            # Robots send these; so many a second, which a flood of them does not exceed.
-            now = time.monotonic()
-            if self._heads.allows("", now):
-                self._heads.record("", now)
+            if self._heads.take("", time.monotonic()):
                 events.put(event, source, payload, urgent=False)
             return
         if not codec.names_source or self._rules.source_refusal(source) is None:
             events.put(event, source, payload, urgent=event == ESTOP, network=network, codec=codec)
-        elif self._refusals.due(source):
+        elif self._refusal_due(source):
             events.put(event, source, payload, urgent=False, codec=codec)
+
+    def _refusal_due(self, source: str) -> bool:
+        """Return True when a refusal of this source should be recorded; else count it."""
+        now = time.monotonic()
+        due = self._refusals.allows(source, now)
+        if not due:
+            self._refusals.count(source, now)
+        return due
+
+    def _record_refusal(self, refused: StopRefused, event: str) -> None:
+        """Log and audit a refusal, unless one of this source was recorded a moment ago."""
+        if not self._refusal_due(refused.source):
+            return
+        more = self._refusals.count(refused.source, time.monotonic())
+        logger.warning("%s of %s does not count: %s.", event, shown(refused.source), refused.why)
+        facts = {"event": event, "source": refused.source[:256], "why": refused.why, "more_since": more}
+        queue_safety_event("estop_refused", "stop-lane", facts)
 
     def _missed_stops(self, registration: ListenerRegistration) -> MissedStops:
         key, link, codec = registration.key, registration.link, registration.codec
@@ -549,7 +381,7 @@ class EstopListener:
         source, params = received.source, received.codec.fields(received.payload)
         why = self._check_ins.refusal(source, params)
         if why is not None:
-            self._refusals.record(StopRefused(source, why), received.event)
+            self._record_refusal(StopRefused(source, why), received.event)
             return False
         self._plane.checkin.record(source, received.at)
         self._rules.compare_clock(source, params, received.at)
@@ -619,7 +451,7 @@ def _no_answer(report: RobotReport) -> None:
 
 
 def _bound(remembered: dict[Any, Any]) -> None:
-    while len(remembered) > SOURCES_MAX:
+    while len(remembered) > REMEMBERED_MAX:
         del remembered[next(iter(remembered))]
 
 

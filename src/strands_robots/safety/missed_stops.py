@@ -26,17 +26,15 @@ from strands_robots.audit import queue_safety_event
 from strands_robots.safety import ed25519
 from strands_robots.safety.identity import SigningIdentity
 from strands_robots.safety.lockout import is_epoch
-from strands_robots.safety.orders import params_of, seconds_of
+from strands_robots.safety.orders import seconds_of
 from strands_robots.safety.persistence import ORIGINAL_MAX_BYTES, STOPS_MAX, Original, newest_within
 from strands_robots.safety.statements import Purpose, own_key, signed
+from strands_robots.safety.stop_link import ANSWER, JSON_RPC, QUESTION, FairQueue
 from strands_robots.state_files import StateFileError, make_private, require_private, state_dir, uptime
 from strands_robots.stop_log import stop_logger
 from strands_robots.utils import shown
 
 logger = stop_logger(__name__)
-
-QUESTION = "missedStops"
-ANSWER = "missedStopsAnswer"
 
 STARTED, BACK = "the process started", "its link is back"
 PEER_BACK = "a peer is linked again, while others stayed"
@@ -140,39 +138,6 @@ class MissedStopsPort(Protocol):
 
     def hold(self, seconds: float) -> None:
         """Hold the motions of the robots for so long; return at once."""
-
-
-class AnswerQueue:
-    """Bounded answers that wait to be read: few for each share of the sources.
-
-    Adding is atomic and takes no lock; one thread takes.
-    """
-
-    def __init__(self) -> None:
-        self._salt = secrets.token_hex(8)
-        self._buckets: list[deque[tuple[str, bytes]]] = [deque(maxlen=BUCKET_CAPACITY) for _ in range(BUCKETS)]
-        self._turn = 0
-        self.dropped = False
-
-    def put(self, source: str, payload: bytes) -> None:
-        """Add an answer, in place of the oldest one of its bucket if that is full."""
-        bucket = self._buckets[hash(self._salt + source) % BUCKETS]
-        self.dropped = self.dropped or len(bucket) == BUCKET_CAPACITY
-        bucket.append((source, payload))
-
-    def take(self) -> tuple[str, bytes] | None:
-        """Return the newest answer of the next bucket in turn."""
-        for _ in self._buckets:
-            self._turn = (self._turn + 1) % BUCKETS
-            if self._buckets[self._turn]:
-                return self._buckets[self._turn].pop()
-        return None
-
-    def clear(self) -> None:
-        """Forget what waits."""
-        for bucket in self._buckets:
-            bucket.clear()
-        self.dropped = False
 
 
 class Asker:
@@ -361,7 +326,7 @@ class MissedStops:
     def __init__(
         self,
         port: MissedStopsPort,
-        parse: Callable[[bytes | int], Mapping[str, Any]] = params_of,
+        parse: Callable[[bytes | int | None], Mapping[str, Any]] = JSON_RPC.fields,
         clock: Callable[[], float] = time.monotonic,
         chance: Callable[[], float] = random.random,
     ) -> None:
@@ -370,7 +335,7 @@ class MissedStops:
         self._asker, self._answerer = Asker(), Answerer(chance)
         self._reasons: deque[str] = deque(maxlen=8)
         self._questions: deque[tuple[str, bytes]] = deque(maxlen=QUESTIONS_MAX)
-        self._answers = AnswerQueue()
+        self._answers = FairQueue(BUCKETS, BUCKET_CAPACITY)
         # The smallest age that a stop was judged with; -inf: no age makes it count.
         self._judged: dict[bytes, float] = {}
         self._own = ""
@@ -429,7 +394,7 @@ class MissedStops:
                 self._questions.append((source, payload))
                 self._wake()
         elif self._asker.listens(self._clock()) or self._answerer.waits or self._questions:
-            self._answers.put(source, payload)
+            self._answers.put(ANSWER, source, payload)
             self._wake()
 
     def close(self) -> None:
@@ -489,7 +454,7 @@ class MissedStops:
     def _ask(self) -> None:
         now = self._clock()
         back, self._back = self._back, False
-        self._asker.settle(now, dropped=self._answers.dropped)
+        self._asker.settle(now, dropped=self._answers.displaced)
         devices = self._port.devices() if self._asker.due <= now else ()
         if not devices:
             self._asker.not_asked()
@@ -516,7 +481,7 @@ class MissedStops:
 
     def _take_answers(self) -> None:
         while (answer := self._answers.take()) is not None:
-            source, fields = answer[0], self._parse(answer[1])
+            source, fields = answer.source, self._parse(answer.payload)
             rows = rows_of(fields)
             if self._answerer.waits:
                 self._note_given(source, fields, rows)

@@ -8,19 +8,17 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from strands_robots.safety.estop_listener import FairQueue
 from strands_robots.safety.identity import KeyFileError, kept_consoles, stated_consoles
 from strands_robots.safety.lockout import is_epoch
 from strands_robots.safety.orders import estop_keys, params_of
 from strands_robots.safety.roster import REPORTED_MAX, RosterRow, bounded
 from strands_robots.safety.sightings import Known
 from strands_robots.safety.statements import Purpose, own_key
+from strands_robots.safety.stop_link import STOP_ROSTER, FairQueue
 from strands_robots.stop_log import stop_logger
 from strands_robots.utils import ValidationError, identifier
 
 logger = stop_logger(__name__)
-
-STOP_ROSTER = "stopRoster"
 
 REPORT_MAX_BYTES = 16 * 2**10
 """Longest message; a longer one is not read."""

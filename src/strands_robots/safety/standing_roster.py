@@ -10,9 +10,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from strands_robots.errors import StrandsRobotsError
+from strands_robots.rate_limits import EventBudget
 from strands_robots.safety import ed25519
 from strands_robots.safety.answers import ANSWERS_MAX, Answers, Received
-from strands_robots.safety.estop_listener import FailureBudget
+from strands_robots.safety.estop_listener import FAILURES_IN_ALL_PER_S, FAILURES_PER_S
 from strands_robots.safety.identity import SigningIdentity, console_key
 from strands_robots.safety.orders import StopRules, params_of, stated_epoch
 from strands_robots.safety.roster import Roster, RosterRow
@@ -106,7 +107,8 @@ class StandingRoster:
         self._done: dict[tuple[str, Scope], None] = {}
         self._wake, self._closed = threading.Event(), False
         self._rules = StopRules(allow=())
-        self._failures, self._signers_failures = FailureBudget(), FailureBudget()
+        self._failures = EventBudget(FAILURES_PER_S, FAILURES_IN_ALL_PER_S)
+        self._signers_failures = EventBudget(FAILURES_PER_S, FAILURES_IN_ALL_PER_S)
         self._signers: dict[str, None] = {}
         self._names: frozenset[str] = frozenset()
         self._thread = threading.Thread(target=self._run, name="standing roster", daemon=True)
@@ -169,12 +171,12 @@ class StandingRoster:
             if self._rules.signed and not budget.allows(source, now):
                 continue
             if self._rules.signature_refusal(source, params, Purpose.EMERGENCY_STOP) is not None:
-                budget.record(source, now)
+                budget.count(source, now)
                 continue
             scope = self._rules.scope(source, params) if SCOPE in params else EVERY_ROBOT
             mark = (estop_id, scope)
             if mark in self._done or (last is not None and (last.estop_id, last.scope) == mark):
-                budget.record(source, now)  # replayed with another scope
+                budget.count(source, now)  # replayed with another scope
                 continue
             if self._rules.signed:
                 self._signers[source] = None

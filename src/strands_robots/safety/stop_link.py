@@ -1,4 +1,4 @@
-"""Protocol of the connections that carry stops, which each network supplies.
+"""Links that carry stops: their protocol, which each network supplies, and queue.
 
 A network gives the e-stop listener a :class:`StopLink`, and a :class:`StopCodec` where its emergency stops are no
 JSON-RPC notifications.
@@ -7,12 +7,14 @@ JSON-RPC notifications.
 from __future__ import annotations
 
 import json
+import secrets
+import threading
 import time
 import uuid
-from collections.abc import Callable, Collection, Mapping
+from collections import deque
+from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
-from strands_robots.safety.missed_stops import ANSWER, QUESTION
 from strands_robots.safety.orders import StopOrder, StopRefused, StopRules, params_of, stated_epoch
 
 if TYPE_CHECKING:
@@ -22,6 +24,9 @@ ESTOP = "emergencyStop"
 VERDICT = "emergencyStopVerdict"
 CHECK_IN = "safetyCheckIn"
 CHECK_IN_ANSWER = "safetyCheckInAnswer"
+QUESTION = "missedStops"
+ANSWER = "missedStopsAnswer"
+STOP_ROSTER = "stopRoster"
 EVENTS = (ESTOP, CHECK_IN, CHECK_IN_ANSWER, QUESTION, ANSWER)
 
 OnEvent = Callable[[str, str, bytes | int], None]
@@ -153,3 +158,132 @@ class StopEvent(NamedTuple):
     at: float
     network: str = ""
     codec: StopCodec = JSON_RPC
+
+
+BUCKETS, BUCKET_CAPACITY = 64, 16
+LATER_EVERY = 8
+"""Of so many events that are taken from a full bucket one is not urgent, so that a flood of stops starves none."""
+
+VOUCHED_MAX = 16
+"""Sources with a share of their own in the queue: the first that signed validly."""
+
+
+class _Bucket:
+    """Events of the sources that share it: stops, and what is not urgent.
+
+    Only the queue's one reader takes; appending is atomic.
+    """
+
+    __slots__ = ("later", "taken", "urgent")
+
+    def __init__(self, capacity: int) -> None:
+        self.urgent: deque[StopEvent] = deque(maxlen=capacity)
+        self.later: deque[StopEvent] = deque(maxlen=capacity // 2)
+        self.taken = 0
+
+
+class _Share:
+    """Buckets that are served in turn."""
+
+    __slots__ = ("buckets", "turn")
+
+    def __init__(self, buckets: Iterable[_Bucket] = ()) -> None:
+        self.buckets = tuple(buckets)
+        self.turn = 0
+
+
+class FairQueue:
+    """Bounded queue of events from links: fair between sources, newest first.
+
+    A flood of forged stops must not delay a true one. Sources share a fixed number of buckets by a keyed hash; buckets
+    are served in turn, one event each, the newest stop first. What overflows a bucket is its oldest stop; a controller
+    repeats its stop, so a true one arrives again. A source that was vouched for has a bucket of its own, and every
+    second turn is of such a one: names that are made up share the other turns. No method but :meth:`get` blocks.
+
+    Args:
+        buckets: number of those that all sources share.
+        capacity: of a bucket, in stops; of others it holds half as many.
+
+    Attributes:
+        displaced: a stop took the place of an older one since :meth:`clear`.
+    """
+
+    def __init__(self, buckets: int = BUCKETS, capacity: int = BUCKET_CAPACITY) -> None:
+        self._salt = secrets.token_hex(8)
+        self._capacity = capacity
+        self._crowd, self._signed = _Share(_Bucket(capacity) for _ in range(buckets)), _Share()
+        self._vouched: dict[str, _Bucket] = {}
+        self._waiting = threading.Event()
+        self._crowd_next = False
+        self._closed = False
+        self.displaced = False
+
+    def vouch(self, source: str) -> None:
+        """Give a source that signed validly a bucket of its own."""
+        if source not in self._vouched and len(self._vouched) < VOUCHED_MAX:
+            bucket = self._vouched[source] = _Bucket(self._capacity)
+            self._signed.buckets = (*self._signed.buckets, bucket)
+
+    def vouched_for(self, source: str) -> bool:
+        """Return True when this source has a bucket of its own."""
+        return source in self._vouched
+
+    def put(
+        self,
+        event: str,
+        source: str,
+        payload: bytes | int,
+        *,
+        urgent: bool = True,
+        network: str = "",
+        codec: StopCodec = JSON_RPC,
+    ) -> None:
+        """Add an event; of those that are not urgent, a full bucket drops the new."""
+        received = StopEvent(event, source, payload, time.monotonic(), network, codec)
+        # Within one text: the hash of a pair keeps the same names together whatever the salt.
+        shared = self._crowd.buckets[hash(self._salt + source) % len(self._crowd.buckets)]
+        bucket = self._vouched.get(source, shared)
+        # Adding to a bucket and setting an event are atomic; no lock is shared with the reader's thread.
+        if urgent:
+            self.displaced = self.displaced or len(bucket.urgent) == self._capacity
+            bucket.urgent.append(received)
+        elif len(bucket.later) < self._capacity // 2:
+            bucket.later.append(received)
+        # While it is set, the reader's next look is still to come: most messages of a flood need not wake it.
+        if not self._waiting.is_set():
+            self._waiting.set()
+
+    def get(self) -> StopEvent | None:
+        """Return the next event, waiting for one; None once closed and empty."""
+        while (event := self.take()) is None and not self._closed:
+            self._waiting.wait()
+            self._waiting.clear()
+            # What was put between the look and the clearing is found by the next look; what comes later sets it.
+        return event
+
+    def take(self) -> StopEvent | None:
+        """Return the next event, of the crowd and of vouched sources in turn; None where there is none."""
+        self._crowd_next = not self._crowd_next
+        for share in (self._crowd, self._signed) if self._crowd_next else (self._signed, self._crowd):
+            buckets = share.buckets
+            for _ in buckets:
+                share.turn = (share.turn + 1) % len(buckets)
+                bucket = buckets[share.turn]
+                if not (bucket.urgent or bucket.later):
+                    continue
+                bucket.taken += 1
+                if bucket.later and (not bucket.urgent or bucket.taken % LATER_EVERY == 0):
+                    return bucket.later.popleft()
+                return bucket.urgent.pop()
+        return None
+
+    def clear(self) -> None:
+        """Forget what waits."""
+        while self.take() is not None:
+            pass
+        self.displaced = False
+
+    def close(self) -> None:
+        """Let :meth:`get` return None when nothing is left."""
+        self._closed = True
+        self._waiting.set()
