@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from strands_robots import settings
-from strands_robots.bounded_json import SMALL_BYTES, json_object
+from strands_robots.bounded_json import SMALL_BYTES, parsed
 from strands_robots.safety import ed25519
 from strands_robots.safety.authorization import caller_name, entries, estop_refusal, matcher
 from strands_robots.safety.lockout import OVERFLOW, is_epoch
@@ -313,12 +313,9 @@ class StopRules:
 
     def source_refusal(self, source: str) -> str | None:
         """Return the reason why this source may not stop, or None; costs next to nothing."""
-        if self._may_stop(source):
+        if caller_name(source) is not None and (not self._allow or self._fits(source) is not None):
             return None
         return estop_refusal(source, self._allow)
-
-    def _may_stop(self, source: str) -> bool:
-        return caller_name(source) is not None and (not self._allow or self._fits(source) is not None)
 
     def order(
         self,
@@ -336,7 +333,9 @@ class StopRules:
         ``raw`` are the bytes that they were read from, or their number where there are too many to be read. A message
         without an id, read or not, has a fresh epoch, and its repetitions within UNREAD_AGAIN_S have the same.
         """
-        why = self.source_refusal(source) or self.signature_refusal(source, params, Purpose.EMERGENCY_STOP)
+        why = self.source_refusal(source)
+        if why is None and self._keys:
+            why = self.signature_refusal(source, params, Purpose.EMERGENCY_STOP)
         if why is not None:
             return StopRefused(source, why)
         received = time.monotonic() if received is None else received
@@ -346,9 +345,11 @@ class StopRules:
         received_at, issued = self._clock() - (time.monotonic() - received), seconds_of(params.get("t"))
         compared = issued is not None and path != MISSED
         ahead = self._clocks.note(source, received_at - issued, received) if compared and issued is not None else None
-        stated = raw is not None and len(raw) <= ORIGINAL_MAX_BYTES and stated_epoch(source, params) != ""
+        epoch = stated_epoch(source, params)
+        passed_on = raw is not None and len(raw) <= ORIGINAL_MAX_BYTES and epoch != ""
         return StopOrder(
-            self._epoch(source, params, received),
+            # The bytes of a stop without an id of its own may be those of every press.
+            epoch or self._unread_epoch(source, received),
             source,
             stated_reason(params),
             path,
@@ -358,19 +359,12 @@ class StopRules:
             pressed=seconds_of(params.get("pressed_at")),
             received_at=received_at,
             clock_ahead_s=ahead,
-            answered=_names(params.get(ANSWERED)),
+            answered=_names(params[ANSWERED]) if ANSWERED in params else frozenset(),
             scope=self.scope(source, params) if SCOPE in params else EVERY_ROBOT,
-            original=raw if stated else None,
+            original=raw if passed_on else None,
             network=network,
             age_s=age_s,
         )
-
-    def _epoch(self, source: str, params: Mapping[str, Any], received: float) -> str:
-        """Return the epoch of a stop; without an id of its own that of its moment.
-
-        The bytes of such a stop may be those of every press.
-        """
-        return stated_epoch(source, params) or self._unread_epoch(source, received)
 
     def _unread_epoch(self, source: str, received: float) -> str:
         """Return the epoch of a stop without an id, the same for repetitions."""
@@ -425,7 +419,11 @@ def params_of(payload: bytes | int) -> dict[str, Any]:
     Args:
         payload: the message, or its number of bytes where there are too many to be read.
     """
-    params = {} if isinstance(payload, int) else json_object(payload, PARSED_MAX_BYTES).get("params")
+    try:
+        message = None if isinstance(payload, int) else parsed(payload, PARSED_MAX_BYTES)
+    except ValueError:
+        return {}
+    params = message.get("params") if isinstance(message, dict) else None
     return params if isinstance(params, dict) else {}
 
 
@@ -443,10 +441,6 @@ def answered_field(names: Iterable[str]) -> dict[str, list[str]]:
             length += more
             named.append(name)
     return {ANSWERED: named} if named else {}
-
-
-def _names(value: object) -> frozenset[str]:
-    return frozenset(each for each in value if isinstance(each, str)) if isinstance(value, list) else frozenset()
 
 
 SOURCES_MAX = 64
@@ -514,3 +508,7 @@ def seconds_of(t: object) -> float | None:
     if isinstance(t, bool) or not isinstance(t, int | float) or not abs(t) < 1e18:
         return None
     return float(t)
+
+
+def _names(value: object) -> frozenset[str]:
+    return frozenset(each for each in value if isinstance(each, str)) if isinstance(value, list) else frozenset()

@@ -189,13 +189,16 @@ class Registered:
         A stop is known, or one of a flood that locks nothing more: the latest halt answers for it. A missed one may be
         from before its time.
         """
+        latch = self.latch
+        lock = functools.partial(latch.engage, order.epoch, order.source, order.reason, order.scope)
+        if order.path != MISSED and latch.state.overflow is None:
+            return lock()
         received = uptime() - order.age_s - (time.monotonic() - order.received)
         if order.path == MISSED and not self._missed(received):
             return False
-        lock = functools.partial(self.latch.engage, order.epoch, order.source, order.reason, order.scope)
-        if not self.crowded:
+        if latch.state.overflow is None:
             return lock()
-        self.latch.crowd_on(received)
+        latch.crowd_on(received)
         if order.received - self._halted_at < HALT_AGAIN_S or not lock():
             return False
         self._halted_at = order.received
@@ -438,6 +441,7 @@ class SafetyPlane:
                     within=run.deadline_s,
                     since=order.received,
                     answered=functools.partial(reporter.answer, run, entry.robot_id),
+                    voided=True,
                 )
             self._note_original(order)
             reporter.begin(run)

@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable, Collection, Hashable, Iterable
 from concurrent.futures import Future, InvalidStateError
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Protocol, TypeGuard, cast, runtime_checkable
+from typing import Any, Protocol, cast, runtime_checkable
 
 from strands_robots.safety.gate import MotionGate, VerbCall, VerbsUnderWay, kept_gate
 from strands_robots.safety.stopping import ForeignAnswer, PendingVerdict, StopVerdict, graded, read_verdict
@@ -108,16 +108,11 @@ def revoke_permits(target: object) -> None:
         gate.revoke()
 
 
-def has_parts(target: object) -> TypeGuard[HaltsInParts]:
+def has_parts(target: object) -> bool:
     """Return whether the executor calls the parts of its halt."""
     kind = type(target)
     halt = getattr(kind, "halt", None)
     return hasattr(kind, "halt_here") and (halt is None or getattr(halt, "halts_in_parts", False))
-
-
-def is_direct(target: object) -> TypeGuard[DirectTarget]:
-    """Return whether it answers for itself while its halt blocks."""
-    return has_parts(target) and hasattr(type(target), "unanswered")
 
 
 def target_key(target: Target) -> Hashable:
@@ -304,6 +299,8 @@ class SubmittedStop:
     Attributes:
         within: seconds to halt, which count from ``since``.
         answered: called with a verdict that comes too late for the future.
+        parts: the executor calls the parts of its halt.
+        direct: it answers for itself while its halt blocks.
         verbs: own verbs of the target that ran when it was submitted.
         asker: the thread that submitted it.
         pending: what is still to be read for the verdict; None until the halt has returned.
@@ -317,6 +314,7 @@ class SubmittedStop:
     within: float
     since: float
     answered: Answered | None
+    parts: bool = False
     direct: bool = False
     verbs: tuple[VerbCall, ...] = ()
     asker: int = field(default_factory=threading.get_ident)
@@ -382,8 +380,8 @@ class SubmittedStop:
         try:
             if pending is not None:
                 verdict = pending.unread(why)
-            elif is_direct(target):
-                verdict = graded(target.unanswered(why), self.name)
+            elif self.direct:
+                verdict = graded(cast(DirectTarget, target).unanswered(why), self.name)
         except Exception:
             logger.exception("%s could not say what it does while its halt blocks.", self.name)
         return self._set(verdict)
