@@ -22,8 +22,7 @@ from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.safety_console import SafetyConsole
 from strands_robots.fleet.watched_robots import WatchedRobots
 from strands_robots.safety import statements
-from strands_robots.safety.answers import Answer
-from strands_robots.safety.controller import StopReport
+from strands_robots.safety.answers import Answer, StopReport
 from strands_robots.safety.ed25519 import keygen
 from strands_robots.safety.identity import (
     ROBOTS,

@@ -24,7 +24,7 @@ from strands_robots.fleet.lockout_report import LockoutReport, Resumed
 from strands_robots.fleet.refusals import answered
 from strands_robots.fleet.stop_answers import measured, roster_verdict, unanswered
 from strands_robots.safety import network_key
-from strands_robots.safety.controller import OnProgress
+from strands_robots.safety.answers import OnProgress
 from strands_robots.safety.identity import SigningIdentity
 from strands_robots.safety.lockout import Lockout
 from strands_robots.safety.network_key import NetworkKey

@@ -20,8 +20,7 @@ from strands_robots.fleet.all_stops import estop_all
 from strands_robots.fleet.enrollment import Enrolled
 from strands_robots.fleet.lockout_report import LockoutReport
 from strands_robots.fleet.networks import Networks
-from strands_robots.safety.answers import Answer
-from strands_robots.safety.controller import Progress
+from strands_robots.safety.answers import Answer, Progress
 from strands_robots.safety.identity import ROBOTS, EnrolledKeys, KeyFile
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.roster import Roster, RosterRow

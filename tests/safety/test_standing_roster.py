@@ -15,11 +15,12 @@ from strands_robots.safety import ed25519, standing_roster
 from strands_robots.safety.identity import console_key
 from strands_robots.safety.network_key import DEVICE_CONNECT, NetworkKey
 from strands_robots.safety.orders import new_epoch, signed_stop
-from strands_robots.safety.roster import Roster, RosterRow
-from strands_robots.safety.roster_report import (
+from strands_robots.safety.roster import (
     REPORT_MAX_BYTES,
+    Roster,
     RosterInbox,
     RosterReport,
+    RosterRow,
     read_report,
     report_fields,
     trusted_controllers,

@@ -9,11 +9,10 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, Protocol
 
-from strands_robots.safety.controller import OnProgress, Press, Progress, StopReport
+from strands_robots.safety.answers import OnProgress, Press, Progress, StopReport
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.orders import new_epoch
-from strands_robots.safety.roster import Sending
-from strands_robots.safety.roster_report import OnReport
+from strands_robots.safety.roster import OnReport, Sending
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.safety.stop_roster import RosterSearch, StopOutcome, StopRoster
 

@@ -10,19 +10,32 @@ from __future__ import annotations
 import functools
 import threading
 import time
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from strands_robots.audit import audit_head, own_log_id, queue_safety_event
 from strands_robots.rate_limits import EventBudget
-from strands_robots.safety.awake import AWAKE
 from strands_robots.safety.checkin import HEADS_PER_S, CheckInAnswers, CheckInRules, HeadWitness
-from strands_robots.safety.identity import SigningIdentity
+from strands_robots.safety.identity import (
+    DEFAULT_TENANT,
+    KnownKeys,
+    SigningIdentity,
+)
 from strands_robots.safety.missed_stops import MissedStops
 from strands_robots.safety.network_key import NetworkKey
-from strands_robots.safety.orders import LISTENER, PARSED_MAX_BYTES, RobotReport, StopOrder, StopRefused, StopRules
+from strands_robots.safety.orders import (
+    LISTENER,
+    MISSED,
+    PARSED_MAX_BYTES,
+    RobotReport,
+    StopOrder,
+    StopRefused,
+    StopRules,
+)
+from strands_robots.safety.persistence import Original
 from strands_robots.safety.plane import SafetyPlane, plane
-from strands_robots.safety.question_ports import Member, RobotsPort
+from strands_robots.safety.process import AWAKE, shorten_time_slices
 from strands_robots.safety.sighting_file import own_run
 from strands_robots.safety.statements import Purpose, signed
 from strands_robots.safety.stop_link import (
@@ -40,7 +53,6 @@ from strands_robots.safety.stop_link import (
     StopLink,
     notification,
 )
-from strands_robots.safety.turns import shorten_turns
 from strands_robots.stop_log import stop_logger
 from strands_robots.utils import shown
 
@@ -91,6 +103,127 @@ class LatchAnswers:
         if len(self._unanswered) > LATCH_ANSWERS_REMEMBERED:
             del self._unanswered[next(iter(self._unanswered))]
         return False
+
+
+@dataclass(frozen=True, slots=True)
+class Member:
+    """A robot of this process on one network.
+
+    Attributes:
+        robot_id: its id in this process.
+        name: its name on the network.
+        identity: returns what signs for it.
+        was_here: it was served from this machine in the ten minutes before its start.
+    """
+
+    robot_id: str
+    name: str
+    identity: Callable[[], SigningIdentity | None]
+    was_here: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Stated:
+    """A missed stop as an answer has it: its bytes, its age in s and who answered."""
+
+    payload: bytes
+    age_s: float
+    answerer: str
+
+
+class RobotsPort:
+    """The robots of a process on one network.
+
+    Args:
+        network: no missed stop crosses it; None where nothing is asked and answered.
+        members: returns those that are served there now.
+        publish: sends fields as an event of a name on that network.
+        on_report: answers a stop, as for one that came directly.
+        codec: reads the stops of that network.
+    """
+
+    def __init__(
+        self,
+        of: SafetyPlane,
+        rules: StopRules,
+        network: NetworkKey | None,
+        *,
+        members: Callable[[], Sequence[Member]],
+        publish: Callable[[str, str, Mapping[str, Any]], bool],
+        on_report: Callable[[RobotReport], None],
+        codec: StopCodec = JSON_RPC,
+    ) -> None:
+        self._plane, self._rules, self._network = of, rules, "" if network is None else network.text
+        self._codec = codec
+        self._members, self._publish, self._on_report = members, publish, on_report
+        self._keys = KnownKeys(DEFAULT_TENANT if network is None else network.tenant, rules.keys)
+
+    def was_here(self) -> bool:
+        robots = self._plane.robots
+        back = [robots.get(each.robot_id) for each in self._members() if each.was_here]
+        # A state directory that was reset since is that of a newcomer.
+        returned = [each.robot_id for each in back if each is not None and each.returned()]
+        return bool(returned)
+
+    def locked(self) -> bool:
+        return all(each.locked for each in self._plane.robots.values())
+
+    def devices(self) -> Sequence[str]:
+        return [each.name for each in self._members()]
+
+    def publish(self, event: str, source: str, fields: Mapping[str, Any]) -> bool:
+        return self._publish(event, source, fields)
+
+    def signer(self) -> tuple[str, SigningIdentity | None]:
+        members = self._members()
+        # A robot that is locked answers for its process.
+        locked = self._plane.lockouts()
+        for each in sorted(members, key=lambda each: each.robot_id not in locked)[:1]:
+            return each.name, each.identity()
+        return "", None
+
+    def originals(self) -> Sequence[Original]:
+        return self._plane.originals(self._network) if self._network else ()
+
+    def learn(self, source: str, payload: bytes, age_s: float, answerer: str) -> bool:
+        if not self._rules.signed and not self._rules.open:
+            # Who says that an allowed source stopped is not that source.
+            return False
+        if self._rules.source_refusal(source) is not None:
+            return False
+        codec = self._codec
+        fields = codec.fields(payload)
+        epoch = codec.epoch(source, fields)
+        if not epoch:
+            return False
+        stop = StopEvent(ESTOP, source, payload, time.monotonic(), self._network, codec)
+        return self.lock(
+            epoch,
+            lambda: codec.order(self._rules, stop, fields, MISSED, age_s),
+            Stated(payload, age_s, answerer),
+        )
+
+    def lock(self, epoch: str, decide: Callable[[], StopOrder | StopRefused | None], stated: Stated) -> bool:
+        """Lock by a missed stop unless all know it; False when it does not count."""
+        if all(each.latch.knows(epoch) for each in self._plane.robots.values()):
+            self._plane.stated_again(self._network, epoch, stated.payload, stated.age_s)
+            return True
+        order = decide()
+        if not isinstance(order, StopOrder):
+            return False
+        run = self._plane.begin(order, self._on_report)
+        for robot_id in run.robot_ids if run is not None else ():
+            logger.warning("%s is locked by emergency stop %s, which it had missed.", robot_id, epoch)
+            sender, answerer = order.source[:256], stated.answerer[:256]
+            facts = {"epoch": epoch, "source": sender, "answerer": answerer, "age_s": round(stated.age_s, 3)}
+            queue_safety_event("missed_stop_learnt", robot_id, facts)
+        return True
+
+    def knows_key(self, source: str, key: bytes) -> bool:
+        return self._keys.knows(source, key)
+
+    def hold(self, seconds: float) -> None:
+        self._plane.hold(seconds)
 
 
 class ListenerRegistration:
@@ -160,7 +293,7 @@ class EstopListener:
         self._repeated: dict[Hashable, bytes] = {}
         self._queue: FairQueue | None = None
         self._thread: threading.Thread | None = None
-        self._end_short_turns: Callable[[], None] = lambda: None
+        self._end_short_slices: Callable[[], None] = lambda: None
         self._end_watch: Callable[[], None] = lambda: None
 
     @property
@@ -233,7 +366,7 @@ class EstopListener:
             opened.missed.close()
         if events is not None:
             self._end_watch()
-            self._end_short_turns()
+            self._end_short_slices()
             events.close()
         if thread is not None and thread is not threading.current_thread():
             thread.join(2.0)
@@ -354,7 +487,7 @@ class EstopListener:
         self._rules.require_keys()
         self._check_ins = CheckInRules(self._rules)
         audit_head(), own_log_id(), own_run()  # read from the disk now, so that no stop waits for it
-        self._end_short_turns = shorten_turns()
+        self._end_short_slices = shorten_time_slices()
         self._end_watch = AWAKE.watch(self.awake)
         self._queue = FairQueue()
         self._thread = threading.Thread(target=self._run, args=(self._queue,), name="estop-listener", daemon=True)

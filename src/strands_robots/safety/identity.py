@@ -14,7 +14,7 @@ import json
 import os
 import secrets
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -484,3 +484,39 @@ def kept_consoles() -> frozenset[bytes]:
     """
     own = console_key().load()
     return frozenset({*enrolled_consoles().load().values(), *([own.public] if own is not None else [])})
+
+
+KEYS_AGAIN_S = 10.0
+"""Seconds after which the keys of this machine and the enrolled ones are read again."""
+
+KEYS_MAX = 512
+
+
+class KnownKeys:
+    """Keys of this machine's robots, of enrolled ones, and of those who may stop."""
+
+    def __init__(self, tenant: str = DEFAULT_TENANT, stop_keys: Sequence[bytes] = ()) -> None:
+        self._tenant, self._stop_keys = tenant, frozenset(stop_keys)
+        self._known: dict[str, bytes | None] = {}
+        self._enrolled: Mapping[str, bytes] = {}
+        self._read = float("-inf")
+
+    def knows(self, name: str, key: bytes) -> bool:
+        """Return True where ``key`` is that of ``name``, or may stop robots."""
+        if key in self._stop_keys:
+            return True
+        if time.monotonic() - self._read > KEYS_AGAIN_S:
+            self._read, self._known, self._enrolled = time.monotonic(), {}, _enrolled()
+        own = local_name(self._tenant, name)
+        if self._enrolled.get(own) == key:
+            return True
+        if own not in self._known and len(self._known) < KEYS_MAX:
+            self._known[own] = key_here(own)
+        return self._known.get(own) == key
+
+
+def _enrolled() -> Mapping[str, bytes]:
+    try:
+        return EnrolledKeys().load()
+    except (StrandsRobotsError, OSError):
+        return {}

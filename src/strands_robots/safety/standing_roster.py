@@ -16,8 +16,7 @@ from strands_robots.safety.answers import ANSWERS_MAX, Answers, Received
 from strands_robots.safety.estop_listener import FAILURES_IN_ALL_PER_S, FAILURES_PER_S
 from strands_robots.safety.identity import SigningIdentity, console_key
 from strands_robots.safety.orders import StopRules, params_of, stated_epoch
-from strands_robots.safety.roster import Roster, RosterRow
-from strands_robots.safety.roster_report import report_fields
+from strands_robots.safety.roster import Roster, RosterRow, report_fields
 from strands_robots.safety.scope import EVERY_ROBOT, SCOPE, Scope
 from strands_robots.safety.sightings import Known
 from strands_robots.safety.statements import Purpose, signed

@@ -8,12 +8,11 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 from strands_robots.audit import queue_safety_event
-from strands_robots.safety.answers import Answer
-from strands_robots.safety.controller import Progress, SafetyController, StopReport
+from strands_robots.safety.answers import Answer, Progress, StopReport
+from strands_robots.safety.controller import SafetyController
 from strands_robots.safety.identity import key_here, local_name
 from strands_robots.safety.network_key import DEVICE_CONNECT, NetworkKey
-from strands_robots.safety.roster import Roster, RosterRow, Sending, reason_of
-from strands_robots.safety.roster_report import RosterReport
+from strands_robots.safety.roster import Roster, RosterReport, RosterRow, Sending, reason_of
 from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope
 from strands_robots.safety.sightings import Known, Sighting, sightings
 from strands_robots.safety.statements import Proof, Purpose, proof_of

@@ -26,6 +26,12 @@ class Haltable(Protocol):
         """Stop everything that moves this robot; returns within the halt deadline."""
 
 
+class Stoppable(Haltable, Protocol):
+    """A robot that the plane can stop: one with a gate and a halt."""
+
+    gate: MotionGate
+
+
 class RobotWrapper:
     """Robot that stands for another one: their stops are stops of one target."""
 

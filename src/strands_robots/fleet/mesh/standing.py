@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 from strands_robots.bounded_json import json_object
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.orders import PARSED_MAX_BYTES
-from strands_robots.safety.roster import Roster, RosterRow
-from strands_robots.safety.roster_report import RosterInbox
+from strands_robots.safety.roster import Roster, RosterInbox, RosterRow
 from strands_robots.safety.standing_roster import StandingRoster, controllers_identity
 from strands_robots.safety.statements import enrolled_peers, lockout_distrust
 from strands_robots.safety.stop_link import ESTOP
