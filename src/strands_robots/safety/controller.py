@@ -32,7 +32,7 @@ from strands_robots.safety.identity import (
     KeyFileError,
     SigningIdentity,
 )
-from strands_robots.safety.missed_stops import MissedStops
+from strands_robots.safety.missed_stops import MissedStops, MissedStopsPort
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.orders import (
     REASON_MAX,
@@ -553,7 +553,7 @@ class _Running:
         )
 
 
-class ControllerPort:
+class ControllerPort(MissedStopsPort):
     """A safety controller, which answers with the stops that it sent.
 
     A stop is told until each robot that must answer it has; one without such robots for as long as there is the
@@ -588,15 +588,6 @@ class ControllerPort:
         """Note that every robot that must answer this stop has."""
         self._open.pop(estop_id, None)
 
-    def was_here(self) -> bool:
-        return False
-
-    def locked(self) -> bool:
-        return False
-
-    def devices(self) -> Sequence[str]:
-        return ()
-
     def publish(self, event: str, source: str, fields: Mapping[str, Any]) -> bool:
         return self._publish(event, source, fields)
 
@@ -607,9 +598,6 @@ class ControllerPort:
         epochs = frozenset(tuple(self._open))
         self._originals.keep(epochs)
         return self._originals.of(epochs)
-
-    def learn(self, source: str, payload: bytes, age_s: float, answerer: str) -> bool:
-        return False
 
     def knows_key(self, source: str, key: bytes) -> bool:
         own = self._identity is not None and self._identity.public == key

@@ -22,7 +22,7 @@ from strands_robots.safety.identity import (
     KnownKeys,
     SigningIdentity,
 )
-from strands_robots.safety.missed_stops import MissedStops
+from strands_robots.safety.missed_stops import MissedStops, MissedStopsPort
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.orders import (
     LISTENER,
@@ -131,7 +131,7 @@ class Stated:
     answerer: str
 
 
-class RobotsPort:
+class RobotsPort(MissedStopsPort):
     """The robots of a process on one network.
 
     Args:

@@ -16,11 +16,12 @@ import random
 import secrets
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from strands_robots.audit import queue_safety_event
 from strands_robots.safety import ed25519
@@ -102,27 +103,33 @@ JUDGED_MAX = 4096
 AUDIT_EVERY_S = 10.0
 
 
-class MissedStopsPort(Protocol):
-    """A process as asker and answerer on one network.
+class MissedStopsPort(ABC):
+    """A process as asker and answerer on one network; one without robots only answers.
 
-    A network supplies it. No method blocks on the network, and none raises for its state.
+    No method blocks on the network, and none raises for its state.
     """
 
     def was_here(self) -> bool:
         """Return True where a robot was served from here before its start."""
+        return False
 
     def locked(self) -> bool:
         """Return True while every robot of the process is locked."""
+        return False
 
     def devices(self) -> Sequence[str]:
         """Return the names of the robots that ask; none, and nothing is asked."""
+        return ()
 
+    @abstractmethod
     def publish(self, event: str, source: str, fields: Mapping[str, Any]) -> bool:
         """Send a question or an answer as ``source``; False when the link is down."""
 
+    @abstractmethod
     def signer(self) -> tuple[str, SigningIdentity | None]:
         """Return the name that answers and what signs, None where there is no key."""
 
+    @abstractmethod
     def originals(self) -> Sequence[Original]:
         """Return the stops to answer with, as of now."""
 
@@ -132,10 +139,13 @@ class MissedStopsPort(Protocol):
         Args:
             age_s: seconds since it was first received, as ``answerer`` says.
         """
+        return False
 
+    @abstractmethod
     def knows_key(self, source: str, key: bytes) -> bool:
         """Return True where ``key`` is known to be that of ``source``."""
 
+    @abstractmethod
     def hold(self, seconds: float) -> None:
         """Hold the motions of the robots for so long; return at once."""
 

@@ -274,8 +274,12 @@ class Roster:
         return replace(joined, rows=in_order(rows.values()), exempt=exempt, enrolled=enrolled)
 
     def counts(self, row: RosterRow) -> bool:
-        """True when the exit code depends on this row."""
-        return row.stoppable is not False and (not self.enrolled or row.known is not Known.HEARD)
+        """Return True when the exit code depends on this row.
+
+        That a device has no stop is said by its presence, which is not signed: it exempts no robot that has shown a
+        key.
+        """
+        return row.known is not Known.HEARD or (row.stoppable is not False and not self.enrolled)
 
     @property
     def must_answer(self) -> tuple[RosterRow, ...]:

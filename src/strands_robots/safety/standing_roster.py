@@ -21,7 +21,6 @@ from strands_robots.safety.scope import EVERY_ROBOT, SCOPE, Scope
 from strands_robots.safety.sightings import Known
 from strands_robots.safety.statements import Purpose, signed
 from strands_robots.safety.stop_link import ESTOP
-from strands_robots.safety.stop_roster import counts
 from strands_robots.stop_log import stop_logger
 
 logger = stop_logger(__name__)
@@ -224,7 +223,7 @@ class StandingRoster:
             self._answers, self._bytes = {}, 0
 
     def _missing(self, followed: _Followed, roster: Roster, keys: Mapping[str, bytes]) -> list[RosterRow]:
-        rows = {row.name: row for row in roster.rows if row.stoppable is not False or counts(roster, row)}
+        rows = {row.name: row for row in roster.rows if row.stoppable is not False or roster.counts(row)}
         marked = {row.name for row in roster.exempt}
         rows |= {name: RosterRow(name, Known.HEARD) for name in self._also() if name not in rows and name not in marked}
         scope = followed.scope

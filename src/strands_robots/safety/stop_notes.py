@@ -11,7 +11,7 @@ from strands_robots.safety.network_key import MESH, NetworkKey
 from strands_robots.safety.persistence import StoredLockout
 from strands_robots.safety.roster import UNTOLD, Roster, RosterRow, cannot_answer, described
 from strands_robots.safety.sightings import sightings, this_moment
-from strands_robots.safety.stop_roster import NAMED_MAX, StopOutcome, counts
+from strands_robots.safety.stop_roster import NAMED_MAX, StopOutcome
 from strands_robots.state_files import uptime
 
 STOPS_ANYWAY = "Bare devices and robots of earlier releases stop all the same."
@@ -129,7 +129,7 @@ def unheard_now(network: NetworkKey, heard: Collection[str]) -> Unheard:
         roster = Roster.of(network)
     except Exception as exc:  # noqa: BLE001 - said in place of the names
         return Unheard(problem=f"the roster cannot be read: {exc}")
-    names = (row.name for row in roster.rows if counts(roster, row) and row.name not in heard)
+    names = (row.name for row in roster.must_answer if row.name not in heard)
     return Unheard(tuple(names), "; ".join(roster.problems))
 
 
@@ -166,7 +166,7 @@ def _without(lockout: Lockout, robots: Collection[str], acted: Mapping[str, Coll
     for network in {each.network for each in found if each.name in robots}:
         roster = Roster.of(network, uptime() - ago)
         for row in roster.rows:
-            must = counts(roster, row) and lockout.scope.covers(row.name, {row.cell} - {""})
+            must = roster.counts(row) and lockout.scope.covers(row.name, {row.cell} - {""})
             if must and not _had(row, lockout.epoch, ago, acted):
                 yield row.name
 

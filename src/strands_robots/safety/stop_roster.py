@@ -227,8 +227,8 @@ class StopRoster:
         with self._lock:
             roster = self._whole(answers.items())
             heard = {name for name, stops in self._found.items() if stops} | answers.keys()
-            others = [row.name for row in roster.rows if row.name in heard and not counts(roster, row)]
-            return frozenset((*(row.name for row in roster.rows if counts(roster, row)), *others[:OTHERS_AWAITED]))
+            others = [row.name for row in roster.rows if row.name in heard and not roster.counts(row)]
+            return frozenset((*(row.name for row in roster.must_answer), *others[:OTHERS_AWAITED]))
 
     def wait_until_read(self) -> bool:
         """Wait at most :data:`READ_WITHIN_S` for the disk; False where it hangs."""
@@ -261,7 +261,7 @@ class StopRoster:
         problems += self._unsure(roster, report)
         rows = {row.name: row for row in roster.rows}
         report, divided = self._proven(report, rows)
-        must = {row.name for row in roster.rows if counts(roster, row)} | report.alarms.keys()
+        must = {row.name for row in roster.must_answer} | report.alarms.keys()
         no_stop = tuple(row.name for row in roster.rows if row.stoppable is False and row.name not in must)
         told = {*rows} - must - {*no_stop}
         counted, others = _part(report, must), _part(report, told)
@@ -405,19 +405,9 @@ def robots_known_at(network: Callable[[], NetworkKey]) -> Remembers:
 
     def remembers(scope: Scope) -> bool:
         roster = Roster.of(network())
-        return any(scope.names(row.name, row.last_cell) for row in roster.rows if counts(roster, row))
+        return any(scope.names(row.name, row.last_cell) for row in roster.must_answer)
 
     return remembers
-
-
-def counts(roster: Roster, row: RosterRow) -> bool:
-    """Return True when the exit code depends on this row.
-
-    That a device has no stop is said by its presence, which is not signed: it exempts no robot that has shown a key.
-    """
-    if row.known is not Known.HEARD:
-        return True
-    return row.stoppable is not False and not roster.enrolled
 
 
 def _divided(missing: Sequence[int], processes: int) -> str:
