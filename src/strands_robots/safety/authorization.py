@@ -12,7 +12,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-import os
 import re
 import secrets
 import threading
@@ -23,7 +22,15 @@ from pathlib import Path
 from typing import Any
 
 from strands_robots import settings
-from strands_robots.state_files import boot, make_private, read_private, require_private, state_dir, uptime
+from strands_robots.state_files import (
+    boot,
+    make_private,
+    read_private,
+    require_private,
+    state_dir,
+    uptime,
+    write_private,
+)
 from strands_robots.stop_log import stop_logger
 from strands_robots.utils import ValidationError, canonical_json, identifier, number, shown, text
 
@@ -240,10 +247,8 @@ class Grants:
         make_private(self.folder)
         require_private(self.folder, self._root)
         path = self.folder / f"{name}+{secrets.token_hex(8)}"
-        writing = path.with_name(f".{path.name}")
-        with os.fdopen(os.open(writing, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
-            json.dump({"verb": verb, "peer": peer, "boot": boot(), "until": self._clock() + lasts, **bound}, file)
-        writing.rename(path)
+        grant = {"verb": verb, "peer": peer, "boot": boot(), "until": self._clock() + lasts, **bound}
+        write_private(path, json.dumps(grant).encode())
         return path
 
     def claim(self, verb: str, peer: str, callers: Collection[str] = (), arguments_digest: str = "") -> Leave | None:

@@ -23,7 +23,15 @@ from strands_robots import settings
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety import ed25519
 from strands_robots.safety.network_key import NetworkKey
-from strands_robots.state_files import OPEN, StateFileError, make_private, read_private, require_private, state_dir
+from strands_robots.state_files import (
+    OPEN,
+    StateFileError,
+    make_private,
+    read_private,
+    require_private,
+    state_dir,
+    write_private,
+)
 from strands_robots.stop_log import stop_logger
 from strands_robots.utils import field_values, identifier
 
@@ -134,7 +142,7 @@ class KeyFile:
         known = self.load()
         if known is None:
             _make_folder(self.path.parent, self._root)
-            _write_once(self.path, ed25519.encode(secrets.token_bytes(SEED_BYTES)).encode() + b"\n")
+            write_private(self.path, ed25519.encode(secrets.token_bytes(SEED_BYTES)).encode() + b"\n", once=True)
             known = self.load()
         if known is None:
             raise KeyFileError(f"{self.path} was removed while it was made.")
@@ -376,7 +384,7 @@ class EnrolledKeys:
         content = json.dumps({"v": VERSION, "saved": time.time(), "robots": records}, indent=1).encode()
         if len(content) >= FILE_MAX_BYTES:
             raise KeyFileError(f"{self.path} would be too long: forget robots first.")
-        _draft(self.path, content).replace(self.path)
+        write_private(self.path, content)
 
 
 def _robot(record: Mapping[str, Any]) -> EnrolledRobot | None:
@@ -436,26 +444,6 @@ def _read_private(path: Path, root: Path) -> bytes:
 def _make_folder(folder: Path, root: Path) -> None:
     make_private(folder)
     require_private(folder, root, error=KeyFileError)
-
-
-def _draft(path: Path, content: bytes) -> Path:
-    draft = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
-    descriptor = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
-    with os.fdopen(descriptor, "wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    return draft
-
-
-def _write_once(path: Path, content: bytes) -> None:
-    """Write a file whole, unless another process wrote it first."""
-    draft = _draft(path, content)
-    try:
-        with contextlib.suppress(FileExistsError):
-            os.link(draft, path)
-    finally:
-        draft.unlink()
 
 
 PUBLIC_KEYS = "STRANDS_MESH_CONSOLE_PUBLIC_KEYS"

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import secrets
 import threading
 import time
@@ -32,6 +31,7 @@ from strands_robots.state_files import (
     require_private,
     state_dir,
     uptime,
+    write_private,
 )
 from strands_robots.stop_log import stop_logger
 from strands_robots.utils import ValidationError, canonical_json, identifier, shown, text
@@ -255,7 +255,10 @@ def order_clearance(who: str, robot_ids: Iterable[str]) -> list[Path]:
     directory = clearances()
     make_private(directory)
     asked = {"who": who, "boot": boot(), "t": uptime()}
-    return [_write_order(directory, {**asked, "robot_id": name}) for name in names]
+    paths = [directory / f"{secrets.token_hex(8)}.json" for _ in names]
+    for path, name in zip(paths, names, strict=True):
+        write_private(path, json.dumps({**asked, "robot_id": name}).encode())
+    return paths
 
 
 def clear_here(who: str, robot_ids: Iterable[str], wait_s: float = 2.0) -> dict[str, str]:
@@ -324,15 +327,6 @@ def _clear_on_disk(who: str, name: str) -> bool:
     return True
 
 
-def _write_order(directory: Path, order: dict[str, Any]) -> Path:
-    path = directory / f"{secrets.token_hex(8)}.json"
-    draft = path.with_suffix(".draft")
-    descriptor = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
-    with os.fdopen(descriptor, "w") as file:
-        json.dump(order, file)
-    return draft.replace(path)
-
-
 class ClearanceInbox:
     """Orders for the robots of this process.
 
@@ -389,5 +383,6 @@ def _sweep(directory: Path) -> None:
     """Remove orders of processes that died, and answers that no caller waited for."""
     for path in directory.iterdir():
         with contextlib.suppress(OSError):  # gone meanwhile, or none of ours
-            if path.suffix in (".taken", ".draft", ".said") and time.time() - path.lstat().st_mtime > VALID_S:
+            left = path.suffix in (".taken", ".draft", ".said") or path.name.startswith(".")
+            if left and time.time() - path.lstat().st_mtime > VALID_S:
                 path.unlink()
