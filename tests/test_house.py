@@ -36,6 +36,7 @@ FLOORS: list[set[str]] = [
         "_mesh_switch",
         "zenoh_session",
         "rate_limits",
+        "threads",
         "certificates",
     },
     {"safety", "audit", "contract", "verb_declaration", "verb_parameters"},

@@ -14,7 +14,6 @@ import math
 import os
 import random
 import secrets
-import threading
 import time
 from abc import ABC, abstractmethod
 from collections import deque
@@ -33,6 +32,7 @@ from strands_robots.safety.statements import Purpose, own_key, signed
 from strands_robots.safety.stop_link import ANSWER, JSON_RPC, QUESTION, FairQueue
 from strands_robots.state_files import StateFileError, make_private, require_private, state_dir, uptime
 from strands_robots.stop_log import stop_logger
+from strands_robots.threads import WokenThread
 from strands_robots.utils import shown
 
 logger = stop_logger(__name__)
@@ -352,9 +352,7 @@ class MissedStops:
         self._linked, self._up = False, False
         self._back, self._pace = False, HoldPace()
         self._audited = float("-inf")
-        self._waiting, self._starting = threading.Event(), threading.Lock()
-        self._closed = False
-        self._thread: threading.Thread | None = None
+        self._worker = WokenThread("missed-stops", self._step_safely, self._due_in)
 
     def ask(self, reason: str) -> None:
         """Hold the motions and ask; return at once.
@@ -364,7 +362,7 @@ class MissedStops:
         """
         self._port.hold(UNITE_S)
         self._reasons.append(reason)
-        self._wake()
+        self._worker.wake()
 
     def back(self, reason: str = BACK) -> None:
         """Ask because of a link; return at once.
@@ -372,7 +370,7 @@ class MissedStops:
         Where the reason is :data:`BACK`, motions hold as the question leaves, as often as :class:`HoldPace` allows.
         """
         self._reasons.append(reason)
-        self._wake()
+        self._worker.wake()
 
     def link_up(self) -> None:
         """Ask because the link is back, or at its first time :meth:`started`.
@@ -393,7 +391,7 @@ class MissedStops:
     def started(self) -> None:
         """Ask because a robot is served from now on, unless it is a newcomer."""
         self._reasons.append(STARTED)
-        self._wake()
+        self._worker.wake()
 
     def receive(self, event: str, source: str, payload: bytes | int) -> None:
         """Take a question or an answer from a link's thread; return at once."""
@@ -402,42 +400,27 @@ class MissedStops:
         if event == QUESTION:
             if len(self._questions) < QUESTIONS_MAX and not self._answerer.full:
                 self._questions.append((source, payload))
-                self._wake()
+                self._worker.wake()
         elif self._asker.listens(self._clock()) or self._answerer.waits or self._questions:
             self._answers.put(ANSWER, source, payload)
-            self._wake()
+            self._worker.wake()
 
     def close(self) -> None:
         """End the thread. Safe to call twice."""
-        with self._starting:
-            self._closed, thread = True, self._thread
-        self._waiting.set()
-        if thread is not None and thread is not threading.current_thread():
-            thread.join(2.0)
+        self._worker.close()
 
-    def _wake(self) -> None:
-        if self._thread is None:
-            with self._starting:
-                if self._thread is None and not self._closed:
-                    self._thread = threading.Thread(target=self._run, name="missed-stops", daemon=True)
-                    self._thread.start()
-        if not self._waiting.is_set():
-            self._waiting.set()
+    def _due_in(self) -> float:
+        return min(self._asker.due, self._answerer.due) - self._clock()
 
-    def _run(self) -> None:
-        while not self._closed:
-            due = min(self._asker.due, self._answerer.due) - self._clock()
-            if due > 0:
-                self._waiting.wait(None if due == float("inf") else due)
-            self._waiting.clear()
-            try:
-                self.step()
-            except Exception:
-                logger.critical("A question for missed stops failed.", exc_info=True)
-                # What could not be answered is not due for ever; our own question is tried again.
-                self._questions.clear()
-                self._answerer.take((), self._clock())
-                time.sleep(RETRY_S)
+    def _step_safely(self) -> None:
+        try:
+            self.step()
+        except Exception:
+            logger.critical("A question for missed stops failed.", exc_info=True)
+            # What could not be answered is not due for ever; our own question is tried again.
+            self._questions.clear()
+            self._answerer.take((), self._clock())
+            time.sleep(RETRY_S)
 
     def step(self) -> None:
         """Do what is due now; the thread does so whenever something is."""

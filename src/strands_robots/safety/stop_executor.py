@@ -20,7 +20,7 @@ import weakref
 from collections import deque
 from collections.abc import Callable, Hashable
 from concurrent.futures import Future
-from typing import Generic, TypeVar, cast
+from typing import cast
 
 from strands_robots import settings
 from strands_robots.safety.stop_targets import (
@@ -41,6 +41,7 @@ from strands_robots.safety.stop_targets import (
 )
 from strands_robots.safety.stopping import PendingVerdict, StopVerdict
 from strands_robots.stop_log import stop_logger
+from strands_robots.threads import ReadyThreads
 
 logger = stop_logger(__name__)
 
@@ -65,90 +66,6 @@ DIRECT_SHARE, RETURN_SHARE = 0.9, 0.85
 """Parts of the deadline after which a direct target is answered for, and by which its halt should return.
 
 The rest is for the verdict to reach the caller in time."""
-
-
-T = TypeVar("T")
-
-
-class ReadyThreads(Generic[T]):
-    """A number of idle threads; each one that is taken is replaced at once.
-
-    Work that blocks therefore never uses them up, and no work waits behind it.
-
-    Args:
-        label: begins the name of each thread.
-        count: how many stand ready.
-        work: done on one of them with each item.
-        start: starts a thread; may raise ``RuntimeError``.
-        used_up: called when the last idle thread was taken; :meth:`refill` is then due, on another thread.
-    """
-
-    def __init__(
-        self,
-        label: str,
-        count: int,
-        work: Callable[[T], None],
-        start: Callable[[threading.Thread], None],
-        used_up: Callable[[], None],
-    ) -> None:
-        self._label, self._count = label, count
-        self._work, self._start, self._used_up = work, start, used_up
-        self.items: queue.SimpleQueue[T | None] = queue.SimpleQueue()
-        """An item put here is worked on, None is passed over."""
-        self._counting = threading.Lock()
-        self._idle = 0
-        self._numbers = itertools.count()
-        self.wanted = False
-        """True from the first :meth:`prepare` that had a thread."""
-
-    def prepare(self) -> None:
-        """Make the threads ready.
-
-        Raises:
-            RuntimeError: no thread can be started, and none is idle.
-        """
-        self.wanted = True
-        try:
-            self.refill()
-        except RuntimeError:
-            self.wanted = self._idle > 0
-            raise
-
-    def refill(self) -> None:
-        """Start threads until as many as wanted are idle.
-
-        Raises:
-            RuntimeError: no further thread can be started.
-        """
-        while True:
-            # Counted first: a thread that has done its work meanwhile must not stay as one too many.
-            with self._counting:
-                if self._idle >= self._count or not self.wanted:
-                    return
-                self._idle += 1
-            name = f"{self._label}-{next(self._numbers)}"
-            try:
-                self._start(threading.Thread(target=self._run, name=name, daemon=True))
-            except BaseException:
-                with self._counting:
-                    self._idle -= 1
-                raise
-
-    def _run(self) -> None:
-        while True:
-            item = self.items.get()
-            with self._counting:
-                self._idle -= 1
-                used_up = self._idle == 0
-            if used_up:
-                self._used_up()
-            if item is not None:
-                self._work(item)
-            del item
-            with self._counting:
-                if self._idle >= self._count:
-                    return
-                self._idle += 1
 
 
 _Wake = queue.SimpleQueue[TargetSlot | None]

@@ -1,0 +1,136 @@
+"""Threads that stand ready for work, and threads that sleep until there is some."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import queue
+import threading
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+T = TypeVar("T")
+
+
+class ReadyThreads(Generic[T]):
+    """A number of idle threads; each one that is taken is replaced at once.
+
+    Work that blocks therefore never uses them up, and no work waits behind it.
+
+    Args:
+        label: begins the name of each thread.
+        count: how many stand ready.
+        work: done on one of them with each item.
+        start: starts a thread; may raise ``RuntimeError``.
+        used_up: called when the last idle thread was taken; :meth:`refill` is then due, on another thread.
+    """
+
+    def __init__(
+        self,
+        label: str,
+        count: int,
+        work: Callable[[T], None],
+        start: Callable[[threading.Thread], None],
+        used_up: Callable[[], None],
+    ) -> None:
+        self._label, self._count = label, count
+        self._work, self._start, self._used_up = work, start, used_up
+        self.items: queue.SimpleQueue[T | None] = queue.SimpleQueue()
+        """An item put here is worked on, None is passed over."""
+        self._counting = threading.Lock()
+        self._idle = 0
+        self._numbers = itertools.count()
+        self.wanted = False
+        """True from the first :meth:`prepare` that had a thread."""
+
+    def prepare(self) -> None:
+        """Make the threads ready.
+
+        Raises:
+            RuntimeError: no thread can be started, and none is idle.
+        """
+        self.wanted = True
+        try:
+            self.refill()
+        except RuntimeError:
+            self.wanted = self._idle > 0
+            raise
+
+    def refill(self) -> None:
+        """Start threads until as many as wanted are idle.
+
+        Raises:
+            RuntimeError: no further thread can be started.
+        """
+        while True:
+            # Counted first: a thread that has done its work meanwhile must not stay as one too many.
+            with self._counting:
+                if self._idle >= self._count or not self.wanted:
+                    return
+                self._idle += 1
+            name = f"{self._label}-{next(self._numbers)}"
+            try:
+                self._start(threading.Thread(target=self._run, name=name, daemon=True))
+            except BaseException:
+                with self._counting:
+                    self._idle -= 1
+                raise
+
+    def _run(self) -> None:
+        while True:
+            item = self.items.get()
+            with self._counting:
+                self._idle -= 1
+                used_up = self._idle == 0
+            if used_up:
+                self._used_up()
+            if item is not None:
+                self._work(item)
+            del item
+            with self._counting:
+                if self._idle >= self._count:
+                    return
+                self._idle += 1
+
+
+class WokenThread:
+    """Thread that sleeps until it is woken or something is due; started at its first wake.
+
+    Args:
+        name: of the thread.
+        step: done after each wake, and when something is due; it may not raise.
+        due_in: returns the seconds until then; infinite where only a wake counts.
+    """
+
+    def __init__(self, name: str, step: Callable[[], None], due_in: Callable[[], float] = lambda: math.inf) -> None:
+        self._name, self._step, self._due_in = name, step, due_in
+        self._woken, self._starting = threading.Event(), threading.Lock()
+        self._closed = False
+        self._thread: threading.Thread | None = None
+
+    def wake(self) -> None:
+        """Have the step done soon; return at once."""
+        if self._thread is None:
+            with self._starting:
+                if self._thread is None and not self._closed:
+                    self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
+                    self._thread.start()
+        if not self._woken.is_set():
+            self._woken.set()
+
+    def close(self, wait_s: float = 2.0) -> None:
+        """End the thread after its step. Safe to call twice."""
+        with self._starting:
+            self._closed, thread = True, self._thread
+        self._woken.set()
+        if thread is not None and thread is not threading.current_thread():
+            thread.join(wait_s)
+
+    def _run(self) -> None:
+        while not self._closed:
+            left_s = self._due_in()
+            if left_s > 0:
+                self._woken.wait(None if left_s == math.inf else left_s)
+            self._woken.clear()
+            if not self._closed:
+                self._step()
