@@ -14,6 +14,7 @@ import hashlib
 import os
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -118,7 +119,7 @@ class Sightings:
         self._noted: dict[tuple[NetworkKey, str], tuple[float, Facts]] = {}
         self._tidied = float("-inf")
         self._crowded = False
-        self._notes: dict[tuple[NetworkKey, str], Note] = {}
+        self._notes: deque[Note] = deque(maxlen=2 * ROWS_MAX)
         self._answers: list[_Answer] = []
         self._own: dict[tuple[NetworkKey, str], Served] = {}
         self._changed: dict[tuple[NetworkKey, str], Served] = {}
@@ -166,8 +167,7 @@ class Sightings:
         with self._lock:
             if not self._admitted(key, now, stated if facts == (None, None, None) else facts):
                 return
-            waiting = self._notes.get(key)
-            self._notes[key] = heard if waiting is None else waiting.merged(heard)
+            self._notes.append(heard)
             self._start()
 
     def note_answer(
@@ -379,7 +379,8 @@ class Sightings:
     def _write_batch(self) -> str:
         """Write what is queued, and queue it again where that fails; return the problem."""
         with self._lock:
-            notes, self._notes = self._notes, {}
+            notes = list(self._notes)
+            self._notes.clear()
             answers, self._answers = self._answers, []
             served, self._changed = self._changed, {}
             self._writing = True
@@ -394,7 +395,7 @@ class Sightings:
 
     def _written(
         self,
-        notes: dict[tuple[NetworkKey, str], Note],
+        notes: list[Note],
         answers: list[_Answer],
         served: dict[tuple[NetworkKey, str], Served],
         problem: str,
@@ -402,9 +403,7 @@ class Sightings:
         """Note the outcome of a write."""
         with self._lock:
             if problem:
-                for key, later in self._notes.items():
-                    notes[key] = notes[key].merged(later) if key in notes else later
-                self._notes = notes
+                self._notes = deque([*notes, *self._notes], self._notes.maxlen)
                 self._changed = {**served, **self._changed}
                 self._answers = (answers + self._answers)[:ANSWERS_MAX]
             if problem and problem != self.problem:
@@ -416,14 +415,14 @@ class Sightings:
 
     def _write(
         self,
-        notes: Mapping[tuple[NetworkKey, str], Note],
+        notes: Iterable[Note],
         answers: Iterable[_Answer],
         served: Mapping[tuple[NetworkKey, str], Served],
     ) -> str:
         """Write one batch; return the problem, or ""."""
         signed = [(each, key) for each in answers if (key := _key_of(each)) is not None]
         counted = self._counted(signed)
-        all_notes = [*notes.values(), *(Note(each.network, each.name, each.at, each.at) for each, _ in counted)]
+        all_notes = [*notes, *(Note(each.network, each.name, each.at, each.at) for each, _ in counted)]
         crowded, self._crowded = self._crowded, False
         try:
             self.file.write(all_notes, list(served.values()), self._clock(), crowded=crowded)
