@@ -15,17 +15,22 @@ from strands_robots.cli.output import Exit
 from strands_robots.cli.stop import exit_code, report_rows, style_of, summary
 from strands_robots.device_connect.backends import loopback_config
 from strands_robots.device_connect.client import Peer
-from strands_robots.device_connect.enrollment import network_of
+from strands_robots.device_connect.links import network_of
 from strands_robots.envelope import Envelope, success
 from strands_robots.fleet.adapter import LockoutReport
 from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.safety_console import SafetyConsole, WatchedRobots
 from strands_robots.safety import statements
-from strands_robots.safety.answers import Answer
-from strands_robots.safety.consoles import enrolled_consoles
-from strands_robots.safety.controller import StopReport
+from strands_robots.safety.answers import Answer, StopReport
 from strands_robots.safety.ed25519 import keygen
-from strands_robots.safety.identity import ROBOTS, EnrolledKeys, KeyFile, SigningIdentity, fingerprint
+from strands_robots.safety.identity import (
+    ROBOTS,
+    EnrolledKeys,
+    KeyFile,
+    SigningIdentity,
+    enrolled_consoles,
+    fingerprint,
+)
 from strands_robots.safety.statements import Proof, Purpose, signed
 from strands_robots.utils import operator
 

@@ -19,8 +19,7 @@ from strands_robots.fleet import joining, safety_console
 from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH, LockoutReport
 from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.safety_console import SafetyConsole, WatchedRobots
-from strands_robots.safety.answers import Answer
-from strands_robots.safety.controller import Progress
+from strands_robots.safety.answers import Answer, Progress
 from strands_robots.safety.lockout import Lockout
 
 

@@ -13,8 +13,7 @@ from strands_robots.cli.stop import exit_code
 from strands_robots.fleet.adapter import LockoutReport
 from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.safety_console import SafetyConsole, StopButtons, WatchedRobots
-from strands_robots.safety.answers import Answer
-from strands_robots.safety.controller import StopReport
+from strands_robots.safety.answers import Answer, StopReport
 from strands_robots.safety.identity import EnrolledKeys
 from strands_robots.safety.lockout import Lockout, LockoutState
 from strands_robots.safety.network_key import MESH, NetworkKey

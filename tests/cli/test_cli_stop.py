@@ -21,16 +21,15 @@ from strands_robots.cli.stop import exit_code, progress_rows, report_rows, show_
 from strands_robots.device_connect import safety_controller
 from strands_robots.device_connect.backends import loopback_config
 from strands_robots.device_connect.discovery import Peer, RegistryError
-from strands_robots.device_connect.enrollment import network_of
+from strands_robots.device_connect.links import network_of
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.errors import UnreachableError
 from strands_robots.fleet.adapter import StopRequest
 from strands_robots.fleet.device_connect.network import DeviceConnectNetwork
 from strands_robots.fleet.verdicts import stop_outcome
-from strands_robots.safety.answers import Answer
-from strands_robots.safety.controller import Progress, StopReport
+from strands_robots.safety.answers import Answer, Progress, StopReport
+from strands_robots.safety.roster import Sending
 from strands_robots.safety.sightings import sightings
-from strands_robots.safety.silence import Sending
 
 
 def answer(name: str, stopped: bool | None = True, ms: float = 3.0, why: str = "") -> Answer:

@@ -30,8 +30,8 @@ from strands_robots.safety import network_key
 from strands_robots.safety.identity import SigningIdentity
 from strands_robots.safety.lockout import Lockout
 from strands_robots.safety.network_key import NetworkKey
+from strands_robots.safety.roster import Sending
 from strands_robots.safety.scope import EVERY_ROBOT, KnownRobots, Scope
-from strands_robots.safety.silence import Sending
 from strands_robots.safety.statements import Purpose
 from strands_robots.safety.statements import signed as signed_by
 from strands_robots.safety.stop_roster import StopOutcome, StopRoster

@@ -22,7 +22,6 @@ from strands_robots.fleet.lockouts import (
     served_here,
 )
 from strands_robots.safety import ed25519
-from strands_robots.safety.consoles import enrolled_consoles
 from strands_robots.safety.identity import (
     DEFAULT_TENANT,
     OFF,
@@ -30,10 +29,11 @@ from strands_robots.safety.identity import (
     EnrolledKeys,
     EnrolledRobot,
     KeyFileError,
+    enrolled_consoles,
     fingerprint,
 )
 from strands_robots.safety.lockout import utc
-from strands_robots.safety.silence import described
+from strands_robots.safety.roster import described
 from strands_robots.utils import identifier, number, operator, shown, text
 
 REASON_MAX = 200

@@ -30,8 +30,7 @@ from strands_robots.fleet.device_connect.config import described
 from strands_robots.policies import warm_profiles
 from strands_robots.policies.base import SPEED_MAX
 from strands_robots.policies.profiles import load_profiles
-from strands_robots.safety.approval import listed
-from strands_robots.safety.authorization import motion_refusal
+from strands_robots.safety.authorization import listed, motion_refusal
 from strands_robots.safety.sightings import DuplicateDeviceError
 from strands_robots.tags import own_tags
 from strands_robots.utils import ValidationError, identifier, number, own_device_id, redacted, shown, text
@@ -40,7 +39,7 @@ if TYPE_CHECKING:
     from device_connect_edge.drivers import DeviceDriver
 
     from strands_robots.device_connect.backends import LinkConfig
-    from strands_robots.device_connect.shutdown import StopSignal
+    from strands_robots.device_connect.process import StopSignal
 
 EVERY_PROGRAM_HERE = "Every program of this machine can drive and read it, no other machine can."
 
@@ -332,7 +331,7 @@ def _arm_options(mode: str, model: Path | None, detector: str | None) -> dict[st
 
 def _serve(screen: Screen, body: Any, served: AbstractContextManager[str], *, piped: bool) -> None:
     """Serve until a signal comes, stop the robot, and leave the network."""
-    from strands_robots.device_connect.shutdown import StopSignal  # noqa: PLC0415 - loads nothing of the framework
+    from strands_robots.device_connect.process import StopSignal  # noqa: PLC0415 - loads nothing of the framework
 
     with StopSignal() as signals:
         with served as peer_id:

@@ -16,11 +16,9 @@ from strands_robots.safety.lockout import Lockout
 from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope
 
 if TYPE_CHECKING:
-    from strands_robots.safety.controller import OnProgress, StopReport
+    from strands_robots.safety.answers import OnProgress, Press, StopReport
     from strands_robots.safety.network_key import NetworkKey
-    from strands_robots.safety.presses import Press
-    from strands_robots.safety.roster_inbox import OnReport
-    from strands_robots.safety.silence import Sending
+    from strands_robots.safety.roster import OnReport, Sending
     from strands_robots.safety.stop_roster import StopOutcome
     from strands_robots.serving.advertised import AdvertisedVerb
 

@@ -14,10 +14,10 @@ from strands_robots.fleet.adapter import FIND_S, LockoutReport, NetworkAdapter, 
 from strands_robots.fleet.networks import Networks
 from strands_robots.safety.identity import EnrolledKeys, Exemption, KeyFileError, fingerprint, local_name
 from strands_robots.safety.network_key import NetworkKey
-from strands_robots.safety.roster_report import CELL_MAX
+from strands_robots.safety.roster import CELL_MAX
 from strands_robots.safety.sightings import sightings
 from strands_robots.safety.statements import Purpose, distrust, own_key
-from strands_robots.safety.unheard import Unheard, unheard_now
+from strands_robots.safety.stop_notes import Unheard, unheard_now
 from strands_robots.utils import near, operator, plain_text, shown
 
 FORGET = "forget"

@@ -14,12 +14,11 @@ from strands_robots.errors import RefusalError
 from strands_robots.fleet.adapter import LockoutReport, NetworkAdapter, StopSender
 from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.standing import StandingController
-from strands_robots.safety.controller import Progress, StopReport
+from strands_robots.safety.answers import Progress, StopReport
 from strands_robots.safety.identity import KeyFileError
 from strands_robots.safety.orders import new_epoch
-from strands_robots.safety.roster_search import RosterSearch
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
-from strands_robots.safety.stop_roster import StopOutcome, StopRoster
+from strands_robots.safety.stop_roster import RosterSearch, StopOutcome, StopRoster
 from strands_robots.utils import plain_text
 
 logger = logging.getLogger(__name__)

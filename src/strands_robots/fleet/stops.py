@@ -16,7 +16,7 @@ from strands_robots.fleet.adapter import CLOSED, STOP_S, NetworkAdapter, StopReq
 from strands_robots.fleet.joining import on_own_thread, side_by_side
 from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.verdicts import FleetVerdict, NetworkVerdict, not_reached, roster_verdict
-from strands_robots.safety.controller import Progress
+from strands_robots.safety.answers import Progress
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.roster import RosterRow
 from strands_robots.safety.scope import Scope

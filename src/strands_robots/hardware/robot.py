@@ -51,10 +51,9 @@ from strands_robots.safety.gate import (
     answered,
     refusal_envelope,
 )
-from strands_robots.safety.halted_verbs import verbs_to_end
 from strands_robots.safety.persistence import hardware_key
 from strands_robots.safety.stop_executor import stop_executor
-from strands_robots.safety.stop_targets import note_motion
+from strands_robots.safety.stop_targets import note_motion, verbs_to_end
 from strands_robots.safety.stopping import PendingVerdict, StopLevel, StopVerdict, checked_level, halts_in_parts
 from strands_robots.stop_log import stop_logger
 from strands_robots.teleop_mixin import TeleopMixin
@@ -564,9 +563,10 @@ class HardwareRobot(ArmMixin, TeleopMixin):
         return settling
 
     def _moving(self) -> list[str]:
-        task = ["task"] if self.occupied(self.tool_name_str) else []
-        task += ["settling"] if self._settling is not None and self._settling.running else []
-        return task + [f"teleoperation {name}" for name in self.teleoperating()] + ["send_action"] * bool(self._sends)
+        task, settling = self._task, self._settling
+        moving = ["task"] if task is not None and task.running else []
+        moving += ["settling"] if settling is not None and settling.running else []
+        return moving + [f"teleoperation {name}" for name in self.teleoperating()] + ["send_action"] * bool(self._sends)
 
     def _voided_loops(self) -> dict[str, Rollout]:
         """Void every running loop; return them as a verdict names them."""

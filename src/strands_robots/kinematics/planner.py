@@ -17,7 +17,7 @@ from strands_robots.kinematics.contacts import DEEPER_M, ContactCheck, new_conta
 from strands_robots.kinematics.inverse import TipGoal, nearest, solve
 from strands_robots.kinematics.obstacles import CLEARANCE_M
 from strands_robots.kinematics.rrt import path_around
-from strands_robots.safety.turns import shorten_turns
+from strands_robots.safety.process import shorten_time_slices
 from strands_robots.utils import ValidationError
 
 APPROACH_STEP_DEG = 5.0
@@ -170,7 +170,7 @@ class Planner:
                 lows[index] = highs[index] = begin[index]
         if not (self.free(begin) and self.free(goal)):
             return None
-        end_short_turns = shorten_turns()
+        end_short_turns = shorten_time_slices()
         try:
             poses = path_around(begin, goal, (lows, highs), self._clear, self._going)
         finally:

@@ -13,7 +13,6 @@ from typing import Any
 
 import anyio
 
-from strands_robots.arm_mixin import WAIT_S
 from strands_robots.contract import RUNNING
 from strands_robots.envelope import Envelope, error, is_error, success, text_of
 from strands_robots.errors import NoAnswerError, NoSuchRobotError, RefusalError, UnreachableError
@@ -29,7 +28,7 @@ from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.safety.stopping import Outcome, grade
 from strands_robots.serving.advertised import AdvertisedVerb, find_verb
 from strands_robots.serving.verbs import LEASE_ID, LEASE_NAMES, LEASE_TTL_S, TTL_MAX_S, TTL_MIN_S
-from strands_robots.utils import ValidationError, number
+from strands_robots.utils import WAIT_S, ValidationError, number
 
 ANSWER_S = 10.0
 """Longest wait for the answer to a call that does not wait for a motion."""

@@ -17,7 +17,7 @@ from strands_robots.errors import ApprovalError, NoAnswerError, NoSuchRobotError
 from strands_robots.fleet.adapter import CLOSED
 from strands_robots.fleet.mesh.network import IN_FLIGHT, MeshNetwork
 from strands_robots.mesh import Mesh
-from strands_robots.safety.approval import Grants, digest
+from strands_robots.safety.authorization import Grants, digest
 from strands_robots.state_files import state_dir
 
 

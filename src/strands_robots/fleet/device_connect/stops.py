@@ -13,11 +13,10 @@ from typing import TYPE_CHECKING, Any
 from strands_robots.envelope import Envelope
 from strands_robots.fleet.adapter import FIND_S, STOP_S, StopRequest
 from strands_robots.fleet.verdicts import measured, with_plain_stops, with_reasons
-from strands_robots.safety.controller import Progress, StopReport
-from strands_robots.safety.roster_search import FoundDevices, RosterSearch
+from strands_robots.safety.answers import Progress, StopReport
+from strands_robots.safety.roster import Sending
 from strands_robots.safety.scope import EVERY_ROBOT
-from strands_robots.safety.silence import Sending
-from strands_robots.safety.stop_roster import StopOutcome, StopRoster
+from strands_robots.safety.stop_roster import FoundDevices, RosterSearch, StopOutcome, StopRoster
 
 logger = logging.getLogger(__name__)
 
@@ -219,6 +218,6 @@ def _measured(search: RosterSearch, report: StopReport, sending: Sending) -> Sto
 
 def network_key(link: LinkConfig) -> NetworkKey:
     """Return the key of the network that a link reaches."""
-    from strands_robots.device_connect.enrollment import network_of  # noqa: PLC0415 - the network is loaded when it is used
+    from strands_robots.device_connect.links import network_of  # noqa: PLC0415 - the network is loaded when it is used
 
     return network_of(link)

@@ -16,19 +16,15 @@ from strands_robots.fleet.adapter import StopRequest
 from strands_robots.fleet.mesh.lockouts import lockable_peers
 from strands_robots.fleet.mesh.peers import LOOK_S, discover, must_answer, only_calls
 from strands_robots.fleet.verdicts import measured, stop_outcome, unanswered
-from strands_robots.safety.answers import Answer
-from strands_robots.safety.controller import DEADLINE_S, OnProgress, Progress, StopReport
-from strands_robots.safety.estop_listener import ESTOP
+from strands_robots.safety.answers import Answer, OnProgress, Press, Presses, Progress, StopReport
+from strands_robots.safety.controller import DEADLINE_S
+from strands_robots.safety.stop_link import ESTOP
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.orders import PARSED_MAX_BYTES, new_epoch
-from strands_robots.safety.peer_answers import enrolled_peers, lockout_distrust, stop_distrust
-from strands_robots.safety.presses import Press, Presses
-from strands_robots.safety.roster import Roster, RosterRow
-from strands_robots.safety.roster_inbox import OnReport, RosterInbox
+from strands_robots.safety.roster import OnReport, Roster, RosterInbox, RosterRow, Sending
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
-from strands_robots.safety.silence import Sending
 from strands_robots.safety.standing_roster import StandingRoster, controllers_identity
-from strands_robots.safety.statements import ALARM
+from strands_robots.safety.statements import ALARM, enrolled_peers, lockout_distrust, stop_distrust
 from strands_robots.safety.stop_roster import READ_WITHIN_S, StopOutcome, StopRoster, robots_known_at
 from strands_robots.safety.stopping import explain, grade
 from strands_robots.utils import plain_text
@@ -302,7 +298,7 @@ class MeshController:
     """
 
     def __init__(self, mesh: Mesh, signing_key: Any = None) -> None:
-        from strands_robots.mesh.transport.zenoh_config import DISCOVERY_S  # noqa: PLC0415 - the network is loaded when it is used
+        from strands_robots.mesh.transport.config import DISCOVERY_S  # noqa: PLC0415 - the network is loaded when it is used
 
         self._mesh = mesh
         self._key = signing_key
