@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import secrets
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
@@ -11,12 +12,12 @@ from enum import Enum
 from typing import TYPE_CHECKING, Any, Protocol
 
 from strands_robots.envelope import Envelope
-from strands_robots.errors import UnreachableError
-from strands_robots.safety.lockout import Lockout
+from strands_robots.errors import RefusalError, UnreachableError
 from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope
 
 if TYPE_CHECKING:
     from strands_robots.safety.answers import OnProgress, Press, StopReport
+    from strands_robots.safety.lockout import Lockout
     from strands_robots.safety.network_key import NetworkKey
     from strands_robots.safety.roster import OnReport, Sending
     from strands_robots.safety.stop_roster import StopOutcome
@@ -59,6 +60,8 @@ def before_resume(robot: LockoutReport) -> Resumed:
         return True, "was not locked"
     return False, TOO_MANY
 
+
+logger = logging.getLogger(__name__)
 
 DEVICE_CONNECT, MESH = "device_connect", "mesh"
 
@@ -468,3 +471,33 @@ class NetworkAdapter(Protocol):
 
     def close(self) -> None:
         """Leave the network; a second call does nothing."""
+
+
+MISSED_BEATS = 3
+"""Beats after which a robot that has left one network counts as gone from another one, too."""
+
+
+def bears(network: NetworkAdapter, robot: str) -> bool:
+    """Return whether a network has a robot now; False for a network that was left."""
+    try:
+        return network.bears(robot)
+    except RefusalError:
+        return False
+
+
+def reaches(network: NetworkAdapter, robot: str) -> bool:
+    """Return whether a robot is in reach, which may be asked."""
+    try:
+        return network.reaches(robot)
+    except RefusalError as exc:
+        logger.debug("%s: %s cannot be looked for: %s", network.name, robot, exc)
+        return False
+
+
+def silent(network: NetworkAdapter, robot: str) -> bool:
+    """Return whether a robot has missed its last beats on a network."""
+    try:
+        last = network.beats([robot]).get(robot)
+        return last is not None and time.monotonic() - last > MISSED_BEATS * network.beats_every(robot)
+    except RefusalError:
+        return True

@@ -15,7 +15,18 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 from strands_robots.envelope import Envelope, error
 from strands_robots.errors import NoSuchRobotError, RefusalError, UnreachableError
-from strands_robots.fleet.adapter import CLOSED, FIND_S, STOP_S, Detail, FoundRobot, NetworkAdapter, OnEvent
+from strands_robots.fleet.adapter import (
+    CLOSED,
+    FIND_S,
+    STOP_S,
+    Detail,
+    FoundRobot,
+    NetworkAdapter,
+    OnEvent,
+    bears,
+    reaches,
+    silent,
+)
 from strands_robots.fleet.joining import Joining, on_own_thread, side_by_side, those
 from strands_robots.serving.known_verbs import READS, RESUMES, STOPS
 from strands_robots.utils import near, plain_text
@@ -29,36 +40,6 @@ if TYPE_CHECKING:
     from strands_robots.serving.advertised import AdvertisedVerb
 
 logger = logging.getLogger(__name__)
-
-MISSED_BEATS = 3
-"""Beats after which a robot that has left one network counts as gone from another one, too."""
-
-
-def bears(network: NetworkAdapter, robot: str) -> bool:
-    """Return whether a network has a robot now; False for a network that was left."""
-    try:
-        return network.bears(robot)
-    except RefusalError:
-        return False
-
-
-def reaches(network: NetworkAdapter, robot: str) -> bool:
-    """Return whether a robot is in reach, which may be asked."""
-    try:
-        return network.reaches(robot)
-    except RefusalError as exc:
-        logger.debug("%s: %s cannot be looked for: %s", network.name, robot, exc)
-        return False
-
-
-def silent(network: NetworkAdapter, robot: str) -> bool:
-    """Return whether a robot has missed its last beats on a network."""
-    try:
-        last = network.beats([robot]).get(robot)
-        return last is not None and time.monotonic() - last > MISSED_BEATS * network.beats_every(robot)
-    except RefusalError:
-        return True
-
 
 BUSY_S = 3.0
 """Seconds in which a stop tries to join a network that takes connections and does not answer."""

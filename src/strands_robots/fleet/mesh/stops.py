@@ -18,13 +18,13 @@ from strands_robots.fleet.mesh.peers import LOOK_S, discover, must_answer, only_
 from strands_robots.fleet.verdicts import measured, stop_outcome, unanswered
 from strands_robots.safety.answers import Answer, OnProgress, Press, Presses, Progress, StopReport
 from strands_robots.safety.controller import DEADLINE_S
-from strands_robots.safety.stop_link import ESTOP
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.orders import PARSED_MAX_BYTES, new_epoch
 from strands_robots.safety.roster import OnReport, Roster, RosterInbox, RosterRow, Sending
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.safety.standing_roster import StandingRoster, controllers_identity
 from strands_robots.safety.statements import ALARM, enrolled_peers, lockout_distrust, stop_distrust
+from strands_robots.safety.stop_link import ESTOP
 from strands_robots.safety.stop_roster import READ_WITHIN_S, StopOutcome, StopRoster, robots_known_at
 from strands_robots.safety.stopping import explain, grade
 from strands_robots.utils import plain_text
