@@ -387,13 +387,16 @@ class SafetyConsole:
 
     Attributes:
         buttons: those of all networks.
+        watched: the robots of each network that has a button.
     """
 
     def __init__(
         self, networks: Networks, signing_key: Any = None, reason: str = "", check_in_s: float | None = None
     ) -> None:
         self.buttons = StopButtons(reason)
-        self._watched = {each.name: WatchedRobots() for each in networks.stated}
+        self._robots = {each.name: WatchedRobots() for each in networks.stated}
+        self.watched: Mapping[str, WatchedRobots] = {}
+        self._lock = threading.Lock()
         self._networks, self._check_in_s = networks, check_in_s
         self._were_up: frozenset[str] = frozenset()
         self._standing = StandingController(
@@ -403,13 +406,13 @@ class SafetyConsole:
     def open(self) -> None:
         """Begin to join the networks; return at once."""
         self._standing.open()
-        self._networks.on_joined(lambda network: self._watched[network.name].poll(network))
+        self._networks.on_joined(lambda network: self._robots[network.name].poll(network))
         self._networks.begin()
 
     def close(self) -> None:
         """Give up stops that wait for a link, and leave the networks."""
         self.buttons.close()
-        for each in self._watched.values():
+        for each in self._robots.values():
             each.close()
         self._standing.close()
         self._networks.close()
@@ -423,11 +426,6 @@ class SafetyConsole:
         """Expect no answer any more from robots that are gone."""
         for each in self.watched.values():
             each.forget()
-
-    @property
-    def watched(self) -> Mapping[str, WatchedRobots]:
-        """The robots of each network that has a button."""
-        return {name: each for name, each in self._watched.items() if name in self._standing.senders}
 
     @property
     def links(self) -> Mapping[str, bool]:
@@ -449,9 +447,12 @@ class SafetyConsole:
         return {**self._networks.missing, **failures}
 
     def _known(self, network: str) -> Collection[str]:
-        return self._watched[network].known()
+        return self._robots[network].known()
 
     def _add_button(self, network: NetworkAdapter, controller: StopSender) -> None:
-        self.buttons.add(network.name, controller, self._watched[network.name].expected)
+        with self._lock:
+            # Read by the screen meanwhile: replaced, not changed.
+            self.watched = {**self.watched, network.name: self._robots[network.name]}
+        self.buttons.add(network.name, controller, self._robots[network.name].expected)
         if self._check_in_s is not None:
             controller.check_in_every(self._check_in_s)
