@@ -12,7 +12,7 @@ from fixtures.waiting import eventually
 
 from strands_robots.audit import flush_audit, read_audit_log
 from strands_robots.hardware import HardwareRobot
-from strands_robots.safety.approval import Approval
+from strands_robots.safety.authorization import Approval
 from strands_robots.safety.lockout import LockoutLatch
 from strands_robots.serving.leave import Command
 from strands_robots.serving.peer_verbs import PEER_VERBS

@@ -11,7 +11,7 @@ from fixtures.toy_robots import ToyRobot
 
 from strands_robots.contract import RolloutEvent
 from strands_robots.hardware import HardwareRobot
-from strands_robots.safety.approval import Approval
+from strands_robots.safety.authorization import Approval
 from strands_robots.serving.leave import Command
 from strands_robots.serving.peer_verbs import PEER_VERBS
 from strands_robots.serving.pipeline import Pipeline, Result

@@ -11,7 +11,7 @@ import pytest
 from fixtures.toy_robots import ToyRobot
 
 from strands_robots.envelope import error
-from strands_robots.safety.approval import Approval, Grants
+from strands_robots.safety.authorization import Approval, Grants
 from strands_robots.serving.leave import Command
 from strands_robots.serving.pipeline import Pipeline, Result
 from strands_robots.serving.refused import RefusalReason, Refused

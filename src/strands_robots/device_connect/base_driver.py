@@ -36,13 +36,12 @@ from strands_robots.device_connect.safety_registration import (
 from strands_robots.device_connect.state_reports import report_changes, sweep
 from strands_robots.device_connect.telemetry import RolloutPump
 from strands_robots.envelope import Envelope, error, jsonable, success
-from strands_robots.safety.approval import Approval
-from strands_robots.safety.authorization import ANONYMOUS, Authorization, caller_name
-from strands_robots.safety.estop_listener import ESTOP
+from strands_robots.safety.authorization import ANONYMOUS, Approval, Authorization, caller_name
 from strands_robots.safety.gate import MotionRequest
 from strands_robots.safety.lockout import LockoutLatch
 from strands_robots.safety.orders import REASON_MAX, epoch_of
 from strands_robots.safety.stop_executor import stop_executor
+from strands_robots.safety.stop_link import ESTOP
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.control_changes import ControlChange
 from strands_robots.serving.leave import Command

@@ -13,8 +13,8 @@ from device_connect_edge.messaging.exceptions import MessagingError
 
 from strands_robots.device_connect.backends import LinkConfig
 from strands_robots.device_connect.discovery import parts
-from strands_robots.safety.estop_listener import ESTOP
 from strands_robots.safety.orders import params_of
+from strands_robots.safety.stop_link import ESTOP
 from strands_robots.stop_log import stop_logger
 
 logger = stop_logger(__name__)

@@ -15,8 +15,8 @@ from strands_robots.device_connect.safety_controller import envelope, outcome_en
 from strands_robots.envelope import Envelope, success
 from strands_robots.safety.controller import DEADLINE_S, SafetyController
 from strands_robots.safety.orders import new_epoch
-from strands_robots.safety.roster_search import RosterSearch, stop_and_search
 from strands_robots.safety.scope import Scope
+from strands_robots.safety.stop_roster import RosterSearch, stop_and_search
 from strands_robots.serving.stop_arguments import noted, stop_reason, stop_robot, stop_scope
 from strands_robots.serving.verbs import unknown_arguments
 from strands_robots.utils import ValidationError, number

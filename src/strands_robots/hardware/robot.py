@@ -42,10 +42,9 @@ from strands_robots.safety.gate import (
     answered,
     refusal_envelope,
 )
-from strands_robots.safety.halted_verbs import StopOfRobot
 from strands_robots.safety.persistence import hardware_key
 from strands_robots.safety.stop_executor import stop_executor
-from strands_robots.safety.stop_targets import note_motion
+from strands_robots.safety.stop_targets import StopOfRobot, note_motion
 from strands_robots.safety.stopping import PendingVerdict, StopLevel, StopVerdict, checked_level, halts_in_parts
 from strands_robots.stop_log import stop_logger
 from strands_robots.teleop_mixin import TeleopMixin

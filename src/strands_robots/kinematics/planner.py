@@ -21,7 +21,7 @@ import numpy as np
 
 from strands_robots.kinematics.chain import ArmJoint, Chain, Floats
 from strands_robots.kinematics.objects import CLEARANCE_M, DEEPER_M, ContactCheck, new_contact
-from strands_robots.safety.turns import shorten_turns
+from strands_robots.safety.process import shorten_time_slices
 from strands_robots.utils import ValidationError
 
 STARTS = 20
@@ -454,7 +454,7 @@ class Planner:
                 lows[index] = highs[index] = begin[index]
         if not (self.free(begin) and self.free(goal)):
             return None
-        end_short_turns = shorten_turns()
+        end_short_turns = shorten_time_slices()
         try:
             poses = path_around(begin, goal, (lows, highs), self._clear, self._going)
         finally:

@@ -30,7 +30,7 @@ from strands_robots.policies.profiles import profiles
 from strands_robots.policies.rollout import Body, Rollout, RolloutObservers, rollout_options
 from strands_robots.policies.settling import Settlings
 from strands_robots.safety.gate import MotionGate, MotionRefused, MotionRequest, Permit, Waiting
-from strands_robots.safety.halted_verbs import verbs_to_end
+from strands_robots.safety.stop_targets import verbs_to_end
 from strands_robots.safety.stopping import READ_EVERY_S, PendingVerdict, StopVerdict, halt_each
 from strands_robots.stop_log import stop_logger
 from strands_robots.utils import ValidationError

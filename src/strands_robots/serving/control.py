@@ -29,8 +29,7 @@ from strands_robots.contract import Robot, WorldRobot, body_of, holds_robots, ro
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.identity_map import IdentityMap
-from strands_robots.safety.approval import Leave
-from strands_robots.safety.authorization import ANONYMOUS, caller_name
+from strands_robots.safety.authorization import ANONYMOUS, Leave, caller_name
 from strands_robots.safety.resume import configured_keys
 from strands_robots.safety.stop_executor import stop_executor
 from strands_robots.safety.stopping import StopVerdict

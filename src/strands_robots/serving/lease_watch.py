@@ -11,7 +11,7 @@ import time
 from functools import partial
 from typing import Protocol
 
-from strands_robots.safety.turns import undisturbed
+from strands_robots.safety.process import undisturbed
 from strands_robots.serving.workers import UNBOUNDED
 from strands_robots.stop_log import stop_logger
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from strands_robots.contract import Robot
 from strands_robots.envelope import error
-from strands_robots.safety.approval import Approval, Leave, digest
+from strands_robots.safety.authorization import Approval, Leave, digest
 from strands_robots.safety.gate import MotionRefused, MotionRequest
 from strands_robots.serving.control import ControlLeases, NotHolderError
 from strands_robots.serving.offered_verbs import unoffered

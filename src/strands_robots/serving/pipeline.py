@@ -16,7 +16,7 @@ from weakref import WeakKeyDictionary
 from strands_robots.contract import Robot, body_of
 from strands_robots.envelope import Envelope, error, is_error
 from strands_robots.identity_map import IdentityMap
-from strands_robots.safety.approval import Leave
+from strands_robots.safety.authorization import Leave
 from strands_robots.safety.gate import REFUSALS, MotionGate, MotionRefused, MotionRequest, refusal_envelope
 from strands_robots.serving.control import NotHolderError, leases_of
 from strands_robots.serving.leave import Command, MotionRules

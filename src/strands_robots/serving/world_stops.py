@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from strands_robots import settings
 from strands_robots.contract import WorldRobot
 from strands_robots.envelope import Envelope
-from strands_robots.safety.halted_verbs import StopOfRobot
 from strands_robots.safety.stop_executor import stop_executor
+from strands_robots.safety.stop_targets import StopOfRobot
 from strands_robots.safety.stopping import (
     PendingVerdict,
     StopVerdict,

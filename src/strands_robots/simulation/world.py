@@ -23,7 +23,7 @@ from strands_robots.policies.rollout import (
 )
 from strands_robots.policies.task_engine import TaskEngine
 from strands_robots.safety.gate import MotionRequest, answered
-from strands_robots.safety.halted_verbs import halted_with_verbs
+from strands_robots.safety.stop_targets import halted_with_verbs
 from strands_robots.safety.stopping import PendingVerdict, StopLevel, StopVerdict, halts_in_parts, read_verdict
 from strands_robots.simulation.body import PICTURE, RobotBody, StopTorque, targets_of
 from strands_robots.simulation.model import compile_scene, in_floor, sunk_sentence
