@@ -1,11 +1,9 @@
-"""Reachy Mini with LeRobot's five verbs and its daemon's own; found by mDNS."""
+"""Reachy Mini with LeRobot's five verbs and the verbs of its own daemon."""
 
 from __future__ import annotations
 
-import ipaddress
-import threading
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from strands_robots import settings
@@ -37,7 +35,7 @@ from strands_robots.safety.gate import MotionGate, MotionRequest
 from strands_robots.safety.stop_executor import RETURN_SHARE
 from strands_robots.safety.stop_targets import halted_with_verbs
 from strands_robots.safety.stopping import StopVerdict
-from strands_robots.utils import ValidationError, choice, flag, identifier, missing_extra, number, shown, text
+from strands_robots.utils import ValidationError, choice, flag, identifier, shown, text
 
 UPRIGHT_LEGS = (0.6265, -0.6265, 0.6265, -0.6265, 0.6265, -0.6265)
 """Legs of the head at the identity, in radians, by the daemon's own inverse kinematics."""
@@ -572,82 +570,3 @@ class ReachyDriver:
             self.motors.release()
         mode = self.motors.mode()
         return "" if mode == "disabled" else f"the motors are {mode}"
-
-
-SERVICE = "_reachy-mini._tcp.local."
-
-
-@dataclass(frozen=True, slots=True)
-class DiscoveredDaemon:
-    """One announced daemon: its name, an address to dial and the port."""
-
-    name: str
-    host: str
-    port: int
-
-
-def discover(within_s: float = 3.0, *, interfaces: Any = None) -> list[DiscoveredDaemon]:
-    """Return every Reachy Mini that answers in that time, by name.
-
-    Args:
-        within_s: seconds to listen, above 0 and at most 60.
-        interfaces: addresses to ask on, all of this machine by default.
-
-    Raises:
-        MissingExtraError: the [reachy] extra is not installed.
-    """
-    try:
-        from zeroconf import InterfaceChoice, ServiceBrowser, ServiceStateChange, Zeroconf  # noqa: PLC0415 - optional
-    except ImportError as exc:
-        raise missing_extra("Finding a Reachy Mini", "reachy") from exc
-    wait = number("within_s", within_s, above=0, high=60)
-    names: set[str] = set()
-
-    def on_change(zeroconf: Zeroconf, service_type: str, name: str, state_change: ServiceStateChange) -> None:
-        del zeroconf, service_type
-        if state_change is ServiceStateChange.Added:
-            names.add(name)
-
-    with Zeroconf(interfaces=interfaces if interfaces is not None else InterfaceChoice.All) as network:
-        browser = ServiceBrowser(network, SERVICE, handlers=[on_change])
-        threading.Event().wait(wait)
-        browser.cancel()
-        infos = [(name, network.get_service_info(SERVICE, name, timeout=500)) for name in sorted(names)]
-    return [_discovered(name, info) for name, info in infos if info is not None and info.parsed_addresses()]
-
-
-def _discovered(name: str, info: Any) -> DiscoveredDaemon:
-    # IPv4 before IPv6: a link-local IPv6 address needs a scope that a URL does not carry.
-    addresses = sorted(info.parsed_addresses(), key=lambda text: ipaddress.ip_address(text).version)
-    return DiscoveredDaemon(name.removesuffix("." + SERVICE), addresses[0], int(info.port))
-
-
-def make_reachy(
-    host: str = "",
-    *,
-    api_port: int = 8000,
-    within_s: float = 3.0,
-    driver: type[ReachyDriver] = ReachyDriver,
-    **options: Any,
-) -> ReachyDriver:
-    """Return a driver for ``host``, or for the one Reachy Mini that announces itself.
-
-    Args:
-        host: bare hostname or IP literal; empty to discover it.
-        api_port: TCP port of the daemon, when ``host`` is given.
-        within_s: seconds to listen.
-        driver: the class to make.
-        options: further arguments of :class:`ReachyDriver`.
-
-    Raises:
-        ValidationError: none or several were found, or an argument is out of its domain.
-    """
-    if host:
-        return driver(host, api_port=api_port, **options)
-    daemons = discover(within_s)
-    if not daemons:
-        raise ValidationError(f"host must name a Reachy Mini: none announced itself within {within_s:g} s.")
-    if len(daemons) > 1:
-        names = ", ".join(f"{each.name} at {each.host}:{each.port}" for each in daemons)
-        raise ValidationError(f"host must name one Reachy Mini; {len(daemons)} were found: {names}.")
-    return driver(daemons[0].host, api_port=daemons[0].port, **options)
