@@ -29,8 +29,7 @@ if TYPE_CHECKING:
         init_device_connect_sync,
         stop_device_connect,
     )
-    from strands_robots.device_connect.client import FleetClient
-    from strands_robots.device_connect.links import connect_agent
+    from strands_robots.device_connect.client import FleetClient, connect_agent
     from strands_robots.device_connect.process import LOOP_JOIN_TIMEOUT_S as _LOOP_JOIN_TIMEOUT_S
     from strands_robots.device_connect.process import StopSignal
     from strands_robots.device_connect.reachy_mini_driver import ReachyMiniDriver
@@ -67,7 +66,7 @@ _HOMES = {
     "RobotDeviceDriver": f"{_HERE}.robot_driver",
     "SimulationDeviceDriver": f"{_HERE}.simulation_driver",
     "StopSignal": f"{_HERE}.process",
-    "connect_agent": f"{_HERE}.links",
+    "connect_agent": f"{_HERE}.client",
     "init_device_connect": f"{_HERE}.bringup",
     "init_device_connect_sync": f"{_HERE}.bringup",
     "link_from_environment": f"{_HERE}.backends",
