@@ -15,9 +15,7 @@ the framework names the [device-connect] extra when that is missing.
 from __future__ import annotations
 
 import sys
-import threading
 from importlib import import_module
-from importlib.util import find_spec, module_from_spec
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -105,6 +103,9 @@ def load_when_used() -> None:
     For processes of our own alone: an application may rely on what the import does. Nothing happens where the package
     is imported already or is not installed.
     """
+    import threading  # noqa: PLC0415 - importing this package costs next to nothing
+    from importlib.util import find_spec, module_from_spec  # noqa: PLC0415 - as above
+
     spec = None if _FRAMEWORK[0] in sys.modules else find_spec(_FRAMEWORK[0])
     if spec is None or spec.loader is None:
         return
