@@ -28,11 +28,9 @@ from benchmarks.table import Row
 from strands_robots.device_connect import FleetClient, loopback_config
 from strands_robots.fleet.adapter import FoundRobot
 from strands_robots.fleet.standing import StandingController
-from strands_robots.mcp.access import ClientAccess
 from strands_robots.mcp.approval import Approvals
-from strands_robots.mcp.caller import SILENCE_S, Caller
-from strands_robots.mcp.resources import RobotResources
-from strands_robots.mcp.server import build
+from strands_robots.mcp.caller import SILENCE_S, Caller, ClientAccess
+from strands_robots.mcp.server import RobotResources, build
 
 HZ = 200.0
 TIMES, TIMES_QUICK = 100, 5

@@ -17,7 +17,7 @@ from strands_robots.cli.output import CliError, Screen
 from strands_robots.device_connect.backends import loopback_config
 from strands_robots.device_connect.safety_controller import safety_controller
 from strands_robots.safety.ed25519 import load_signing_key
-from strands_robots.simulation.tabletop import TABLETOP
+from strands_robots.simulation import TABLETOP
 
 from .output import DemoScreen, draw_motion
 from .processes import TENANT, connected_agent, served_robot

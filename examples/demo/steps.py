@@ -23,7 +23,7 @@ from strands_robots.policies.base import plain_numbers
 from strands_robots.safety.controller import SafetyController
 from strands_robots.safety.ed25519 import keygen
 from strands_robots.safety.resume import sign
-from strands_robots.simulation.tabletop import CUBE, PLATE
+from strands_robots.simulation import CUBE, PLATE
 
 from .output import DemoScreen
 from .processes import Agent, AgentEvent, EventStream, RobotProcess

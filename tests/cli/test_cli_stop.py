@@ -20,8 +20,8 @@ from strands_robots.cli.output import Exit, Screen
 from strands_robots.cli.stop import exit_code, progress_rows, report_rows, show_resume, summary
 from strands_robots.device_connect import safety_controller
 from strands_robots.device_connect.backends import loopback_config
+from strands_robots.device_connect.backends.config import network_of
 from strands_robots.device_connect.discovery import Peer, RegistryError
-from strands_robots.device_connect.links import network_of
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.errors import UnreachableError
 from strands_robots.fleet.adapter import StopRequest
