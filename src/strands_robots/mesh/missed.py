@@ -175,8 +175,8 @@ def epoch_of(notice: wire.EstopNotice, body: Mapping[str, Any]) -> str:
     return notice.estop_id or derived_epoch(notice.peer_id, json.dumps(body["t"]).encode())
 
 
-def _fields_of(payload: bytes | int) -> dict[str, Any]:
+def _fields_of(payload: bytes | int | None) -> dict[str, Any]:
     try:
-        return {} if isinstance(payload, int) else wire.decode(payload, ANSWER_MAX_BYTES)
+        return wire.decode(payload, ANSWER_MAX_BYTES) if isinstance(payload, bytes) else {}
     except wire.WireError:
         return {}
