@@ -24,8 +24,8 @@ from strands_robots.bounded_json import LONG_MAX, json_object
 from strands_robots.device_connect.backends import LinkConfig, open_client
 from strands_robots.device_connect.backends.base import NoResponderError, ResponderLostError
 from strands_robots.device_connect.discovery import DESCRIBE_S, HEARTBEATS_S, Discovery, Peer, parts
-from strands_robots.device_connect.enrollment import network_of
-from strands_robots.device_connect.shutdown import LOOP_JOIN_TIMEOUT_S
+from strands_robots.device_connect.links import network_of
+from strands_robots.device_connect.process import LOOP_JOIN_TIMEOUT_S, EventLoopThread
 from strands_robots.envelope import Envelope, error
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety.sightings import sightings
@@ -50,8 +50,8 @@ CONNECT_MARGIN_S = 3.0
 PURPOSES = {"getStatus": Purpose.LOCKOUT_STATE, "resume": Purpose.RESUME_ANSWER}
 """Functions whose answer has a signed part, with its purpose."""
 
-LAST_TASKS_S = 1.0
 CLOSED = "the client was closed before there was an answer"
+NOT_CONNECTED = "the client is not connected; use it as a context manager"
 
 IN_FLIGHT = 64
 """Calls of :meth:`FleetClient.call_each` that wait for an answer at a time."""
@@ -103,8 +103,7 @@ class FleetClient:
     def __init__(self, link: LinkConfig, source: str = "strands-robots") -> None:
         self.link = link
         self.source = device_id("source", source)
-        self._loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self._loop.run_forever, name="fleet-client", daemon=True)
+        self._loop: EventLoopThread | None = None
         self._messaging: Any = None
         self._discovery: Discovery | None = None
         self._network = network_of(link)
@@ -113,7 +112,7 @@ class FleetClient:
         self._closed = False
 
     def __enter__(self) -> Self:
-        self._thread.start()
+        self._loop = EventLoopThread("fleet-client")
         try:
             self._messaging = self.run(open_client(self.link), self.link.connect_timeout_s + CONNECT_MARGIN_S)
             self._discovery = Discovery(self._messaging)
@@ -130,25 +129,18 @@ class FleetClient:
         """Leave the network; waiting calls get :class:`ClientClosedError`."""
         with self._lock:
             self._closed, pending = True, tuple(self._pending)
-        if self._loop.is_closed():
+        loop, self._loop = self._loop, None
+        if loop is None:
             return
         for each in pending:
             each.cancel()
         messaging, self._messaging = self._messaging, None
         try:
-            if self._thread.is_alive():
-                asyncio.run_coroutine_threadsafe(_ended(messaging), self._loop).result(LOOP_JOIN_TIMEOUT_S)
+            if messaging is not None:
+                loop.submit(messaging.close()).result(LOOP_JOIN_TIMEOUT_S)
         finally:
-            self._end_loop()
-
-    def _end_loop(self) -> None:
-        if not self._thread.is_alive():
-            self._loop.close()
-            return
-        self._loop.call_soon_threadsafe(self._loop.stop)
-        self._thread.join(LOOP_JOIN_TIMEOUT_S)
-        if not self._thread.is_alive():
-            self._loop.close()
+            loop.end()
+            loop.join(LOOP_JOIN_TIMEOUT_S)
 
     def peers(self, timeout: float = 2.0, *, thorough: bool = False) -> list[Peer]:
         """Return the devices of the tenant, sorted by id.
@@ -158,31 +150,33 @@ class FleetClient:
                 list; :attr:`stale` says so then. The collection ends early once no more devices come.
             thorough: wait longer for a further device.
         """
-        return self.run(self._found.collect(timeout, thorough=thorough), max(timeout, HEARTBEATS_S) + COLLECT_MARGIN_S)
+        return self.run(
+            self._connected.collect(timeout, thorough=thorough), max(timeout, HEARTBEATS_S) + COLLECT_MARGIN_S
+        )
 
     @property
     def stale(self) -> str:
         """Empty, or the reason why the last discovery may be incomplete."""
-        return self._found.stale
+        return self._connected.stale
 
     def known(self) -> tuple[str, ...]:
         """Return the ids of live devices announced since the last :meth:`peers`."""
-        return self._found.known
+        return self._connected.known
 
     def announces(self, device: str, function: str, argument: str) -> bool:
         """Return True where the last :meth:`peers` found the device with this argument."""
-        return self._found.announces(device, function, argument)
+        return self._connected.announces(device, function, argument)
 
     def last_heartbeat(self, device: str) -> float | None:
         """Return the monotonic time of a device's last heartbeat; None before the first.
 
         The beat of its process counts as one.
         """
-        return self._found.last_heartbeat(device)
+        return self._connected.last_heartbeat(device)
 
     def beats_every(self, device: str) -> float:
         """Return the seconds between two heartbeats, or beats, of a device."""
-        return self._found.beats_every(device)
+        return self._connected.beats_every(device)
 
     def call(
         self, device: str, function: str, params: Mapping[str, Any] | None = None, timeout: float = 10.0
@@ -314,11 +308,11 @@ class FleetClient:
         async def all_of_them() -> dict[str, Envelope]:
             stops: dict[str, asyncio.Task[Envelope]] = {}
 
-            def found(peer: Peer) -> None:
+            def stop(peer: Peer) -> None:
                 if peer.stop_verb:
                     stops[peer.id] = asyncio.create_task(self._stop_named(peer.id, timeout))
 
-            await self._found.collect(2.0, found, thorough=True)
+            await self._connected.collect(2.0, stop, thorough=True)
             return {name: await stops[name] for name in sorted(stops)}
 
         return self.run(all_of_them(), HEARTBEATS_S + COLLECT_MARGIN_S + 2 * timeout)
@@ -360,18 +354,18 @@ class FleetClient:
 
     def _submitted(self, work: Coroutine[Any, Any, T]) -> Future[T]:
         with self._lock:
-            if self._closed:
+            if self._closed or self._loop is None:
                 work.close()
-                raise ClientClosedError(CLOSED)
-            done: Future[T] = asyncio.run_coroutine_threadsafe(work, self._loop)
+                raise ClientClosedError(CLOSED) if self._closed else RuntimeError(NOT_CONNECTED)
+            done = self._loop.submit(work)
             self._pending.add(done)
         done.add_done_callback(self._pending.discard)
         return done
 
     @property
-    def _found(self) -> Discovery:
+    def _connected(self) -> Discovery:
         if self._discovery is None:
-            raise RuntimeError("the client is not connected; use it as a context manager")
+            raise RuntimeError(NOT_CONNECTED)
         return self._discovery
 
     def _subject(self, rest: str) -> str:
@@ -408,8 +402,8 @@ class FleetClient:
         if purpose is None:
             sightings().note(self._network, device)
             return
-        asked = params.get("assertion") if verb == "resume" else params
-        nonce = asked.get("nonce") if isinstance(asked, Mapping) else None
+        request = params.get("assertion") if verb == "resume" else params
+        nonce = request.get("nonce") if isinstance(request, Mapping) else None
         expected = {"nonce": nonce} if nonce else {}
         sightings().note_answer(self._network, device, purpose, answer.get("statement"), expected)
 
@@ -468,17 +462,6 @@ class EventSubscription:
 
     def __exit__(self, *_exception: object) -> None:
         self.close()
-
-
-async def _ended(messaging: Any) -> None:
-    """Leave the network and wait until cancelled calls have ended."""
-    if messaging is not None:
-        await messaging.close()
-    others = asyncio.all_tasks() - {asyncio.current_task()}
-    for each in others:
-        each.cancel()
-    if others:
-        await asyncio.wait(others, timeout=LAST_TASKS_S)
 
 
 def _event(data: bytes, subject: str) -> DeviceEvent | None:

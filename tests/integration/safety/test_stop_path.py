@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from pathlib import Path
 
+from fixtures import mesh_call_path
 from fixtures.call_path import Call, CallPath, documented, hops
 from fixtures.devices import RecordingDevice
 from fixtures.nats_server import NatsServer
@@ -59,10 +60,23 @@ def test_stop_of_a_real_arm_takes_the_documented_way_with_two_hand_offs() -> Non
     threads = [name for name, _ in itertools.groupby(call.thread for call in way)]
     assert threads == ["stop-link", "estop-listener", "halt-arm"]
     assert hops(way) == documented(ARCHITECTURE, "stop-path")
-    assert len(hops(way)) <= 14
+    assert len(hops(way)) <= 13
 
 
 def test_stop_of_a_real_arm_enters_few_functions_before_the_freeze() -> None:
     # The reports of a stop begin beside its halt, and under a profiler sometimes before it ends.
     fewest = min((way_of_a_stop()[1] for _ in range(4)), key=len)
+    assert len(fewest) <= FUNCTIONS_MAX, "\n".join(fewest)
+
+
+def test_stop_over_the_mesh_takes_the_documented_way_with_two_hand_offs(tmp_path: Path) -> None:
+    way, _ = mesh_call_path.stop(tmp_path)
+    assert len(list(itertools.groupby(call.thread for call in way))) == 3
+    assert way[-1].thread == "halt-arm"
+    assert hops(way) == documented(ARCHITECTURE, "mesh-stop-path")
+    assert len(hops(way)) <= 13
+
+
+def test_stop_over_the_mesh_enters_few_functions_before_the_freeze(tmp_path: Path) -> None:
+    fewest = min((mesh_call_path.stop(tmp_path)[1] for _ in range(4)), key=len)
     assert len(fewest) <= FUNCTIONS_MAX, "\n".join(fewest)
