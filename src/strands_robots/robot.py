@@ -26,7 +26,7 @@ logger = logging.getLogger(__name__)
 HARDWARE_OPTIONS = ("control_hz", "joint_ranges", "stop_level", "rest_pose", "model", "speed_limit")
 
 DETECTOR = "detector"
-"""Option of a real robot that is set on it: an :class:`~strands_robots.kinematics.detector.ObjectDetector`."""
+"""Option of a real robot that is set on it: an :class:`~strands_robots.kinematics.objects.ObjectDetector`."""
 
 NO_SUCH_MODEL = "NO_SUCH_MODEL"
 """Error code for a simulated robot whose model is unknown or cannot be loaded."""
@@ -143,7 +143,7 @@ def run(
         DuplicateDeviceError: another device of this id is served.
     """
     from strands_robots import device_connect  # noqa: PLC0415 - the network is loaded when it is used
-    from strands_robots.device_connect.links import usual_link  # noqa: PLC0415
+    from strands_robots.device_connect.backends.config import usual_link  # noqa: PLC0415
 
     if peer_id is not None:
         own_device_id("peer_id", peer_id)
@@ -188,8 +188,7 @@ def _print_to_terminal(text: str) -> None:
 
 
 def _simulated(name: str, tool_name: str | None, options: dict[str, Any]) -> Any:
-    from strands_robots.simulation import Simulation  # noqa: PLC0415 - loads MuJoCo
-    from strands_robots.simulation.tabletop import furnish  # noqa: PLC0415 - simulation only
+    from strands_robots.simulation import Simulation, furnish  # noqa: PLC0415 - loads MuJoCo
 
     label, scene, tip = _label(name), options.pop("scene", None), options.pop("tip", "")
     simulation = _construct(_networked(Simulation), tool_name=tool_name or label, **options)

@@ -9,16 +9,16 @@ from typing import Any
 import pytest
 from fixtures.driver_bench import DriverBench
 from fixtures.planes import own_plane
+from fixtures.ros_memory import MemoryLink
 
 from strands_robots.device_connect.bringup import driver_for
 from strands_robots.device_connect.mobile_base_driver import MobileBaseDeviceDriver
-from strands_robots.drivers.ros import rtps_robot, velocity_publisher
+from strands_robots.drivers.ros import rtps_robot, velocity
 from strands_robots.drivers.ros.ackermann_robot import AckermannRosRobot
 from strands_robots.drivers.ros.mobile_base import MobileBaseRobot
 from strands_robots.drivers.ros.ros_bridge import RosBridgedRobot
 from strands_robots.drivers.ros.rosbridge_robot import RosbridgeRobot
 from strands_robots.ros.gate import CommandGate
-from strands_robots.ros.memory import MemoryLink
 from strands_robots.safety.authorization import Approval, Authorization
 from strands_robots.safety.orders import StopOrder
 from strands_robots.safety.plane import SafetyPlane
@@ -81,7 +81,7 @@ def plane() -> Iterator[SafetyPlane]:
 async def test_a_locked_base_of_every_class_gets_zeros_and_nothing_else_until_it_is_freed(
     kind: str, plane: SafetyPlane, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(velocity_publisher, "BLIND_HOLD_S", 0.2)
+    monkeypatch.setattr(velocity, "BLIND_HOLD_S", 0.2)
     link = Far()
     base = MAKERS[kind](link, monkeypatch)
     assert isinstance(driver_for(base, "robot"), MobileBaseDeviceDriver)

@@ -1,4 +1,4 @@
-"""Device as the body of a control loop, under its bus lock and a permit."""
+"""Device as the body of a control loop, under bus lock and permit; leader arms."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial
-from typing import Any, TypeVar
+from types import TracebackType
+from typing import Any, Self, TypeVar
 
-from strands_robots.bus_access import action_ranges, bus_lock, motor_buses, read_currents, read_joints, write_joints
+from strands_robots.bus_access import action_ranges, bus_lock, joint_reader, motor_buses, read_currents, write_joints
 from strands_robots.hardware._compat import drop, forget_input, stop_base, unplugged
-from strands_robots.hardware.calibration import answer_lost, write_to_servos
-from strands_robots.hardware.device_facts import require_port
-from strands_robots.hardware.speed import default_speeds
+from strands_robots.hardware.device_facts import default_speeds, require_port
+from strands_robots.hardware.lerobot_device import answer_lost, write_to_servos
 from strands_robots.policies.base import Action, checked_speeds, is_velocity, numbers
 from strands_robots.safety.gate import MotionsHeldError, Permit, PermitVoidError
 from strands_robots.safety.stopping import StopLevel
@@ -34,6 +34,9 @@ CONNECT_TRIES = 3
 
 A motor that does not answer its first ping is a ``RuntimeError`` of LeRobot's, one that falls silent later a
 ``ConnectionError``."""
+
+IDLE_WAIT_S = 1.0
+"""Seconds that a read of the state waits for the bus while nothing drives the robot."""
 
 HOLD_FRESH_S = 0.25
 """Greatest age, in seconds, of a joint read whose positions are held when a new one fails."""
@@ -85,6 +88,8 @@ class DeviceBody:
         self.bounds = {**action_ranges(device), **_checked(joint_ranges or {}, device)}
         positions = [key for key in self.bounds if not is_velocity(key)]
         self._speeds = {} if speed_limit is None else checked_speeds(speed_limit, positions)
+        self._read_joints = joint_reader(device)
+        self._default_speeds = default_speeds(device)
         self._latest: tuple[float, dict[str, float]] | None = None
         self.targets: dict[str, float] = {}
         """What it was told last by an action, by key; empty once it was frozen or let go."""
@@ -92,14 +97,14 @@ class DeviceBody:
         self._was_connected = self.is_connected
         self._holds_unconnected = bool(getattr(device, "holds_unconnected", False))
         self._stops: list[object] = []
-        self._current_lost = False
+        self._current_lost, self._unread = False, ""
         self.driven = False
         """True from an action until it was frozen or let go."""
 
     @property
     def speeds(self) -> dict[str, float]:
         """Greatest speed by action key: as given, else 2 rad/s for an angle."""
-        return default_speeds(self.device) | self._speeds
+        return self._default_speeds | self._speeds
 
     @property
     def lost(self) -> bool:
@@ -132,6 +137,7 @@ class DeviceBody:
                 return
             self.bring_up(self.device)
             self._lost, self._was_connected = False, True
+            self._default_speeds = default_speeds(self.device)
             # A driver that connects switches the torque on.
             self._limp = set()
 
@@ -167,6 +173,41 @@ class DeviceBody:
         """
         with self.lock:
             return self._joints(tries)
+
+    def refresh(self, *, led: bool, rate: float) -> str:
+        """Read the joints unless they are fresh; return why they were not read, or "".
+
+        Args:
+            led: a loop drives the robot and reads them itself.
+            rate: of that loop, in Hz.
+        """
+        if not self.is_connected:
+            return "The device is not connected."
+        if self.lost:
+            return "The device's port is gone; these are the joints of the last read."
+        age, _ = self.latest_joints or (math.inf, {})
+        # Two, because at one the loop itself is about to read, and would be held up.
+        if led and age <= 2 / rate:
+            return ""
+        within_s = 1 / rate if led else IDLE_WAIT_S
+        if not self.lock.acquire(timeout=within_s):
+            return f"The bus was busy for {within_s:g} s; these are the joints of the last read."
+        try:
+            if self.stop_waits:
+                return "A stop waits for the bus; these are the joints of the last read."
+            # The driving loop waits meanwhile: for one lost answer, not for three.
+            self.get_joints(1 if self.driven else READ_TRIES)
+        except Exception as exc:  # noqa: BLE001 - a device may raise anything; the answer says what
+            problem = f"The joints could not be read: {type(exc).__name__}: {exc}"
+            if problem != self._unread:
+                # A caller may ask fifty times a second.
+                logger.warning("%s: %s", self.name, problem)
+            self._unread = problem
+            return problem
+        finally:
+            self.lock.release()
+        self._unread = ""
+        return ""
 
     def get_positions(self) -> dict[str, float]:
         """Read the joints, which are called as the action keys are."""
@@ -308,7 +349,7 @@ class DeviceBody:
         return nullcontext()
 
     def _joints(self, tries: int, *, urgent: bool = False) -> dict[str, float]:
-        joints = self._exchange(lambda: read_joints(self.device), tries, urgent=urgent)
+        joints = self._exchange(self._read_joints, tries, urgent=urgent)
         self._latest = (time.monotonic(), joints)
         return dict(joints)
 
@@ -405,6 +446,54 @@ class DeviceBody:
         except BaseException:
             self._limp = limp
             raise
+
+
+class LeaderArm:
+    """A LeRobot leader, connected without a prompt while it is entered as a context.
+
+    Args:
+        device: has ``connect``, ``disconnect`` and ``get_action``; its joints are moved by hand.
+    """
+
+    def __init__(self, device: Any) -> None:
+        self.device = device
+        self._lock = bus_lock(device)
+
+    @property
+    def is_connected(self) -> bool:
+        """The device's own state; a device without one counts as connected."""
+        return bool(getattr(self.device, "is_connected", True))
+
+    def __enter__(self) -> Self:
+        DeviceBody.bring_up(self.device)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, exc: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            self.device.disconnect()
+        except OSError:
+            # Its cable is out, or a servo does not answer.
+            drop(self.device)
+
+    def get_action(self) -> Action:
+        """Read the joints by action key; raise after three lost answers."""
+        with self._lock:
+            for left in reversed(range(READ_TRIES)):
+                # A late answer would be taken for this one's, and every read after it would be old.
+                forget_input(self.device)
+                try:
+                    return dict(self.device.get_action())
+                except ConnectionError:
+                    if not left:
+                        raise
+        raise AssertionError  # the last try returns or raises
+
+    def get_teleop_events(self) -> dict[str, Any] | None:
+        """Read the device's events besides its joints; None for a device without any."""
+        read = getattr(self.device, "get_teleop_events", None)
+        return dict(read()) if callable(read) else None
 
 
 def _torque_buses(device: Any) -> dict[str, tuple[Any, str | None]]:

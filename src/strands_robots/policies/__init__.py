@@ -21,7 +21,7 @@ ENTRY_POINT_GROUP = "strands_robots.policies"
 ALIASES = {"lerobot": "lerobot_local"}
 
 _BUILT_IN = {
-    "mock": ("strands_robots.policies.mock", "MockPolicy"),
+    "mock": ("strands_robots.policies.base", "MockPolicy"),
     "remote": ("strands_robots.policies.remote", "RemotePolicy"),
     "openpi": ("strands_robots.policies.openpi", "OpenPiPolicy"),
     "groot": ("strands_robots.policies.groot", "GrootPolicy"),
@@ -46,9 +46,8 @@ def resolve_provider(provider: object) -> str:
     Raises:
         ValidationError: no such provider; the message names similar ones.
     """
-    names = policy_names()
     name = ALIASES.get(provider, provider) if isinstance(provider, str) else ""
-    if name in names:
+    if name in _BUILT_IN or name in (names := policy_names()):
         return name
     similar = alike(str(name), names)
     hint = f" Did you mean {' or '.join(similar)}?" if similar else ""

@@ -14,13 +14,11 @@ from typing import Any, TypeVar
 from strands_robots import settings
 from strands_robots.contract import Observer, Unsubscribe, for_request
 from strands_robots.drivers.ros.motion import COUNT_MAX, BaseMotion, Drive, DriveOrder, messages_for
-from strands_robots.drivers.ros.odometry import OdometryMonitor
-from strands_robots.drivers.ros.velocity_publisher import CurrentHold, VelocityPublisher, ZeroVelocityHold
+from strands_robots.drivers.ros.velocity import CurrentHold, OdometryMonitor, VelocityPublisher, ZeroVelocityHold
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.policies.rollout import RolloutObservers
 from strands_robots.ros.gate import CommandGate
-from strands_robots.ros.link import RosError, RosLink
-from strands_robots.ros.names import bare_kind, graph_name, interface
+from strands_robots.ros.link import RosError, RosLink, bare_kind, graph_name, interface
 from strands_robots.safety.gate import MotionGate, MotionRefused, MotionRequest, Permit
 from strands_robots.safety.stop_targets import halted_with_verbs
 from strands_robots.safety.stopping import PendingVerdict, StopVerdict, halts_in_parts
