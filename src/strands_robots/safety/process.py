@@ -1,4 +1,4 @@
-"""The process: time slices and garbage collector of its interpreter, and its pauses."""
+"""The process: time slices and collector of its interpreter, and its pauses."""
 
 from __future__ import annotations
 

@@ -306,13 +306,13 @@ SOURCES_NAMED = 16
 
 
 class StopCount:
-    """Stops of a flood since the last record of them; thread-safe.
+    """Stops that were counted instead of carried out one by one; thread-safe.
 
     Args:
-        every_s: seconds between two records.
+        every_s: seconds between two records of them.
     """
 
-    def __init__(self, every_s: float) -> None:
+    def __init__(self, every_s: float = 10.0) -> None:
         self._every_s = every_s
         self._counting = threading.Lock()
         self._stops = 0
