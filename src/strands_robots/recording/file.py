@@ -19,7 +19,7 @@ from strands_robots.recording import schemas
 from strands_robots.recording._compat import close_chunk
 from strands_robots.recording.schemas import Schema
 from strands_robots.recording.unpacking import read_messages
-from strands_robots.teleoperators.recorded import Frame, check_length
+from strands_robots.teleoperators import Frame, check_length
 from strands_robots.utils import ValidationError, missing_extra, shown
 
 CHUNK_BYTES = 16_384
