@@ -423,11 +423,11 @@ class GamepadLeader:
                 data = os.read(self._fd, _EVENT.size * 64)
             except BlockingIOError:
                 return
-            for _, value, kind, axis in _EVENT.iter_unpack(data[: len(data) // _EVENT.size * _EVENT.size]):
+            for _, value, kind, place in _EVENT.iter_unpack(data[: len(data) // _EVENT.size * _EVENT.size]):
                 if kind & ~_OPENING == _AXIS:
-                    self._pushes[axis] = max(value / _FULL, -1.0)
+                    self._pushes[place] = max(value / _FULL, -1.0)
                 elif kind & ~_OPENING == _BUTTON:
-                    self._buttons[number] = bool(value)
+                    self._buttons[place] = bool(value)
             if len(data) < _EVENT.size * 64:
                 return
 
