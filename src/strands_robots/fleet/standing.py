@@ -114,10 +114,10 @@ class StandingController:
         while not self._closing.is_set():
             try:
                 with network.standing(self._signing_key, partial(self._known, name)) as sender:
-                    self._on_standing(network, sender)
                     if name in self.failures:
                         logger.warning("%s reports whom it misses on %s again.", self._source, name)
                     self._note(name, sender, None)
+                    self._on_standing(network, sender)
                     tried.set()
                     self._closing.wait()
             except Exception as exc:  # noqa: BLE001 - logged and said; the other networks have their controller
