@@ -31,7 +31,7 @@ PARSERS = {
     "audit/head.py": OWN_FILE,
     "audit/journal.py": OWN_FILE,
     "bounded_json.py": BOUNDED,
-    "cli/command.py": OWN_FILE,
+    "cli/app.py": OWN_FILE,
     "dashboard/page_session.py": BOUNDED,
     "dashboard/pose_process.py": OWN_FILE,
     "dashboard/pictures.py": OWN_FILE,
