@@ -23,7 +23,7 @@ from strands_robots.fleet import event_feed
 from strands_robots.fleet.adapter import FoundRobot, RobotEvent
 from strands_robots.fleet.description import python_name
 from strands_robots.fleet.remote_robot import RemoteRobot
-from strands_robots.serving.own_verbs import MEMBERS, STOPS
+from strands_robots.serving.offered_verbs import MEMBERS, STOPS
 from strands_robots.utils import WAIT_S, ValidationError
 
 

@@ -11,7 +11,7 @@ import pytest
 from fixtures.toy_robots import ToyRobot
 
 from strands_robots.contract import adapt
-from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS, WORLD_MOTION_VERBS
+from strands_robots.serving.arm_verbs import ARM_MOTION_VERBS, WORLD_MOTION_VERBS
 from strands_robots.serving.verbs import Kind
 from strands_robots.simulation import Simulation
 from strands_robots.utils import ValidationError
@@ -48,7 +48,7 @@ def test_reads_need_no_leave_to_move() -> None:
 
 def test_robot_without_an_arm_says_so() -> None:
     verb = ARM_MOTION_VERBS["getPose"]
-    answer: Any = verb.call(adapt(ToyRobot()), {})()
+    answer: Any = verb.carry_out(adapt(ToyRobot()), {})
     assert answer["reason"] == "This robot has no arm whose motions can be planned here."
 
 
@@ -63,7 +63,7 @@ def world() -> Iterator[Simulation]:
 def run(world: Simulation, name: str, **arguments: Any) -> dict[str, Any]:
     verb = WORLD_MOTION_VERBS[name]
     checked = verb.checked(arguments)
-    answer = verb.call(world, {key: value for key, value in checked.items() if not key.startswith("lease_")})()
+    answer = verb.carry_out(world, {key: value for key, value in checked.items() if not key.startswith("lease_")})
     assert isinstance(answer, dict)
     return answer
 

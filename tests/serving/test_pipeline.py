@@ -10,11 +10,9 @@ from typing import Any
 import pytest
 from fixtures.toy_robots import ToyRobot
 
-from strands_robots.envelope import error
+from strands_robots.envelope import RefusalReason, Refused, error
 from strands_robots.safety.approval import Approval, Grants
-from strands_robots.serving.leave import Command
-from strands_robots.serving.pipeline import Pipeline, Result
-from strands_robots.serving.refused import RefusalReason, Refused
+from strands_robots.serving.pipeline import Command, Pipeline, Result
 from strands_robots.serving.robot_verbs import ARM_VERBS
 from strands_robots.serving.verbs import Arguments
 from strands_robots.serving.workers import shares_of

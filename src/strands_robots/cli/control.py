@@ -12,7 +12,7 @@ from strands_robots.cli.keys import PassphraseFile, signing_key
 from strands_robots.cli.network import Network, answering
 from strands_robots.cli.output import CliError, Exit, Screen, plain
 from strands_robots.envelope import is_error, text_of
-from strands_robots.serving.take_assertion import sign_take
+from strands_robots.safety.lease_signatures import sign_take
 from strands_robots.utils import identifier, number
 
 

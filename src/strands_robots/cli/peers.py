@@ -14,12 +14,11 @@ from rich.text import Text
 from strands_robots.cli.command import OnMesh, Timeout, assignments, command
 from strands_robots.cli.network import Network, answering, say_missing
 from strands_robots.cli.output import LATE_S, CliError, Exit, Screen, label, plain, readable, table
-from strands_robots.envelope import is_error, text_of
+from strands_robots.envelope import RefusalReason, is_error, text_of
 from strands_robots.fleet.adapter import FIND_S
 from strands_robots.fleet.callers import SOURCE
 from strands_robots.fleet.networks import STILL
-from strands_robots.serving.known_verbs import QUICK, STOPS, TEXTS, VERBS, WAITING
-from strands_robots.serving.refused import RefusalReason
+from strands_robots.serving.advertised import QUICK, STOPS, TEXTS, VERBS, WAITING
 from strands_robots.utils import WAIT_S, ValidationError, identifier, number
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from itertools import islice
 from typing import Any
 
 from strands_robots.serving.advertised import AdvertisedParameter, AdvertisedVerb, RobotDescription
-from strands_robots.serving.control_verbs import CONTROL_VERBS
+from strands_robots.serving.control_leases import CONTROL_VERBS
 
 LEFT_OUT = frozenset({*CONTROL_VERBS, "resume", "ping", "teleop_status", "teleop_receive", "teleop_stop"})
 """Verbs that the page has a control of its own for, or none."""

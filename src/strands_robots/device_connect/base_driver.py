@@ -35,7 +35,7 @@ from strands_robots.device_connect.safety_registration import (
 )
 from strands_robots.device_connect.state_reports import report_changes, sweep
 from strands_robots.device_connect.telemetry import RolloutPump
-from strands_robots.envelope import Envelope, error, jsonable, success
+from strands_robots.envelope import Envelope, RefusalReason, Refused, error, jsonable, success
 from strands_robots.safety.approval import Approval
 from strands_robots.safety.authorization import ANONYMOUS, Authorization, caller_name
 from strands_robots.safety.estop_listener import ESTOP
@@ -44,17 +44,13 @@ from strands_robots.safety.lockout import LockoutLatch
 from strands_robots.safety.orders import REASON_MAX, epoch_of
 from strands_robots.safety.stop_executor import stop_executor
 from strands_robots.safety.stopping import StopVerdict
-from strands_robots.serving.control_changes import ControlChange
-from strands_robots.serving.leave import Command
-from strands_robots.serving.offered_verbs import Offers
-from strands_robots.serving.own_verbs import own_verbs
-from strands_robots.serving.pipeline import Pipeline, Result, busy
-from strands_robots.serving.refused import RefusalReason, Refused
+from strands_robots.serving.control import ControlChange
+from strands_robots.serving.offered_verbs import Offers, own_verbs
+from strands_robots.serving.pipeline import Command, Pipeline, Result
 from strands_robots.serving.stop_arguments import noted
-from strands_robots.serving.verb_schema import described, labels_of, text_of
-from strands_robots.serving.verbs import REQUIRED, Arguments, Kind, Verb
-from strands_robots.serving.workers import ShareFullError, called, loop_future
-from strands_robots.serving.world_stops import stop_within
+from strands_robots.serving.stops import stop_within
+from strands_robots.serving.verbs import REQUIRED, Arguments, Kind, Verb, described, labels_of, text_of
+from strands_robots.serving.workers import called, loop_future
 from strands_robots.stop_log import stop_logger
 from strands_robots.utils import START_S, WAIT_S, ValidationError, shown, text
 
@@ -217,18 +213,14 @@ class RobotDriver(CollectedOnce):
             problem = verb and verb.unfit(params.keys() - {"source_device"})
             return error(problem) if problem else await super().invoke(function_name, **params)
         caller = params.pop("source_device", None)
-        moves, named = verb.kind is Kind.MOTION, params.get("robot_name")
-        request = self.pipeline.pending.arrive(named if isinstance(named, str) else "") if moves else None
-        command = Command(verb, params, caller, request)
+        moves = verb.kind is Kind.MOTION
         answered, hand_over = loop_future()
+        request = self.pipeline.receive(verb, params, caller, hand_over)
         try:
-            self.pipeline.share(verb).submit(partial(self.pipeline.serve, command, hand_over))
             # Not wait_for: in Python 3.11 it forgets a cancellation that comes together with the answer.
             within_s = (START_S if moves else READ_DEADLINE_S) + (verb.lasts_s or WAIT_S if verb.lasts else 0.0)
             async with asyncio.timeout(within_s):
                 result: Result = await answered
-        except ShareFullError:
-            result = busy(command)
         except TimeoutError:
             # This command alone: to revoke the gate without a halt would leave what moves with its last command.
             if request is not None:
@@ -258,7 +250,7 @@ class RobotDriver(CollectedOnce):
 
     def _status(self, arguments: Arguments, request: MotionRequest | None) -> object:
         """The robot's status with its lockouts, the dead-man check-in and who holds it."""
-        answer = self.verbs["getStatus"].call(self.robot, arguments)()
+        answer = self.verbs["getStatus"].carry_out(self.robot, arguments)
         if not isinstance(answer, dict):
             return answer
         here, nonce = self.registration, arguments.get("nonce", "")

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from strands_robots.device_connect._compat import Labels
 from strands_robots.device_connect.robot_driver import RobotDeviceDriver
-from strands_robots.serving.base_verbs import BASE_VERBS, NAVIGATING_BASE_VERBS
+from strands_robots.serving.robot_verbs import BASE_VERBS, NAVIGATING_BASE_VERBS
 from strands_robots.serving.verbs import Verb
 
 

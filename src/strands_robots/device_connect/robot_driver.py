@@ -16,7 +16,7 @@ from strands_robots.envelope import fields_of
 from strands_robots.policies.base import plain_numbers
 from strands_robots.safety.approval import Approval
 from strands_robots.safety.authorization import Authorization
-from strands_robots.serving.leave import Command
+from strands_robots.serving.pipeline import Command
 from strands_robots.serving.policy_arguments import profile_list
 from strands_robots.serving.robot_verbs import ARM_VERBS
 from strands_robots.serving.verbs import Arguments, Verb

@@ -19,8 +19,8 @@ from strands_robots.safety.authorization import Authorization
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.policy_arguments import profile_list
 from strands_robots.serving.robot_verbs import WORLD_VERBS, served_world, world_stop_answer
+from strands_robots.serving.stops import WorldStop, robot_stop
 from strands_robots.serving.verbs import Verb
-from strands_robots.serving.world_stops import WorldStop, robot_stop
 
 Observed = tuple[float, int, dict[str, dict[str, float]]]
 """Simulated time, physics steps, and the joints of each robot."""

@@ -19,7 +19,7 @@ from strands_robots.fleet.adapter import CLOSED, FIND_S, STOP_S, Detail, FoundRo
 from strands_robots.fleet.bearers import bears, reaches, silent
 from strands_robots.fleet.joining import Joining
 from strands_robots.fleet.side_by_side import on_own_thread, side_by_side, those
-from strands_robots.serving.known_verbs import READS, RESUMES, STOPS
+from strands_robots.serving.advertised import READS, RESUMES, STOPS
 from strands_robots.utils import near, plain_text
 
 if TYPE_CHECKING:

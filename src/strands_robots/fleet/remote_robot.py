@@ -23,8 +23,7 @@ from strands_robots.fleet.lease import HeldLease, SharedLease
 from strands_robots.fleet.networks import STILL, Networks
 from strands_robots.fleet.refusals import refusal_of
 from strands_robots.safety.stopping import StopVerdict
-from strands_robots.serving.advertised import AdvertisedVerb, RobotDescription
-from strands_robots.serving.known_verbs import READS, RESUMES, STOPS
+from strands_robots.serving.advertised import READS, RESUMES, STOPS, AdvertisedVerb, RobotDescription
 from strands_robots.serving.verbs import LEASE_ID
 from strands_robots.utils import DURATION_MAX_S, START_S, WAIT_S, near, number, optional_module, text
 

@@ -8,8 +8,7 @@ from typing import Any
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.fleet.adapter import FoundRobot
 from strands_robots.mcp.results import row
-from strands_robots.serving.advertised import AdvertisedVerb, RobotDescription, find_verb, fitting, verb_names
-from strands_robots.serving.known_verbs import STOPS
+from strands_robots.serving.advertised import STOPS, AdvertisedVerb, RobotDescription, find_verb, fitting, verb_names
 from strands_robots.utils import near, shown
 
 VERBS_BYTES = 28_000

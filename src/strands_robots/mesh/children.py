@@ -27,12 +27,11 @@ from strands_robots.recording.cameras import has_cameras
 from strands_robots.safety.gate import MotionRequest
 from strands_robots.safety.identity import SigningIdentity
 from strands_robots.safety.stopping import StopVerdict
-from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS
+from strands_robots.serving.arm_verbs import ARM_MOTION_VERBS, PICTURE_VERBS
 from strands_robots.serving.peer_verbs import PEER_VERBS, TELEOP_VERBS, description_of
-from strands_robots.serving.picture_verbs import PICTURE_VERBS
 from strands_robots.serving.pipeline import Own, Pipeline
+from strands_robots.serving.stops import RobotStop
 from strands_robots.serving.verbs import Arguments, Verb
-from strands_robots.serving.world_stops import RobotStop
 from strands_robots.utils import ValidationError, identifier
 
 logger = logging.getLogger(__name__)
@@ -298,7 +297,7 @@ class Children:
             def begin(arguments: Arguments, request: MotionRequest | None) -> object:
                 if arguments.get("robot_name", name) != name:
                     return error(f"robot_name must be {name}, or be left out.")
-                return verb.call(self._world, {**arguments, **named}, request)()
+                return verb.carry_out(self._world, {**arguments, **named}, request)
 
             return begin
 

@@ -46,7 +46,7 @@ from strands_robots.safety.gate import MotionGate
 from strands_robots.safety.persistence import simulation_key
 from strands_robots.safety.plane import SafetyPlane
 from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope, none_known, own_cell
-from strands_robots.serving.own_verbs import own_verbs
+from strands_robots.serving.offered_verbs import own_verbs
 from strands_robots.serving.peer_verbs import description_of
 from strands_robots.serving.pipeline import Own, Pipeline
 from strands_robots.serving.robot_verbs import served

@@ -41,9 +41,8 @@ from strands_robots.safety.resume import REJECTED, configured_keys, is_epoch, si
 from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope, none_known
 from strands_robots.safety.statements import Proof, Purpose, proof_of
 from strands_robots.safety.stopping import Outcome, StopVerdict
-from strands_robots.serving.peer_verbs import PEER_VERBS
+from strands_robots.serving.peer_verbs import PEER_VERBS, peer_stop_answer
 from strands_robots.serving.pipeline import Own
-from strands_robots.serving.robot_verbs import peer_stop_answer
 from strands_robots.serving.verbs import Arguments
 from strands_robots.serving.workers import Share, ShareFullError
 from strands_robots.stop_log import stop_logger
@@ -82,7 +81,7 @@ def status_of(robot: Robot, facts: Callable[[str], Mapping[str, Any]]) -> Own:
     """
 
     def status(arguments: Arguments, request: MotionRequest | None) -> object:
-        answer = PEER_VERBS["status"].call(robot, arguments)()
+        answer = PEER_VERBS["status"].carry_out(robot, arguments)
         return {**answer, **facts(arguments.get("nonce", ""))} if isinstance(answer, Mapping) else answer
 
     return status

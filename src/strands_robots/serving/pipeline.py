@@ -1,41 +1,61 @@
 """Pipeline of a command from any network to a robot's method.
 
-In order: the arguments, leave to begin (:mod:`~strands_robots.serving.leave`), the robot's method. The first that
-refuses raises :class:`~strands_robots.serving.leave.Refused`, which says which it was. Whatever is raised on the way
-becomes a :class:`Result` here alone. Stops take no part in it: they go to the stop executor at once, for every caller.
+In order: the arguments, leave to begin, the robot's method. The first that refuses raises
+:class:`~strands_robots.envelope.Refused`, which says which it was. Whatever is raised on the way becomes a
+:class:`Result` here alone. Stops take no part in it: they go to the stop executor at once, for every caller.
+
+Leave to begin is one question: caller, control lease, lockout, the operator's approval. A call that is refused must not
+keep others from moving, so the robot is held, and a grant claimed, when nothing has refused; :meth:`Leave.settle` gives
+both back where the robot then starts nothing.
 """
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 from weakref import WeakKeyDictionary
 
 from strands_robots.contract import Robot, body_of
-from strands_robots.envelope import Envelope, error, is_error
+from strands_robots.envelope import Envelope, RefusalReason, Refused, error, is_error
 from strands_robots.identity_map import IdentityMap
-from strands_robots.safety.approval import Leave
+from strands_robots.safety.approval import Approval, Leave, digest
 from strands_robots.safety.gate import REFUSALS, MotionGate, MotionRefused, MotionRequest, refusal_envelope
-from strands_robots.serving.control import NotHolderError, leases_of
-from strands_robots.serving.leave import Command, MotionRules
-from strands_robots.serving.offered_verbs import tasks_refused
-from strands_robots.serving.refused import RefusalReason, Refused
-from strands_robots.serving.verbs import Arguments, Kind, Verb
-from strands_robots.serving.workers import Share, Shares, shares_of
+from strands_robots.serving.control import NotHolderError
+from strands_robots.serving.control_leases import ControlLeases, leases_of
+from strands_robots.serving.offered_verbs import tasks_refused, unoffered
+from strands_robots.serving.policy_arguments import MOCK, mock_refusal
+from strands_robots.serving.verbs import LEASE_ID, LEASE_NAMES, LEASE_TTL_S, Arguments, Kind, Verb
+from strands_robots.serving.workers import Share, ShareFullError, Shares, shares_of
 from strands_robots.stop_log import stop_logger
 from strands_robots.utils import ValidationError
 
 logger = stop_logger(__name__)
 
 
-def _own_refusal(verb: str, refused: Exception) -> Envelope:
-    """Return the answer to a verb that refused by itself."""
-    envelope = refusal_envelope(verb, refused)
-    if isinstance(refused, ValidationError):
-        return RefusalReason.ARGUMENTS.noted(envelope)
-    return RefusalReason.LOCKOUT.noted(envelope) if envelope.get("locked") is True else envelope
+@dataclass(frozen=True)
+class Command:
+    """One call of a verb, as a network received it.
+
+    Attributes:
+        arguments: unchecked, as the caller gave them.
+        caller: the caller's declared name, or whatever stood in its place.
+        request: of a motion, made of the robot's gate when the command arrived; None for a peer without a robot.
+        proof: what the network knows of the sender besides its name.
+    """
+
+    verb: Verb
+    arguments: Mapping[str, Any]
+    caller: object = None
+    request: MotionRequest | None = None
+    proof: Any = None
+
+    @property
+    def begun(self) -> bool:
+        """True once something has moved by it, whatever it is answered."""
+        return self.request is not None and self.request.begun
 
 
 @dataclass(frozen=True)
@@ -46,18 +66,20 @@ class Result:
     refusal: Refused | None = None
 
 
-def busy(command: Command) -> Result:
-    """Return the answer to a command for which no thread of the robot is left."""
-    text = f"{command.verb.name} refused: the robot has not yet answered earlier calls; try again later."
-    refused = Refused(RefusalReason.BUSY, text, reason="busy")
-    return Result(refused.envelope, refused)
+Authorize = Callable[[Command, Arguments], Collection[str] | None]
+"""Raises :class:`Refused` where the caller may not; :mod:`strands_robots.safety.authorization` decides.
 
+Returns the names by which an approval may know the caller, None without any.
+"""
 
 Answered = Callable[[Result], None]
 """Gets a command's answer on the thread that served it; it may not raise."""
 
 Own = Callable[[Arguments, MotionRequest | None], object]
 """Carries out a verb that is the network peer's own and not its robot's, for the command's request."""
+
+_Terms = tuple[str, str | None, float]
+"""``lease_id``, the robot of a world (None for all of them) and ``lease_ttl_s`` of a motion under a lease."""
 
 
 class PendingCommands:
@@ -80,13 +102,17 @@ class PendingCommands:
         """The same commands, for the peer of one robot of the world."""
         return PendingCommands(self._gate, robot, self)
 
-    def arrive(self, robot: str = "") -> MotionRequest | None:
-        """Note a command's arrival; what it begins may be no older than this."""
+    def arrive(self, robot: object = "") -> MotionRequest | None:
+        """Note a command's arrival; what it begins may be no older than this.
+
+        Args:
+            robot: the robot of a world that it names; anything but a text names none.
+        """
         if self._gate is None:
             return None
         request = self._gate.request()
         with self._lock:
-            self._pending[request] = self._robot or robot
+            self._pending[request] = self._robot or (robot if isinstance(robot, str) else "")
         return request
 
     def void(self, robot: str = "") -> None:
@@ -102,32 +128,60 @@ _PENDING: IdentityMap[PendingCommands] = IdentityMap()
 
 
 @dataclass
-class Pipeline(MotionRules):
+class Pipeline:
     """Serves the commands of one robot on one network, by its rules.
 
     Attributes:
+        robot: behind its contract; None for a peer that only watches and commands.
+        peer_id: gives the name that the operator's approval is for.
+        hardware: True where a motion needs the operator's approval besides the caller's authorization.
+        authorize: the network's question to the caller.
+        approval: the operator's.
+        leases: who holds the robot, on every network.
         own: verbs that the peer carries out itself, by name.
         pending: commands that a stop has to reach before they begin.
         shares: the robot's threads.
     """
 
+    robot: Robot | None
+    peer_id: Callable[[], str]
+    hardware: bool
+    authorize: Authorize
+    approval: Approval = field(default_factory=Approval)
+    leases: ControlLeases | None = None
     own: Mapping[str, Own] = field(default_factory=dict)
     pending: PendingCommands = field(default_factory=lambda: PendingCommands(None))
     shares: Shares = field(default_factory=Shares)
+    closed: bool = field(default=False, init=False)
+    """True once the peer leaves its network."""
     _serving: list[str] = field(default_factory=list, init=False)
-    _closed: bool = field(default=False, init=False)
     _changed: threading.Condition = field(default_factory=threading.Condition, init=False, repr=False)
 
     @classmethod
     def of(cls, robot: Robot | None, peer_id: Callable[[], str], **parts: Any) -> Pipeline:
-        """Make the pipeline of a robot, with shares and pending commands of its own."""
-        gate = None if robot is None else robot.gate
-        # The same on every network: a stop of one robot of a world voids what waits on the others.
-        pending = PendingCommands(None) if robot is None else _PENDING.of(body_of(robot), lambda: PendingCommands(gate))
-        parts.setdefault("pending", pending)
-        parts.setdefault("shares", Shares() if robot is None else shares_of(robot))
-        parts.setdefault("leases", None if robot is None else leases_of(robot, hardware=parts["hardware"]))
+        """Make the pipeline of a robot, with leases, shares and pending commands of its own unless given others."""
+        if robot is not None:
+            gate = robot.gate
+            # The same on every network: a stop of one robot of a world voids what waits on the others.
+            parts.setdefault("pending", _PENDING.of(body_of(robot), lambda: PendingCommands(gate)))
+            parts.setdefault("shares", shares_of(robot))
+            if "leases" not in parts:
+                parts["leases"] = leases_of(robot, hardware=parts["hardware"])
         return cls(robot, peer_id, **parts)
+
+    def receive(
+        self, verb: Verb, arguments: Mapping[str, Any], caller: object, answered: Answered, proof: Any = None
+    ) -> MotionRequest | None:
+        """Have a command carried out on a thread of the robot; return at once, with the request of a motion."""
+        request = self.pending.arrive(arguments.get("robot_name")) if verb.kind is Kind.MOTION else None
+        command = Command(verb, arguments, caller, request, proof)
+        try:
+            self.share(verb).submit(partial(self.serve, command, answered))
+        except ShareFullError:
+            text = f"{verb.name} refused: the robot has not yet answered earlier calls; try again later."
+            refused = Refused(RefusalReason.BUSY, text, reason="busy")
+            answered(Result(refused.envelope, refused))
+        return request
 
     def share(self, verb: Verb) -> Share:
         """Return the share of threads for a verb; only motions wait for motions."""
@@ -157,7 +211,7 @@ class Pipeline(MotionRules):
             elif self.robot is None:
                 result = error(f"{verb.name}: no robot is registered on this peer.")
             else:
-                result = verb.call(self.robot, arguments, command.request)()
+                result = verb.carry_out(self.robot, arguments, command.request)
             begun = not is_error(result)
         except Refused as refused:
             refusal, result, begun = refused, refused.envelope, False
@@ -182,20 +236,61 @@ class Pipeline(MotionRules):
                 self._serving.remove(verb.name)
                 self._changed.notify_all()
 
-    @property
-    def closed(self) -> bool:
-        """True once the peer leaves its network."""
-        return self._closed
-
     def close(self, timeout: float = 0.0) -> list[str]:
         """Refuse waiting commands and wait; return the verbs still running."""
-        self._closed = True
+        self.closed = True
         with self._changed:
             self._changed.wait_for(lambda: not self._serving, timeout)
             return list(self._serving)
 
+    def leave(self, command: Command, arguments: dict[str, Any]) -> Leave:
+        """Return leave to begin; a read needs no more than its caller's authorization.
+
+        Args:
+            command: as it was received.
+            arguments: checked. Those of the lease are taken out; a verb on the lease gets its parts.
+
+        Raises:
+            Refused: naming who refused, and why.
+            MotionRefused: the robot does not offer the verb, or was halted since the command arrived.
+        """
+        verb = command.verb
+        try:
+            callers = self.authorize(command, arguments) or ()
+        except Refused:
+            self._refuse_unoffered(verb)
+            raise
+        terms = self._terms(command, arguments) if verb.leased or verb.on_lease else None
+        if verb.kind is not Kind.MOTION:
+            return Leave()
+        self._admit(command, terms, hold=False)
+        self._refuse_locked(verb, command.request)
+        if not self.hardware:
+            return self._admit(command, terms)
+        if arguments.get("policy_provider") == MOCK and getattr(self.robot, "runs_policies", False):
+            refusal = mock_refusal()
+            if refusal is not None:
+                raise Refused(RefusalReason.APPROVAL, f"{verb.name} is refused: {refusal}", reason="mock on hardware")
+        peer = self.peer_id()
+        if self.approval.standing(verb.name, peer, callers):
+            return self._admit(command, terms)
+        own = {name: value for name, value in command.arguments.items() if name in verb.by_name.keys() - LEASE_NAMES}
+        wanted = verb.name, peer, callers, digest(own)
+        if not self.approval.given(*wanted):
+            raise self._unapproved(verb)
+        held = self._admit(command, terms)
+        claimed = None
+        try:
+            claimed = self.approval.claim(*wanted)
+        finally:
+            if claimed is None:
+                held.settle(begun=False)
+        if claimed is None:
+            raise self._unapproved(verb)
+        return Leave(held.settle, claimed.settle)
+
     def _checked(self, command: Command) -> dict[str, Any]:
-        if self._closed:
+        if self.closed:
             raise Refused(
                 RefusalReason.BUSY, f"{command.verb.name} refused: this peer has left its network.", reason="closed"
             )
@@ -206,3 +301,67 @@ class Pipeline(MotionRules):
             if lacking is not None:
                 raise MotionRefused(error(lacking)) from None
             raise Refused(RefusalReason.ARGUMENTS, str(exc)) from None
+
+    def _terms(self, command: Command, arguments: dict[str, Any]) -> _Terms | None:
+        """Take the lease's arguments out; give the lease's verbs their parts.
+
+        Returns:
+            None where no lease is asked.
+        """
+        verb = command.verb
+        if verb.on_lease:
+            if self.leases is None:
+                raise Refused(RefusalReason.CONTROL, f"{verb.name}: no robot is registered on this peer.")
+            arguments |= {"caller": command.caller, "robot": self.peer_id(), "leases": self.leases}
+            return None
+        lease_id, ttl_s = arguments.pop(LEASE_ID, "") or "", arguments.pop(LEASE_TTL_S, 0.0) or 0.0
+        if ttl_s and not lease_id:
+            raise Refused(RefusalReason.ARGUMENTS, f"{LEASE_TTL_S} needs a {LEASE_ID}: a secret of the caller's own.")
+        return lease_id, None if verb.of_world else arguments.get("robot_name", ""), ttl_s
+
+    def _admit(self, command: Command, terms: _Terms | None, *, hold: bool = True) -> Leave:
+        if terms is None or self.leases is None:
+            return Leave()
+        try:
+            return self.leases.admit(command.verb.name, command.caller, *terms, hold=hold, begun=lambda: command.begun)
+        except NotHolderError as exc:
+            raise Refused(RefusalReason.CONTROL, str(exc), envelope=exc.envelope) from None
+
+    def _refuse_unoffered(self, verb: Verb) -> None:
+        """Refuse a verb that the robot does not offer, for which no grant would help."""
+        lacking = None if self.robot is None else unoffered(self.robot, verb, self.peer_id())
+        if lacking is not None:
+            raise MotionRefused(error(lacking))
+
+    def _unapproved(self, verb: Verb) -> Refused:
+        self._refuse_unoffered(verb)
+        text = Approval.refusal(verb.name, self.peer_id())
+        return Refused(RefusalReason.APPROVAL, text, reason="the operator has not approved it")
+
+    def _refuse_locked(self, verb: Verb, request: MotionRequest | None) -> None:
+        """Refuse a motion of a locked robot, or one older than the last halt."""
+        if self.robot is None or verb.while_locked:
+            return
+        gate = self.robot.gate
+        locked = gate.lockout(verb.name)
+        if locked is not None:
+            text = str(locked.get("reason", "locked"))
+            if verb.instead:
+                text = f"{text} {verb.instead} works while it is locked, with the operator's approval."
+                locked = {**locked, **error(text)}
+            raise Refused(RefusalReason.LOCKOUT, text, reason="locked by an emergency stop", envelope=locked)
+        busy_with = gate.under_way.name
+        if busy_with:
+            text = f"{verb.name} is refused: {busy_with} of this robot has not returned."
+            raise Refused(RefusalReason.BUSY, text, reason="busy")
+        # Halted since the command arrived: refused before a grant is spent on it.
+        if request is not None and request.overtaken and (late := gate.refusal(verb.name, request)) is not None:
+            raise MotionRefused(late)
+
+
+def _own_refusal(verb: str, refused: Exception) -> Envelope:
+    """Return the answer to a verb that refused by itself."""
+    envelope = refusal_envelope(verb, refused)
+    if isinstance(refused, ValidationError):
+        return RefusalReason.ARGUMENTS.noted(envelope)
+    return RefusalReason.LOCKOUT.noted(envelope) if envelope.get("locked") is True else envelope

@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from functools import partial
 from typing import Any
 
 from strands_robots.contract import for_request
 from strands_robots.safety.gate import MotionRequest
 from strands_robots.safety.resume import is_epoch
 from strands_robots.utils import DURATION_MAX_S, ValidationError, duration, identifier, number, shown, text, whole
+from strands_robots.verb_parameters import JSON_TYPES
 
 Arguments = Mapping[str, Any]
 """Checked arguments, by parameter."""
@@ -166,20 +166,21 @@ class Verb:
     own: bool = False
     lasts_s: float = 0.0
     by_name: Mapping[str, Parameter] = field(init=False, repr=False, compare=False)
+    _required: frozenset[str] = field(init=False, repr=False, compare=False)
+    leased: bool = field(init=False, repr=False, compare=False)
+    """True for a motion of the lease's holder alone; it takes :data:`OF_THE_LEASE`."""
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "leased", self.kind is Kind.MOTION and not self.while_locked)
         if self.leased and all(each.name != LEASE_ID for each in self.parameters):
             more = [replace(each, default=None) if self.drops_unknown else each for each in OF_THE_LEASE]
             object.__setattr__(self, "parameters", (*self.parameters, *more))
         object.__setattr__(self, "by_name", {each.name: each for each in self.parameters})
+        required = frozenset(each.name for each in self.parameters if each.default is REQUIRED)
+        object.__setattr__(self, "_required", required)
 
-    @property
-    def leased(self) -> bool:
-        """True for a motion of the lease's holder alone; it takes :data:`OF_THE_LEASE`."""
-        return self.kind is Kind.MOTION and not self.while_locked
-
-    def call(self, robot: Any, arguments: Arguments, request: MotionRequest | None = None) -> Callable[[], object]:
-        """Return the call that carries the verb out with a robot, and returns its answer.
+    def carry_out(self, robot: Any, arguments: Arguments, request: MotionRequest | None = None) -> object:
+        """Carry the verb out with a robot, and return its answer.
 
         Args:
             robot: behind its contract.
@@ -187,15 +188,16 @@ class Verb:
             request: what a motion begins for; a halt since it was made refuses the motion.
         """
         if self.begin is not None:
-            return partial(self.begin, robot, arguments, request)
+            return self.begin(robot, arguments, request)
         if self.run is not None:
-            return partial(self.run, robot, arguments)
-        return partial(for_request(request, getattr(robot, self.method)), **arguments)
+            return self.run(robot, arguments)
+        answer: object = for_request(request, getattr(robot, self.method))(**arguments)
+        return answer
 
     def unfit(self, names: Collection[str]) -> str | None:
         """Return the reason why arguments of these names do not fit, or None."""
         unknown = [name for name in names if name not in self.by_name]
-        missing = [each.name for each in self.parameters if each.default is REQUIRED and each.name not in names]
+        missing = [each for each in self.by_name if each in self._required and each not in names]
         if not unknown and not missing:
             return None
         takes = ", ".join(name for name in self.by_name if name not in LEASE_NAMES) or "no parameters"
@@ -210,12 +212,11 @@ class Verb:
         """
         if self.drops_unknown:
             given = {name: value for name, value in given.items() if name in self.by_name and value is not None}
-        problem = self.unfit(given)
-        if problem is not None:
-            raise ValidationError(problem)
+        if not (self._required <= given.keys() <= self.by_name.keys()):
+            raise ValidationError(str(self.unfit(given)))
         arguments = {
-            each.name: each.check(each.name, given[each.name]) if each.name in given else each.default
-            for each in self.parameters
+            name: each.check(name, given[name]) if name in given else each.default
+            for name, each in self.by_name.items()
         }
         return {name: value for name, value in arguments.items() if value is not None or not self.drops_unknown}
 
@@ -329,3 +330,49 @@ RESUME = Verb(
     returns="epoch, locked, epochs",
     urgent=True,
 )
+
+
+Labels = dict[str, str | list[str]]
+
+
+def labels_of(verb: Verb) -> Labels:
+    """Return the labels of a verb: direction, whose it is, seconds to return."""
+    kind: Labels = {"direction": "read"} if verb.kind is Kind.READ else {"direction": "write"}
+    if verb.kind is not Kind.READ and verb.critical:
+        kind["safety"] = "critical"
+    if verb.own:
+        kind["own"] = "true"
+    duration = verb.by_name.get("duration") if verb.lasts else None
+    lasts_s = verb.lasts_s if duration is None else float(duration.default)
+    if lasts_s:
+        kind["lasts_s"] = f"{lasts_s:g}"
+    return kind
+
+
+def text_of(verb: Verb) -> str:
+    """Return the text that describes a verb and its parameters."""
+    lines = [verb.summary, *(["", verb.note] if verb.note else [])]
+    if verb.parameters:
+        lines += ["", "Args:", *(f"    {each.name}: {each.meaning}" for each in verb.parameters)]
+    return "\n".join(lines)
+
+
+def described(verb: Verb) -> dict[str, Any]:
+    """Return the description of a verb, in Device Connect's shape for a function."""
+    return {
+        "name": verb.name,
+        "description": text_of(verb),
+        "parameters": {
+            "type": "object",
+            "properties": {each.name: _schema(each) for each in verb.parameters},
+            "required": [each.name for each in verb.parameters if each.default is REQUIRED],
+        },
+        "labels": labels_of(verb),
+    }
+
+
+def _schema(parameter: Parameter) -> dict[str, Any]:
+    if parameter.schema is not None:
+        return dict(parameter.schema)
+    kind = {"type": JSON_TYPES.get(parameter.type, "string"), "description": parameter.meaning}
+    return kind if parameter.default is REQUIRED else {**kind, "default": parameter.default}

@@ -501,7 +501,7 @@ class MeshNetwork:
 
     def _given_to(self, robot: str, verb: str, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         """Return the arguments that an action of ours is sent with."""
-        from strands_robots.serving.known_verbs import STOPS  # noqa: PLC0415 - loaded when it is used
+        from strands_robots.serving.advertised import STOPS  # noqa: PLC0415 - loaded when it is used
         from strands_robots.serving.peer_verbs import PEER_VERBS  # noqa: PLC0415 - as above
 
         mesh = self._mesh
