@@ -34,7 +34,7 @@ FLOORS: list[set[str]] = [
         "stop_log",
         "agent_tool",
         "_mesh_switch",
-        "zenoh_sockets",
+        "zenoh_session",
         "certificates",
     },
     {"safety", "audit", "contract", "verb_declaration", "verb_parameters"},

@@ -10,9 +10,9 @@ import atexit
 import contextlib
 import threading
 import weakref
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from device_connect_edge.messaging import MessagingError
 
@@ -22,27 +22,13 @@ from strands_robots.safety.missed_stops import ANSWER, QUESTION
 from strands_robots.safety.orders import PARSED_MAX_BYTES
 from strands_robots.safety.roster_report import STOP_ROSTER
 from strands_robots.stop_log import stop_logger
-
-if TYPE_CHECKING:
-    from strands_robots.device_connect.backends.zenoh_session import LinkedSession
+from strands_robots.zenoh_session import StopSession
 
 logger = stop_logger(__name__)
 
 RETRY_S = 0.25
-TRY_MS = 1000
-"""Time in which a client's session tries to open before it checks whether it is still wanted."""
-
-LEASE_MS = 4000
-"""Time after which a silent peer is given up; with a shorter one a lossy link would flap under a stop."""
-
-OVERLAP_S = 2.0
-"""Time in which a replaced session still carries stops: peers learn of the new one and of one another meanwhile."""
-
 ANSWERS = frozenset((VERDICT, CHECK_IN_ANSWER, QUESTION, ANSWER, STOP_ROSTER))
 """Events of which many may be sent at once; any other one is a stop or a check-in, and goes first."""
-
-LOST_MAX = 1024
-"""Peers remembered that were linked once; one of them that is linked again makes the link up anew."""
 
 CLOSE_S = 10.0
 """Seconds that a close waits for the link's thread."""
@@ -90,165 +76,24 @@ def _from_here(endpoint: str) -> str:
     return f"{scheme}/{local}:{port}" + ("#verify_name_on_connect=false" if scheme == "tls" else "")
 
 
-class _State:
-    """Up or down; reports each change, and again when it is up anew."""
-
-    def __init__(self, on_state: OnState) -> None:
-        self.up = False
-        self._on_state = on_state
-
-    def set(self, up: bool, *, anew: bool = False) -> None:
-        if up != self.up or (up and anew):
-            self.up = up
-            self._on_state(up)
-
-
-class ZenohStopLink:
+class ZenohStopLink(StopSession):
     """Stop link over a Zenoh session; its callbacks run on Zenoh's threads."""
 
     def __init__(self, link: LinkConfig) -> None:
-        self._link = _apart(link)
+        super().__init__(_apart(link).zenoh)
         self._root = f"device-connect/{link.tenant}"
-        self._sessions: tuple[LinkedSession, ...] = ()
-        self._dropping, self._reporting, self._starting = threading.Lock(), threading.Lock(), threading.Lock()
-        self._state = _State(lambda up: None)
-        self._linked: frozenset[tuple[int, str]] = frozenset()
-        self._lost: dict[str, None] = {}
-        self._closing = threading.Event()
-        self._thread: threading.Thread | None = None
-        self._subscribed: tuple[Collection[str], OnEvent] = ((), lambda event, source, payload: None)
-        self._put_options: dict[str, Any] = {}
-        self._answer_options: dict[str, Any] = {}
-
-    @property
-    def up(self) -> bool:
-        return self._state.up
-
-    @property
-    def remotes(self) -> set[str]:
-        """The Zenoh ids of the sessions it is linked to."""
-        return {zid for _, zid in self._links()}
 
     def open(self, events: Collection[str], on_event: OnEvent, on_state: OnState) -> None:
-        self._state = _State(on_state)
-        self._subscribed = (events, on_event)
-        with self._starting:
-            self._start(self._open)
-        _OPEN.add(self)
-
-    def renew(self) -> None:
-        """Open another session, and close the present one after an overlap.
-
-        The work is done on a thread; a call while that thread still works does nothing.
-        """
-        with self._starting:
-            if self._thread is not None and not self._thread.is_alive() and not self._closing.is_set():
-                self._start(self._replace)
-
-    def publish(self, source: str, event: str, payload: bytes) -> bool:
-        sent, options = False, self._answer_options if event in ANSWERS else self._put_options
-        for each in self._sessions:
-            if not each.remotes:
-                continue
-            try:
-                each.zenoh.put(f"{self._root}/{source}/event/{event}", payload, **options)
-            except Exception as exc:  # noqa: BLE001 - the binding has one error for a closed session and a bad key
-                logger.warning("%s was not sent: %s", event, exc)
-            else:
-                sent = True
-        return sent
-
-    def close(self) -> None:
-        self._closing.set()
-        with self._starting:
-            thread = self._thread
-        if thread is not None:
-            thread.join(CLOSE_S)
-        for each in self._sessions:
-            self._drop(each)
-        _OPEN.discard(self)
-
-    def _start(self, work: Callable[[], None]) -> None:
-        self._thread = threading.Thread(target=work, name="stop-link", daemon=True)
-        self._thread.start()
-
-    def _replace(self) -> None:
-        before = self._sessions
-        self._open()
-        self._closing.wait(OVERLAP_S)
-        for each in before:
-            self._drop(each)
-
-    def _drop(self, session: LinkedSession) -> None:
-        # A second caller waits too: a thread that is inside Zenoh while the interpreter ends aborts the process.
-        with self._dropping:
-            if session not in self._sessions:
-                return
-            self._sessions = tuple(other for other in self._sessions if other is not session)
-            session.close()
-        self._report()
-
-    def _open(self) -> None:
-        import zenoh  # noqa: PLC0415 - an optional package, loaded with the first link
-
-        from strands_robots.device_connect.backends.zenoh_session import LinkedSession  # noqa: PLC0415 - as above
-
-        self._put_options = {
-            "priority": zenoh.Priority.REAL_TIME,
-            "congestion_control": zenoh.CongestionControl.DROP,
-            "express": True,
-        }
-        # Many robots answer at once: their answers share batches, and stand before no stop.
-        self._answer_options = {**self._put_options, "priority": zenoh.Priority.INTERACTIVE_HIGH, "express": False}
-        events, on_event = self._subscribed
-        session = None
-        while session is None:
-            if self._closing.is_set():
-                return
-            try:
-                session = LinkedSession(self._config(), self._report)
-            except zenoh.ZError as exc:
-                logger.debug("the e-stop listener's session does not open yet: %s", exc)
-                self._closing.wait(RETRY_S)
-
         def on_sample(sample: Any) -> None:
             parts = str(sample.key_expr).split("/")
             size = len(sample.payload)
             if len(parts) == 5:
                 on_event(parts[4], parts[2], size if size > PARSED_MAX_BYTES else sample.payload.to_bytes())
 
-        for event in events:
-            session.subscribe(f"{self._root}/*/event/{event}", on_sample)
-        self._sessions = (*self._sessions, session)
-        session.watch_links()
+        self.start({f"{self._root}/*/event/{event}": on_sample for event in events}, on_state)
 
-    def _config(self) -> dict[str, Any]:
-        config = self._link.zenoh()
-        config["connect"]["retry"] = {"period_init_ms": 50, "period_max_ms": 250, "period_increase_factor": 2}
-        config["transport"]["link"]["tx"]["lease"] = LEASE_MS
-        # Answers of many robots come at once; Zenoh's own queue holds two batches and drops what does not fit.
-        config["transport"]["link"]["tx"]["queue"] = {"size": {"real_time": 16, "interactive_high": 16}}
-        # Zenoh keeps a descriptor of each link that agreed on shared memory; a stop has no use for it.
-        config["transport"]["shared_memory"] = {"enabled": False}
-        if not self._link.is_peer:
-            config["connect"]["timeout_ms"] = TRY_MS
-        return config
-
-    def _report(self) -> None:
-        with self._reporting:
-            before, self._linked = self._linked, self._links()
-            here = {zid for _, zid in self._linked}
-            new_session = bool({each for each, _ in self._linked} - {each for each, _ in before})
-            # A peer that is back may have sent a stop meanwhile, though others stayed linked.
-            back = new_session or not here.isdisjoint(self._lost)
-            self._lost.update(dict.fromkeys(zid for _, zid in before if zid not in here))
-            for zid in (*here, *list(self._lost)[:-LOST_MAX]):
-                self._lost.pop(zid, None)
-            self._state.set(bool(here) and not self._closing.is_set(), anew=back)
-
-    def _links(self) -> frozenset[tuple[int, str]]:
-        """Return each link as session and peer."""
-        return frozenset((id(each), zid) for each in self._sessions for zid in tuple(each.remotes))
+    def publish(self, source: str, event: str, payload: bytes) -> bool:
+        return self.put(f"{self._root}/{source}/event/{event}", payload, answer=event in ANSWERS)
 
 
 class NatsStopLink:
@@ -259,7 +104,8 @@ class NatsStopLink:
         self._root = f"device-connect.{link.tenant}"
         self._loop: asyncio.AbstractEventLoop | None = None
         self._client: Any = None
-        self._state = _State(lambda up: None)
+        self._up = False
+        self._on_state: OnState = lambda up: None
         self._started = threading.Event()
         self._sending: set[asyncio.Future[None]] = set()
         self._end: asyncio.Event | None = None
@@ -268,7 +114,7 @@ class NatsStopLink:
 
     @property
     def up(self) -> bool:
-        return self._state.up
+        return self._up
 
     @property
     def denied(self) -> str:
@@ -279,7 +125,7 @@ class NatsStopLink:
         return said
 
     def open(self, events: Collection[str], on_event: OnEvent, on_state: OnState) -> None:
-        self._state = _State(on_state)
+        self._on_state = on_state
         self._thread = threading.Thread(target=self._run, args=(events, on_event), name="stop-link", daemon=True)
         self._thread.start()
         self._started.wait()
@@ -287,7 +133,7 @@ class NatsStopLink:
 
     def publish(self, source: str, event: str, payload: bytes) -> bool:
         loop = self._loop
-        if loop is None or loop.is_closed() or not self._state.up:
+        if loop is None or loop.is_closed() or not self._up:
             return False
         subject = f"{self._root}.{source}.event.{event}"
         if event == ESTOP:
@@ -304,6 +150,12 @@ class NatsStopLink:
         thread.join(CLOSE_S)
         _OPEN.discard(self)
 
+    def _set(self, up: bool) -> None:
+        """Report a change of state."""
+        if up != self._up:
+            self._up = up
+            self._on_state(up)
+
     def _run(self, events: Collection[str], on_event: OnEvent) -> None:
         try:
             with asyncio.Runner() as runner:
@@ -314,7 +166,7 @@ class NatsStopLink:
             logger.critical("The e-stop listener's NATS link ended.", exc_info=True)
         finally:
             self._started.set()
-            self._state.set(False)
+            self._set(False)
 
     async def _serve(self, events: Collection[str], on_event: OnEvent, end: asyncio.Event) -> None:
         from strands_robots.device_connect.backends.nats import NatsBackend  # noqa: PLC0415 - loaded with the first link
@@ -334,21 +186,21 @@ class NatsStopLink:
                 # The server has the subscriptions when it has answered this.
                 await client.flush()
                 self._client = client
-                self._state.set(True)
+                self._set(True)
                 await end.wait()
             finally:
                 self._client = None
-                self._state.set(False)
+                self._set(False)
                 await client.close()
 
     async def _connected(self, client: Any, end: asyncio.Event) -> bool:
         """Try once to connect; False, after a pause, when it failed."""
 
         async def back() -> None:
-            self._state.set(True)
+            self._set(True)
 
         async def lost() -> None:
-            self._state.set(False)
+            self._set(False)
 
         trying = asyncio.ensure_future(client.connect(servers=[], reconnect_cb=back, disconnect_cb=lost))
         ending = asyncio.ensure_future(end.wait())
@@ -385,6 +237,6 @@ _OPEN: weakref.WeakSet[Any] = weakref.WeakSet()
 
 @atexit.register
 def _close_all() -> None:
-    """A session left open with a subscriber would hang the interpreter's exit."""
+    """A connection in use while the interpreter ends would log errors of its loop."""
     for link in list(_OPEN):
         link.close()

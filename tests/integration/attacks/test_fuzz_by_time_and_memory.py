@@ -76,7 +76,7 @@ RECEIVERS = {
     "device_connect/backends/base.py": "feeds and servers: 1 MiB, a stop 64 KiB",
     "device_connect/backends/nats.py": "1 MiB by the parser of frames, a reply 4 MiB",
     "device_connect/backends/zenoh.py": "1 MiB, looked at before it is copied, a reply 4 MiB",
-    "device_connect/backends/zenoh_session.py": "the sinks of zenoh.py and stop_link.py",
+    "device_connect/backends/zenoh_session.py": "the sinks of zenoh.py",
     "device_connect/bringup.py": "by the back end; nothing is parsed",
     "device_connect/client.py": "by the back end",
     "device_connect/discovery.py": "by the back end",
@@ -101,6 +101,7 @@ RECEIVERS = {
     "ros/dds.py": "by ros/dds_types.py, before a sample is decoded",
     "ros/rclpy.py": "decoded by rclpy itself",
     "serving/pipeline.py": "a question of this process",
+    "zenoh_session.py": "the sinks of its users",
 }
 """Each module that receives foreign messages, and their bound."""
 

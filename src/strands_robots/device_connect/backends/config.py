@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import hashlib
 import json
 import re
@@ -15,6 +14,7 @@ from urllib.parse import urlparse, urlsplit
 
 from ... import settings
 from ...utils import ValidationError, choice, device_id, port, redacted, shown
+from ...zenoh_session import transport_config, use_tls
 
 LOOPBACK = "127.0.0.1"
 INTERNET = ("tcp", "udp", "tls", "quic", "ws")
@@ -24,9 +24,6 @@ _DOTTED = re.compile(r"[0-9.]+")
 
 # Variables with the URLs of a backend, the first that is set counts.
 _URLS_OF = {"nats": ("NATS_URLS", "NATS_URL"), "zenoh": ("ZENOH_CONNECT",)}
-
-# Batches of 64 KiB per priority and link: the memory that a peer costs which is stopped in a debugger.
-QUEUED_BATCHES = 16
 
 DEFAULT_URL = "nats://127.0.0.1:4222"
 """NATS server of a link that names none."""
@@ -40,9 +37,6 @@ MAX_MESSAGE_BYTES = 64 * 2**20
 WAIT_BEFORE_DROP_US = 500
 WAIT_BEFORE_DROP_FRAGMENTS_US = 1_000_000
 WAIT_BEFORE_CLOSE_US = 1_000_000
-
-# Time in which a peer that accepted a connection has to answer; a session does not close while it waits for that.
-HANDSHAKE_MS = 2000
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,29 +203,16 @@ class LinkConfig:
                     "autoconnect_strategy": {"peer": {"to_router": "always", "to_peer": self._dials_peers()}},
                 },
             },
-            "transport": {
-                "unicast": {"open_timeout": HANDSHAKE_MS},
-                "link": {
-                    "tx": {
-                        "queue": {
-                            "size": {"data": QUEUED_BATCHES, "interactive_high": QUEUED_BATCHES},
-                            "congestion_control": {
-                                "drop": {
-                                    "wait_before_drop": WAIT_BEFORE_DROP_US,
-                                    "max_wait_before_drop_fragments": WAIT_BEFORE_DROP_FRAGMENTS_US,
-                                },
-                                "block": {"wait_before_close": WAIT_BEFORE_CLOSE_US},
-                            },
-                        }
-                    },
-                    "rx": {"max_message_size": MAX_MESSAGE_BYTES},
-                },
-            },
+            "transport": transport_config(("data", "interactive_high"), WAIT_BEFORE_DROP_US),
         }
+        link = config["transport"]["link"]
+        link["tx"]["queue"]["congestion_control"]["drop"]["max_wait_before_drop_fragments"] = (
+            WAIT_BEFORE_DROP_FRAGMENTS_US
+        )
+        link["tx"]["queue"]["congestion_control"]["block"] = {"wait_before_close": WAIT_BEFORE_CLOSE_US}
+        link["rx"] = {"max_message_size": MAX_MESSAGE_BYTES}
         if self.ca:
-            # A link with certificates must not fall back to plain TCP.
-            config["transport"]["link"]["protocols"] = ["tls"]
-            config["transport"]["link"]["tls"] = self._zenoh_tls()
+            use_tls(config, ca=self.ca, cert=self.cert, key=self.key, verify_name=self.verify_hostname)
         return config
 
     def _session_id(self) -> str:
@@ -253,16 +234,6 @@ class LinkConfig:
     def meeting_host(self) -> dict[str, Any]:
         """Return the configuration of a session that only listens on the meeting port."""
         return replace(self, listen=(self.meeting_point or "",), connect=(), meet_port=None, mode="peer").zenoh()
-
-    def _zenoh_tls(self) -> dict[str, Any]:
-        tls: dict[str, Any] = {"verify_name_on_connect": self.verify_hostname}
-        tls |= _pem_field("root_ca_certificate", self.ca)
-        if self.cert:
-            tls["enable_mtls"] = True
-            for side in ("connect", "listen"):
-                tls |= _pem_field(f"{side}_certificate", self.cert)
-                tls |= _pem_field(f"{side}_private_key", self.key)
-        return tls
 
 
 def loopback_config(meet_port: int | None = None, tenant: str = "default") -> LinkConfig:
@@ -443,9 +414,3 @@ def _armoured(text: str) -> dict[str, str]:
 
 def _tls_fields(tls: Mapping[str, Any]) -> dict[str, str]:
     return {part: str(tls.get(f"{part}_file") or tls.get(f"{part}_pem") or "") for part in ("ca", "cert", "key")}
-
-
-def _pem_field(name: str, value: str) -> dict[str, str]:
-    if value.lstrip().startswith("-----BEGIN"):
-        return {f"{name}_base64": base64.b64encode(value.encode()).decode()}
-    return {name: value}

@@ -25,6 +25,7 @@ from device_connect_edge.messaging.exceptions import (
 
 from ...bounded_json import LONG_MAX, SMALL_BYTES
 from ...utils import redacted
+from ...zenoh_session import direct
 from . import jsonrpc, zenoh_session
 from .base import Backend, NoResponderError, ResponderLostError, Undo, UnreadableReplyError, too_long
 from .config import LinkConfig
@@ -180,7 +181,7 @@ class ZenohBackend(Backend):
         began = time.monotonic()
         request, key = _Request(loop, self._outcomes), key_of(subject)
         token: Any = zenoh.CancellationToken()
-        handler = zenoh_session.direct(request.on_reply, request.on_end)
+        handler = direct(request.on_reply, request.on_end)
         get = partial(session.get, key, handler, payload=data, timeout=wait_s, cancellation_token=token, **self._query)
         deadline = loop.call_later(wait_s + _GRACE_S, request.on_deadline)
         try:

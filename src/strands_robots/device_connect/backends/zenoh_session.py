@@ -1,25 +1,19 @@
-"""Zenoh sessions, one for each distinct link, shared by the process.
-
-Zenoh calls back on its own threads; a sink given here runs there and must only hand over. Callbacks are direct: the
-binding would otherwise start one Python thread for each subscriber, queryable and query.
-"""
+"""Zenoh sessions, one for each distinct link, shared by the process."""
 
 from __future__ import annotations
 
 import atexit
 import contextlib
-import json
 import logging
 import random
 import socket
 import threading
 import time
 from collections.abc import Callable
-from ctypes import pythonapi
 from typing import Any
 
 from ...utils import missing_extra
-from ...zenoh_sockets import close_in_background
+from ...zenoh_session import LinkedSession, Sink, direct, undeclare
 from .config import LOOPBACK, LinkConfig
 
 try:
@@ -29,19 +23,9 @@ except ImportError as error:
 
 logger = logging.getLogger(__name__)
 
-Sink = Callable[[Any], None]
-
 # Seconds between two checks of a process without the meeting port whether another one still has it; half of it is
 # random, so that two survivors rarely try in the same instant.
 MEETING_CHECK_S = 1.0
-
-# Seconds that Zenoh's threads may still need after a close to release callbacks. A thread that asks for the interpreter
-# while that ends aborts the process, and Zenoh does not report when the last one has released.
-RELEASE_S = 0.05
-
-_ever_opened = threading.Event()
-
-_thread = threading.local()
 
 _sessions: dict[LinkConfig, SharedSession] = {}
 _lock = threading.Lock()
@@ -94,79 +78,6 @@ def meets(link: LinkConfig) -> str:
     return "peer" if shared is None else shared.meets
 
 
-def direct(sink: Sink, drop: Callable[[], None] | None = None) -> Any:
-    """Return a handler that calls ``sink`` on Zenoh's receiving thread."""
-
-    def on_message(message: Any) -> None:
-        if not hasattr(_thread, "kept"):
-            _keep_thread_state()
-        sink(message)
-
-    return zenoh.handlers.Callback(on_message, drop, indirect=False)
-
-
-def _keep_thread_state() -> None:
-    """Keep the interpreter's state of this thread until the thread ends.
-
-    Without it CPython makes a state for each callback on a thread that it did not start, and frees it after: two memory
-    mappings, a tenth of a call's time. The count that this raises is never lowered; there are as many states as Zenoh
-    has threads.
-    """
-    _thread.kept = True
-    pythonapi.PyGILState_Ensure()
-
-
-def undeclare(entity: Any) -> None:
-    """Undeclare an entity, unless its session was closed meanwhile."""
-    with contextlib.suppress(zenoh.ZError):
-        entity.undeclare()
-
-
-class LinkedSession:
-    """An open Zenoh session that knows the ids of the sessions it is linked to.
-
-    Args:
-        config: what ``zenoh.open`` takes.
-        on_change: called on Zenoh's thread when a link came or went.
-
-    Raises:
-        zenoh.ZError: the session cannot be opened.
-    """
-
-    def __init__(self, config: dict[str, Any], on_change: Callable[[], None] = lambda: None) -> None:
-        self.zenoh: Any = zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
-        self.remotes: set[str] = set()
-        self._on_change = on_change
-        self._declared: list[Any] = []
-
-    def watch_links(self) -> None:
-        """Keep ``remotes`` up to date from now on."""
-        events = self.zenoh.info.declare_transport_events_listener(direct(self._on_transport), history=True)
-        self._declared.append(events)
-
-    def subscribe(self, key: str, sink: Sink) -> None:
-        """Have ``sink(sample)`` called for every sample on ``key`` until the close."""
-        self._declared.append(self.zenoh.declare_subscriber(key, direct(sink)))
-
-    def close(self) -> None:
-        """Undeclare, then close."""
-        # Closing ends links, which Zenoh would report on its own threads after this has returned.
-        for declared in self._declared:
-            undeclare(declared)
-        try:
-            self.zenoh.close()
-        except zenoh.ZError as problem:
-            logger.warning("a Zenoh session did not close in order: %s", problem)
-
-    def _on_transport(self, event: Any) -> None:
-        up = event.kind == zenoh.SampleKind.PUT
-        if up:
-            close_in_background()
-        change = self.remotes.add if up else self.remotes.discard
-        change(str(event.transport.zid))
-        self._on_change()
-
-
 class SharedSession:
     """The session of one link with its users and its subscribers by key."""
 
@@ -190,8 +101,7 @@ class SharedSession:
                 return
             self._linked_session = opened = self._opened()
             self.opened_at = time.monotonic()
-            self.session, self._was_linked = opened.zenoh, self.link.is_peer
-            _ever_opened.set()
+            self.session, self._was_linked = opened.session, self.link.is_peer
             opened.watch_links()
 
     def close(self) -> None:
@@ -262,7 +172,7 @@ class SharedSession:
                 return LinkedSession(link.zenoh(meet=True), self._on_change)
         opened = LinkedSession(link.zenoh(), self._on_change)
         if link.meeting_point is not None:
-            self._meeting = MeetingPort(link, opened.zenoh)
+            self._meeting = MeetingPort(link, opened.session)
         return opened
 
     def _unsubscribe(self, key: str, sink: Sink) -> None:
@@ -276,7 +186,7 @@ class SharedSession:
             del self._topics[key]
         undeclare(topic.subscriber)
 
-    def _on_change(self) -> None:
+    def _on_change(self, _up: bool) -> None:
         with self._lock:
             linked, before = self.linked, self._was_linked
             self._was_linked = linked
@@ -355,11 +265,9 @@ class MeetingPort:
 
 @atexit.register
 def _close_all() -> None:
-    """A session left open with a subscriber would hang the interpreter's exit."""
+    """Close the meeting ports too, before the sessions of the process are closed."""
     with _lock:
         left = list(_sessions.values())
         _sessions.clear()
     for shared in left:
         shared.close()
-    if _ever_opened.is_set():
-        time.sleep(RELEASE_S)

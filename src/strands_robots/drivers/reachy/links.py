@@ -30,7 +30,7 @@ from strands_robots.drivers.reachy.rest import (
 from strands_robots.drivers.reachy.target import Target
 from strands_robots.stop_log import stop_logger
 from strands_robots.utils import ValidationError, identifier, missing_extra, shown
-from strands_robots.zenoh_sockets import close_in_background
+from strands_robots.zenoh_session import close_in_background
 
 logger = stop_logger(__name__)
 

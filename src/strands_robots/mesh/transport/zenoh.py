@@ -18,7 +18,7 @@ from strands_robots.mesh import topics, wire
 from strands_robots.mesh.transport import Callback, LivenessCallback, Sample, Transport, TransportError, zenoh_config
 from strands_robots.mesh.transport.zenoh_config import Posture
 from strands_robots.utils import missing_extra
-from strands_robots.zenoh_sockets import close_in_background
+from strands_robots.zenoh_session import close_in_background
 
 logger = logging.getLogger(__name__)
 

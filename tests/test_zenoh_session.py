@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 from fixtures.waiting import eventually
 
-from strands_robots import zenoh_sockets
-from strands_robots.zenoh_sockets import LINGER, change_links, close_in_background
+from strands_robots import zenoh_session
+from strands_robots.zenoh_session import LINGER, change_links, close_in_background
 
 
 @pytest.fixture
@@ -61,8 +61,8 @@ def test_search_leaves_sockets_blocking_where_the_process_has_a_default_timeout(
 
 def test_links_that_come_up_together_cost_one_search_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
     searches = list[int]()
-    monkeypatch.setattr(zenoh_sockets, "GATHER_S", 0.5)
-    monkeypatch.setattr(zenoh_sockets, "change_links", lambda: searches.append(threading.get_ident()))
+    monkeypatch.setattr(zenoh_session, "GATHER_S", 0.5)
+    monkeypatch.setattr(zenoh_session, "change_links", lambda: searches.append(threading.get_ident()))
     for _ in range(100):
         close_in_background()
     assert searches == []
@@ -76,7 +76,7 @@ def test_a_system_without_a_folder_of_descriptors_changes_nothing(
     open_sockets: ExitStack, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     link = made(open_sockets, 1, 10)
-    monkeypatch.setattr(zenoh_sockets, "DESCRIPTORS", Path("/nowhere"))
+    monkeypatch.setattr(zenoh_session, "DESCRIPTORS", Path("/nowhere"))
     assert change_links() == 0
     assert linger(link) == (1, 10)
 
@@ -86,9 +86,9 @@ def test_search_that_got_no_thread_is_tried_again_at_the_next_link(monkeypatch: 
         raise RuntimeError("can't start new thread")
 
     with monkeypatch.context() as patch:
-        patch.setattr(zenoh_sockets._thread, "start_new_thread", refuse)
-        zenoh_sockets.close_in_background()
+        patch.setattr(zenoh_session._thread, "start_new_thread", refuse)
+        zenoh_session.close_in_background()
     searched = threading.Event()
-    monkeypatch.setattr(zenoh_sockets, "change_links", searched.set)
-    zenoh_sockets.close_in_background()
+    monkeypatch.setattr(zenoh_session, "change_links", searched.set)
+    zenoh_session.close_in_background()
     assert searched.wait(20)
