@@ -178,9 +178,11 @@ class LinkedSession:
         events = self.session.info.declare_transport_events_listener(direct(self._on_transport), history=True)
         self._declared.append(events)
 
-    def subscribe(self, key: str, sink: Sink) -> None:
-        """Have ``sink(sample)`` called for every sample on ``key`` until the close."""
-        self._declared.append(self.session.declare_subscriber(key, direct(sink)))
+    def subscribe(self, key: str, sink: Sink) -> Any:
+        """Have ``sink(sample)`` called for every sample on ``key`` until the close; return what to undeclare before."""
+        subscriber = self.session.declare_subscriber(key, direct(sink))
+        self._declared.append(subscriber)
+        return subscriber
 
     def close(self) -> None:
         """Undeclare, then close."""

@@ -6,7 +6,7 @@ import textwrap
 
 import pytest
 
-PRELUDE = "import sys\nfrom strands_robots.device_connect.framework import load_when_used\n"
+PRELUDE = "import sys\nfrom strands_robots.device_connect import load_when_used\n"
 
 
 def run(code: str) -> str:

@@ -10,8 +10,8 @@ from collections.abc import Iterator
 import pytest
 from fixtures.waiting import until
 
-from strands_robots.device_connect import state_reports
-from strands_robots.device_connect.state_reports import IdleSweep, report_changes
+from strands_robots.device_connect import telemetry
+from strands_robots.device_connect.telemetry import IdleSweep, report_changes
 
 
 class Counter:
@@ -49,7 +49,7 @@ async def test_unchanged_state_is_neither_told_nor_read_again() -> None:
 
 
 async def test_unchanged_state_is_told_again_unread_after_a_while(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(state_reports, "AGAIN_S", 0.01)
+    monkeypatch.setattr(telemetry, "AGAIN_S", 0.01)
     counter = Counter()
     task = counter.report()
     await until(lambda: len(counter.told) >= 3)

@@ -11,7 +11,7 @@ import sys
 from typing import NoReturn
 
 from strands_robots import __version__
-from strands_robots.device_connect.framework import load_when_used
+from strands_robots.device_connect import load_when_used
 from strands_robots.utils import DISTRIBUTION
 
 __all__ = ["main"]

@@ -87,7 +87,7 @@ def meeting_problem(link: LinkConfig) -> str:
     """Return who else has the meeting port; empty for a robot process of this user."""
     if link.meet_port is None:
         return ""
-    from strands_robots.device_connect.backends.zenoh_session import meets  # noqa: PLC0415 - loaded when it is used
+    from strands_robots.device_connect.backends.zenoh import meets  # noqa: PLC0415 - loaded when it is used
 
     kind, until = meets(link), time.monotonic() + MEET_S
     while kind == "stranger" and time.monotonic() < until:
@@ -157,7 +157,7 @@ def dial_problem(link: LinkConfig, endpoint: str) -> str:
     from device_connect_edge.messaging import MessagingError  # noqa: PLC0415 - loaded when a network is used
 
     from strands_robots.device_connect.backends import open_client  # noqa: PLC0415 - as above
-    from strands_robots.device_connect.backends.reasons import reason_of  # noqa: PLC0415 - as above
+    from strands_robots.device_connect.backends.dial import reason_of  # noqa: PLC0415 - as above
 
     alone = replace(link, mode="client" if link.transport == "zenoh" else "auto", connect=(endpoint,), listen=())
     alone = replace(alone, meet_port=None, multicast=None, connect_timeout_s=DIAL_S)
@@ -179,7 +179,7 @@ def dial_problem(link: LinkConfig, endpoint: str) -> str:
 def listen_problem(endpoint: str) -> str:
     """Return why nobody can listen on a TCP endpoint, or empty."""
     from strands_robots.device_connect.backends.config import host_of  # noqa: PLC0415 - as above
-    from strands_robots.device_connect.backends.reasons import reason_of  # noqa: PLC0415 - as above
+    from strands_robots.device_connect.backends.dial import reason_of  # noqa: PLC0415 - as above
 
     host, number = host_of(endpoint), endpoint.rpartition(":")[2]
     if not endpoint.startswith(("tcp/", "tls/")) or not number.isdecimal():

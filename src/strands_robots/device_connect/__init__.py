@@ -14,13 +14,15 @@ the framework names the [device-connect] extra when that is missing.
 
 from __future__ import annotations
 
+import sys
+import threading
 from importlib import import_module
+from importlib.util import find_spec, module_from_spec
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from device_connect_edge import DeviceRuntime
 
-    from strands_robots.device_connect.agent import connect_agent
     from strands_robots.device_connect.backends import LinkConfig, link_from_environment, loopback_config
     from strands_robots.device_connect.bringup import (
         init_device_connect,
@@ -28,10 +30,11 @@ if TYPE_CHECKING:
         stop_device_connect,
     )
     from strands_robots.device_connect.client import FleetClient
+    from strands_robots.device_connect.links import connect_agent
+    from strands_robots.device_connect.process import LOOP_JOIN_TIMEOUT_S as _LOOP_JOIN_TIMEOUT_S
+    from strands_robots.device_connect.process import StopSignal
     from strands_robots.device_connect.reachy_mini_driver import ReachyMiniDriver
     from strands_robots.device_connect.robot_driver import RobotDeviceDriver
-    from strands_robots.device_connect.shutdown import LOOP_JOIN_TIMEOUT_S as _LOOP_JOIN_TIMEOUT_S
-    from strands_robots.device_connect.shutdown import StopSignal
     from strands_robots.device_connect.simulation_driver import SimulationDeviceDriver
     from strands_robots.safety.sightings import DuplicateDeviceError
 
@@ -55,7 +58,7 @@ __all__ = [
 
 _HERE = "strands_robots.device_connect"
 _HOMES = {
-    "_LOOP_JOIN_TIMEOUT_S": f"{_HERE}.shutdown",
+    "_LOOP_JOIN_TIMEOUT_S": f"{_HERE}.process",
     "DeviceRuntime": "device_connect_edge",
     "DuplicateDeviceError": "strands_robots.safety.sightings",
     "FleetClient": f"{_HERE}.client",
@@ -63,8 +66,8 @@ _HOMES = {
     "ReachyMiniDriver": f"{_HERE}.reachy_mini_driver",
     "RobotDeviceDriver": f"{_HERE}.robot_driver",
     "SimulationDeviceDriver": f"{_HERE}.simulation_driver",
-    "StopSignal": f"{_HERE}.shutdown",
-    "connect_agent": f"{_HERE}.agent",
+    "StopSignal": f"{_HERE}.process",
+    "connect_agent": f"{_HERE}.links",
     "init_device_connect": f"{_HERE}.bringup",
     "init_device_connect_sync": f"{_HERE}.bringup",
     "link_from_environment": f"{_HERE}.backends",
@@ -91,3 +94,28 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted({*globals(), *_HOMES})
+
+
+def load_when_used() -> None:
+    """Have the framework's package run at the first use of a name in it; its submodules import without that.
+
+    ``device_connect_edge/__init__.py`` imports its runtime, pydantic's models and OpenTelemetry, ten times the time of
+    the messaging package, which is all that a client needs.
+
+    For processes of our own alone: an application may rely on what the import does. Nothing happens where the package
+    is imported already or is not installed.
+    """
+    spec = None if _FRAMEWORK[0] in sys.modules else find_spec(_FRAMEWORK[0])
+    if spec is None or spec.loader is None:
+        return
+    module, loader = module_from_spec(spec), spec.loader
+    running = threading.RLock()
+
+    def run_then_get(name: str) -> Any:
+        with running:
+            if vars(module).pop("__getattr__", None) is not None:
+                loader.exec_module(module)
+        return getattr(module, name)
+
+    vars(module)["__getattr__"] = run_then_get
+    sys.modules[_FRAMEWORK[0]] = module

@@ -29,8 +29,7 @@ from .. import settings
 from ..utils import ValidationError
 from .backends import LinkConfig, backend_for, jsonrpc
 from .backends.dispatch import Answer, send
-from .beat import Beating, beat_of
-from .presence import PresenceView, encoded_capabilities, lock_stated, presence_builder
+from .presence import LivingDevice, PresenceView, encoded_capabilities, lock_stated, presence_builder, process_heartbeat
 
 HOLD_EVENTS_S = 5.0
 """Seconds of a lost link for which events wait; a server that restarts is back sooner, and older events mislead."""
@@ -175,7 +174,7 @@ class Runtime(DeviceRuntime):  # type: ignore[misc]  # the framework has no type
         self._lost_at: float | None = None
         self._dropping = False
         self.lives: Callable[[], bool] = lambda: True
-        """Says whether the robot behind the device can be read; the beat leaves it out while it cannot."""
+        """Says whether the robot behind the device can be read; the heartbeat leaves it out while it cannot."""
 
     @property
     def _d2d_announcer(self) -> Any:
@@ -331,13 +330,13 @@ class Runtime(DeviceRuntime):  # type: ignore[misc]  # the framework has no type
     async def _heartbeat_loop(self) -> None:
         # The last thing the framework starts: from here on the device is callable and announced.
         self._ready.set()
-        beat = beat_of(self.link)
-        beating = Beating(self.device_id, self.messaging, self.lives, self._heartbeat_provider or dict)
-        beat.join(beating)
+        heartbeat = process_heartbeat(self.link)
+        living = LivingDevice(self.device_id, self.messaging, self.lives, self._heartbeat_provider or dict)
+        heartbeat.join(living)
         try:
             await super()._heartbeat_loop()
         finally:
-            beat.leave(beating)
+            heartbeat.leave(living)
 
     async def _event_dispatch_loop(self) -> None:
         """Send events in order; the stock loop repeats a refused event for ever."""

@@ -24,7 +24,6 @@ from strands_robots import settings
 from strands_robots.contract import Haltable, Robot, RolloutEvent, Unsubscribe, observe
 from strands_robots.device_connect._compat import CollectedOnce, Runtime, describe_anew, emit, observed, on, rpc
 from strands_robots.device_connect.presence import lock_stated
-from strands_robots.device_connect.runtime_stops import stops_of
 from strands_robots.device_connect.safety_registration import (
     LEAVE_TIMEOUT_S,
     REGISTER_S,
@@ -32,9 +31,9 @@ from strands_robots.device_connect.safety_registration import (
     SafetyRegistration,
     register_safety,
     register_served,
+    stops_of,
 )
-from strands_robots.device_connect.state_reports import report_changes, sweep
-from strands_robots.device_connect.telemetry import RolloutPump
+from strands_robots.device_connect.telemetry import RolloutPump, report_changes, sweep
 from strands_robots.envelope import Envelope, RefusalReason, Refused, error, jsonable, success
 from strands_robots.safety.approval import Approval
 from strands_robots.safety.authorization import ANONYMOUS, Authorization, caller_name

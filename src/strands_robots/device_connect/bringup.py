@@ -27,9 +27,9 @@ from strands_robots.device_connect._compat import Runtime
 from strands_robots.device_connect.backends import LinkConfig
 from strands_robots.device_connect.backends.base import NoResponderError
 from strands_robots.device_connect.base_driver import RobotDriver
-from strands_robots.device_connect.device_loop import DeviceLoop, enter_loop
 from strands_robots.device_connect.links import insecure_opt_in, link_for
 from strands_robots.device_connect.presence import encoded_capabilities
+from strands_robots.device_connect.process import LOOP_JOIN_TIMEOUT_S, DeviceLoop, enter_loop
 from strands_robots.device_connect.robot_driver import RobotDeviceDriver
 from strands_robots.device_connect.safety_registration import (
     LEAVE_TIMEOUT_S,
@@ -38,7 +38,6 @@ from strands_robots.device_connect.safety_registration import (
     cell_of,
     register_safety,
 )
-from strands_robots.device_connect.shutdown import LOOP_JOIN_TIMEOUT_S
 from strands_robots.device_connect.simulation_driver import SimulationDeviceDriver
 from strands_robots.safety.sightings import DuplicateDeviceError
 from strands_robots.serving.workers import called
@@ -500,11 +499,11 @@ def _forget_warnings(name: str) -> None:
 
 
 def _depart_at_exit() -> None:
-    own = {runtime: host for runtime, host in _hosts.items() if host.home is not None}
-    for host in own.values():
+    started = {runtime: host for runtime, host in _hosts.items() if host.home is not None}
+    for host in started.values():
         with contextlib.suppress(RuntimeError):  # its loop closed a moment ago
             host.loop.call_soon_threadsafe(host.end.set)
     until = time.monotonic() + EXIT_TIMEOUT_S
-    for runtime, host in own.items():
+    for runtime, host in started.items():
         if not host.ended.wait(max(until - time.monotonic(), 0.0)):
             logger.warning("Device %s could not announce its departure.", runtime.device_id)

@@ -24,8 +24,8 @@ from strands_robots.bounded_json import LONG_MAX, json_object
 from strands_robots.device_connect.backends import LinkConfig, open_client
 from strands_robots.device_connect.backends.base import NoResponderError, ResponderLostError
 from strands_robots.device_connect.discovery import DESCRIBE_S, HEARTBEATS_S, Discovery, Peer, parts
-from strands_robots.device_connect.enrollment import network_of
-from strands_robots.device_connect.shutdown import LOOP_JOIN_TIMEOUT_S
+from strands_robots.device_connect.links import network_of
+from strands_robots.device_connect.process import LOOP_JOIN_TIMEOUT_S
 from strands_robots.envelope import Envelope, error
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety.sightings import sightings
@@ -158,31 +158,33 @@ class FleetClient:
                 list; :attr:`stale` says so then. The collection ends early once no more devices come.
             thorough: wait longer for a further device.
         """
-        return self.run(self._found.collect(timeout, thorough=thorough), max(timeout, HEARTBEATS_S) + COLLECT_MARGIN_S)
+        return self.run(
+            self._connected.collect(timeout, thorough=thorough), max(timeout, HEARTBEATS_S) + COLLECT_MARGIN_S
+        )
 
     @property
     def stale(self) -> str:
         """Empty, or the reason why the last discovery may be incomplete."""
-        return self._found.stale
+        return self._connected.stale
 
     def known(self) -> tuple[str, ...]:
         """Return the ids of live devices announced since the last :meth:`peers`."""
-        return self._found.known
+        return self._connected.known
 
     def announces(self, device: str, function: str, argument: str) -> bool:
         """Return True where the last :meth:`peers` found the device with this argument."""
-        return self._found.announces(device, function, argument)
+        return self._connected.announces(device, function, argument)
 
     def last_heartbeat(self, device: str) -> float | None:
         """Return the monotonic time of a device's last heartbeat; None before the first.
 
         The beat of its process counts as one.
         """
-        return self._found.last_heartbeat(device)
+        return self._connected.last_heartbeat(device)
 
     def beats_every(self, device: str) -> float:
         """Return the seconds between two heartbeats, or beats, of a device."""
-        return self._found.beats_every(device)
+        return self._connected.beats_every(device)
 
     def call(
         self, device: str, function: str, params: Mapping[str, Any] | None = None, timeout: float = 10.0
@@ -314,11 +316,11 @@ class FleetClient:
         async def all_of_them() -> dict[str, Envelope]:
             stops: dict[str, asyncio.Task[Envelope]] = {}
 
-            def found(peer: Peer) -> None:
+            def stop(peer: Peer) -> None:
                 if peer.stop_verb:
                     stops[peer.id] = asyncio.create_task(self._stop_named(peer.id, timeout))
 
-            await self._found.collect(2.0, found, thorough=True)
+            await self._connected.collect(2.0, stop, thorough=True)
             return {name: await stops[name] for name in sorted(stops)}
 
         return self.run(all_of_them(), HEARTBEATS_S + COLLECT_MARGIN_S + 2 * timeout)
@@ -369,7 +371,7 @@ class FleetClient:
         return done
 
     @property
-    def _found(self) -> Discovery:
+    def _connected(self) -> Discovery:
         if self._discovery is None:
             raise RuntimeError("the client is not connected; use it as a context manager")
         return self._discovery
@@ -408,8 +410,8 @@ class FleetClient:
         if purpose is None:
             sightings().note(self._network, device)
             return
-        asked = params.get("assertion") if verb == "resume" else params
-        nonce = asked.get("nonce") if isinstance(asked, Mapping) else None
+        request = params.get("assertion") if verb == "resume" else params
+        nonce = request.get("nonce") if isinstance(request, Mapping) else None
         expected = {"nonce": nonce} if nonce else {}
         sightings().note_answer(self._network, device, purpose, answer.get("statement"), expected)
 

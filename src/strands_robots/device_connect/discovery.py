@@ -21,8 +21,8 @@ from device_connect_edge.messaging.exceptions import MessagingError
 from strands_robots import settings
 from strands_robots.bounded_json import json_object
 from strands_robots.device_connect.backends.base import Backend, NoResponderError, UnreadableReplyError
-from strands_robots.device_connect.beat import BEAT_S, HEARTBEAT_S, named_in
-from strands_robots.device_connect.enrollment import network_of
+from strands_robots.device_connect.links import network_of
+from strands_robots.device_connect.presence import HEARTBEAT_S, PROCESS_HEARTBEAT_S, devices_in
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety.sightings import sightings
 from strands_robots.tags import read_tags
@@ -68,7 +68,7 @@ REGISTRY_LINKED_S = 0.6
 HEARTBEATS_S = 6.0
 """Seconds in which every live device sends a heartbeat; the framework's default is one in 5 s."""
 
-BEATS_MAX = 4096
+HEARTBEATS_MAX = 4096
 """Devices whose last heartbeat is kept; the longest silent one makes place."""
 
 DESCRIBE_S = 1.0
@@ -79,7 +79,7 @@ PAGE = 100
 
 PAGES_MAX = 1000
 
-Found = Callable[["Peer"], None]
+OnDevice = Callable[["Peer"], None]
 
 
 class RegistryError(StrandsRobotsError, RuntimeError):
@@ -157,13 +157,13 @@ class Discovery:
         self._listed: dict[str, Peer] = {}
         self._listed_at: float | None = None
         self._described: dict[str, Peer] = {}
-        self._beats: dict[str, float] = {}
+        self._heartbeats: dict[str, float] = {}
         self._named: set[str] = set()
         self._unserved = False
         """True while the last question to the registry found none."""
         self._listens_since = 0.0
         self._changed_at = self._longest_gap_s = 0.0
-        self._found: Found = lambda peer: None
+        self._on_device: OnDevice = lambda peer: None
 
     @property
     def known(self) -> tuple[str, ...]:
@@ -181,11 +181,11 @@ class Discovery:
 
         The beat of its process counts as one.
         """
-        return self._beats.get(name)
+        return self._heartbeats.get(name)
 
     def beats_every(self, name: str) -> float:
         """Return the seconds between two heartbeats, or beats, of a device."""
-        return BEAT_S if name in self._named else HEARTBEAT_S
+        return PROCESS_HEARTBEAT_S if name in self._named else HEARTBEAT_S
 
     async def start(self) -> None:
         """Receive presence and heartbeats from now on."""
@@ -193,13 +193,15 @@ class Discovery:
         for leaf, take in (("presence", self._on_presence), ("heartbeat", self._on_heartbeat)):
             await self._messaging.subscribe_with_subject(f"{self._root}.*.{leaf}", take, subscribe_only=True)
 
-    async def collect(self, within: float, found: Found = lambda peer: None, *, thorough: bool = False) -> list[Peer]:
+    async def collect(
+        self, within: float, on_device: OnDevice = lambda peer: None, *, thorough: bool = False
+    ) -> list[Peer]:
         """Return the devices of the tenant, sorted by id.
 
         Args:
             within: seconds at most. Where the registry is expected and gives no list, it lasts until heartbeats were
                 received for ``HEARTBEATS_S``. It ends early, once no more devices come.
-            found: called once with each device, when it is found.
+            on_device: called once with each device, when it is found.
             thorough: wait longer for a further device, and where none was found for heartbeats.
         """
         loop = asyncio.get_running_loop()
@@ -207,13 +209,13 @@ class Discovery:
         self._described.clear()
         named: set[str] = set()
 
-        def found_once(peer: Peer) -> None:
+        def report_once(peer: Peer) -> None:
             if peer.id not in named:
                 named.add(peer.id)
                 self._changed(loop.time())
-                found(peer)
+                on_device(peer)
 
-        self._found = found_once
+        self._on_device = report_once
         began = self._changed_at = loop.time()
         self._longest_gap_s = 0.0
         listing = asyncio.create_task(self._list(within))
@@ -229,17 +231,17 @@ class Discovery:
                     pause *= 1 if linked > links else 2
                     await self._messaging.publish(f"{self._root}.discovery.probe", b'{"probe": true}')
                 links = linked
-                if named and self._registry_heard(listing, now - began) and self._settled(now, thorough):
+                if named and self._registry_answered(listing, now - began) and self._settled(now, thorough):
                     break
                 await asyncio.sleep(min(LOOK_EVERY_S, within))
             await self._settle_registry(listing, began, sure=thorough and not named)
         finally:
             listing.cancel()
             await asyncio.gather(listing, return_exceptions=True)
-            self._found = lambda peer: None
+            self._on_device = lambda peer: None
         # A device's own word is newer than the registry's.
         everyone = {**self._listed, **self._described, **self._present}
-        return [self._with_last_beat(everyone[name]) for name in sorted(everyone)]
+        return [self._with_last_heartbeat(everyone[name]) for name in sorted(everyone)]
 
     def _changed(self, now: float) -> None:
         self._longest_gap_s = max(self._longest_gap_s, now - self._changed_at)
@@ -256,11 +258,11 @@ class Discovery:
             settled = SETTLED_AMONG_SCOUTED_S if link.uses_multicast else SETTLED_S
         return now - self._changed_at >= settled
 
-    def _with_last_beat(self, peer: Peer) -> Peer:
-        beat = self._beats.get(peer.id)
-        return peer if beat is None or beat <= (peer.heard_at or 0.0) else replace(peer, heard_at=beat)
+    def _with_last_heartbeat(self, peer: Peer) -> Peer:
+        at = self._heartbeats.get(peer.id)
+        return peer if at is None or at <= (peer.heard_at or 0.0) else replace(peer, heard_at=at)
 
-    def _registry_heard(self, listing: asyncio.Task[dict[str, Peer]], lasted: float) -> bool:
+    def _registry_answered(self, listing: asyncio.Task[dict[str, Peer]], lasted: float) -> bool:
         """Return False while the registry's list has to be waited for."""
         return listing.done() or (not self._expects_registry and (self._unserved or lasted >= REGISTRY_S))
 
@@ -281,21 +283,21 @@ class Discovery:
         if listing.done() and problem is None:
             self._listed, self._listed_at, self.stale = listing.result(), loop.time(), ""
             return
-        asked: dict[str, asyncio.Task[None]] = {}
+        descriptions: dict[str, asyncio.Task[None]] = {}
         while True:
             now = time.monotonic()
-            alive = {name for name, at in self._beats.items() if now - at <= HEARTBEATS_S + loop.time() - began}
-            for name in alive - self._present.keys() - asked.keys():
-                asked[name] = asyncio.create_task(self._describe(name))
+            alive = {name for name, at in self._heartbeats.items() if now - at <= HEARTBEATS_S + loop.time() - began}
+            for name in alive - self._present.keys() - descriptions.keys():
+                descriptions[name] = asyncio.create_task(self._describe(name))
             # A device that sends heartbeats and no presence is in registry mode.
-            if self._expects_registry or asked or isinstance(problem, RegistryError):
+            if self._expects_registry or descriptions or isinstance(problem, RegistryError):
                 self._report_stale(str(problem or "no answer in time"), loop.time())
             elif not sure:
                 return
             if loop.time() >= self._listens_since + HEARTBEATS_S:
                 break
             await asyncio.sleep(PROBE_EVERY_S)
-        await asyncio.gather(*asked.values())
+        await asyncio.gather(*descriptions.values())
 
     def _report_stale(self, problem: str, now: float) -> None:
         known_before = bool(self.stale)
@@ -325,7 +327,7 @@ class Discovery:
                     peer = Peer.of(row)
                     devices[peer.id] = peer
                     self._remember(peer)
-                    self._found(peer)
+                    self._on_device(peer)
             except NoResponderError:
                 if not self._messaging.link.is_peer or loop.time() >= linked_by:
                     raise
@@ -364,7 +366,7 @@ class Discovery:
         if answer.get("device_id") == name:
             peer = self._described[name] = replace(Peer.of(answer), heard_at=time.monotonic())
             self._remember(peer)
-            self._found(peer)
+            self._on_device(peer)
 
     def _remember(self, peer: Peer, *, departing: bool = False) -> None:
         """Have this machine remember a device that was heard."""
@@ -397,28 +399,28 @@ class Discovery:
         if presence.get("departing"):
             self._remember(Peer.of(presence), departing=True)
             self._present.pop(name, None)
-            self._beats.pop(name, None)
+            self._heartbeats.pop(name, None)
             self._named.discard(name)
         else:
             peer = self._present[name] = replace(Peer.of(presence), heard_at=time.monotonic())
             self._remember(peer)
-            self._found(peer)
+            self._on_device(peer)
 
     async def _on_heartbeat(self, data: bytes, subject: str, reply: str | None) -> None:
-        own, now = parts(subject)[2], time.monotonic()
-        named = named_in(data)
+        device, now = parts(subject)[2], time.monotonic()
+        named = devices_in(data)
         if self._messaging.link.identified:
             # Access rules guard the topic of one device, so a beat proves the life of that one only.
-            named = [each for each in named if each == own]
-        for name in (own, *named):
+            named = [each for each in named if each == device]
+        for name in (device, *named):
             self._remembered.note(self._network, name)
             # Taken out and put in again, so that the longest silent ones are dropped first.
-            self._beats.pop(name, None)
-            self._beats[name] = now
+            self._heartbeats.pop(name, None)
+            self._heartbeats[name] = now
         self._named.update(named)
-        while len(self._beats) > BEATS_MAX:
-            silent = next(iter(self._beats))
-            del self._beats[silent]
+        while len(self._heartbeats) > HEARTBEATS_MAX:
+            silent = next(iter(self._heartbeats))
+            del self._heartbeats[silent]
             self._named.discard(silent)
 
 

@@ -1,18 +1,20 @@
-"""Choice of a device's link, and the opt-in to an unauthenticated one."""
+"""Choice of a link, the opt-in to an unauthenticated one, and what belongs to the network that a link reaches."""
 
 from __future__ import annotations
 
+import atexit
 import logging
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from strands_robots import settings
 from strands_robots.device_connect.backends import LinkConfig, link_from_environment, loopback_config
-from strands_robots.device_connect.backends.config import endpoints, split_urls
+from strands_robots.device_connect.backends.config import DEFAULT_URL, endpoints, split_urls
+from strands_robots.safety.network_key import DEVICE_CONNECT, NetworkKey
 from strands_robots.utils import ValidationError, choice, device_id, redacted, shown, text
 
 logger = logging.getLogger(__name__)
-
 
 _NAMES_A_NETWORK = (
     "MESSAGING_URLS",
@@ -125,3 +127,45 @@ def insecure_opt_in(allow_insecure: bool | None, link: LinkConfig, *, stated: bo
         "credentials (MESSAGING_CREDENTIALS_FILE).",
         "INSECURE_TRANSPORT",
     )
+
+
+def enrolled_robots(link: LinkConfig) -> dict[str, bytes]:
+    """Return the enrolled public keys of the link's tenant, by device id.
+
+    Raises:
+        KeyFileError, OSError: the enrolled keys cannot be used.
+    """
+    from strands_robots.safety.identity import EnrolledKeys, of_tenant  # noqa: PLC0415 - a choice of links has no keys
+
+    return of_tenant(EnrolledKeys().load(), link.tenant)
+
+
+def network_of(link: LinkConfig) -> NetworkKey:
+    """Return the key of the network that a link reaches."""
+    met = (link.meeting_point,) if link.meeting_point else ()
+    listened = [each for each in link.listen if not each.endswith(":0")]
+    scouted = ("multicast",) if link.uses_multicast else ()
+    default = DEFAULT_URL if link.transport == "nats" else "nowhere"
+    stated = [*link.connect, *listened, *met, *scouted] or [default]
+    return NetworkKey.of(DEVICE_CONNECT, stated, link.tenant)
+
+
+def connect_agent(**options: Any) -> None:
+    """Connect the framework's ``discover`` and ``invoke`` to our robots.
+
+    Where the environment names no network, they are those of this machine. The end of the process disconnects: the
+    framework's own thread, which the interpreter would end inside Zenoh, could abort the process.
+
+    Args:
+        options: of ``device_connect_agent_tools.connect``, such as ``request_timeout``.
+    """
+    from device_connect_agent_tools import connect, disconnect  # noqa: PLC0415 - loaded when an agent connects
+
+    link = usual_link()
+    if link.meeting_point:
+        settings.put("ZENOH_CONNECT", link.meeting_point)
+        if not settings.is_set("DEVICE_CONNECT_DISCOVERY_MODE"):
+            settings.put("DEVICE_CONNECT_DISCOVERY_MODE", "d2d")
+    atexit.unregister(disconnect)
+    atexit.register(disconnect)
+    connect(**options)

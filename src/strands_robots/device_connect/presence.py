@@ -1,4 +1,8 @@
-"""Presence of other devices, collected only while a device of this process asks.
+"""Presence of devices: what they announce, the heartbeat of their process, and the others as one of them sees them.
+
+One message a second tells which devices of a loop and a link live. It is a heartbeat of the first of them, on whose
+topic access rules let them publish, with the ids of all in ``devices``. A reader of heartbeats that does not know the
+field sees one more heartbeat.
 
 The framework's runtime parses the presence of every device for each device that it serves, which costs the square of
 their number. Here the devices of one loop and one link share a collector, which runs while one of them needs it: for
@@ -9,14 +13,30 @@ from __future__ import annotations
 
 import asyncio
 import json
+import logging
 import time
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
-from device_connect_edge.discovery import PresenceCollector
-from device_connect_edge.drivers import DeviceDriver
+from device_connect_edge.messaging.exceptions import MessagingError
 
+from strands_robots.bounded_json import json_object
 from strands_robots.device_connect.backends import LinkConfig, open_client
+
+if TYPE_CHECKING:
+    from device_connect_edge.drivers import DeviceDriver
+
+logger = logging.getLogger(__name__)
+
+PROCESS_HEARTBEAT_S = 1.0
+"""Seconds between two heartbeats of a process."""
+
+HEARTBEAT_S = 5.0
+"""Seconds between two heartbeats of a single device, by the framework's default."""
+
+MARK = b'"devices"'
+"""Part of every heartbeat of a process; one without it is that of one device."""
 
 KEEP_S = 60.0
 """Seconds that the collector goes on after the last question of a device."""
@@ -58,7 +78,7 @@ def presence_builder(
         identity: stays as it is.
         status: returns it, for each message anew.
     """
-    device, own = json.dumps(device_id), json.dumps(identity)
+    device, stated = json.dumps(device_id), json.dumps(identity)
 
     def build() -> bytes:
         now = time.time()
@@ -67,10 +87,90 @@ def presence_builder(
             "ts": now,
             "d2d": True,
         }
-        described = f'{{"device_id": {device}, "capabilities": {capabilities()}, "identity": {own}'
+        described = f'{{"device_id": {device}, "capabilities": {capabilities()}, "identity": {stated}'
         return f"{described}, {json.dumps(changing)[1:]}".encode()
 
     return build
+
+
+@dataclass(frozen=True, slots=True)
+class LivingDevice:
+    """One device of a process's heartbeat.
+
+    Attributes:
+        device_id: its id.
+        messaging: its connected client.
+        lives: returns False while its robot cannot be read; the heartbeat leaves it out then.
+        fields: returns what a heartbeat of this device carries.
+    """
+
+    device_id: str
+    messaging: Any
+    lives: Callable[[], bool]
+    fields: Callable[[], Mapping[str, Any]]
+
+
+class ProcessHeartbeat:
+    """The heartbeat of one loop and one link: which of their devices live."""
+
+    def __init__(self, link: LinkConfig) -> None:
+        self._link = link
+        self._devices: dict[str, LivingDevice] = {}
+        self._task: asyncio.Task[None] | None = None
+
+    def join(self, device: LivingDevice) -> None:
+        """Name ``device`` from now on."""
+        self._devices[device.device_id] = device
+        if self._task is None:
+            self._task = asyncio.create_task(self._run(), name="process-heartbeat")
+
+    def leave(self, device: LivingDevice) -> None:
+        """Name ``device`` no more; the last one ends the heartbeat."""
+        if self._devices.get(device.device_id) is device:
+            del self._devices[device.device_id]
+        if not self._devices and self._task is not None:
+            self._task.cancel()
+            self._task = None
+            _HEARTBEATS.pop((asyncio.get_running_loop(), self._link), None)
+
+    async def _run(self) -> None:
+        loop = asyncio.get_running_loop()
+        due = loop.time()
+        while True:
+            await self._send()
+            due = max(due + PROCESS_HEARTBEAT_S, loop.time())
+            await asyncio.sleep(due - loop.time())
+
+    async def _send(self) -> None:
+        living = [each for each in self._devices.values() if each.lives()]
+        if not living:
+            return
+        first = living[0]
+        try:
+            message = {"device_id": first.device_id, "ts": time.time(), **first.fields()}
+            message["devices"] = [each.device_id for each in living]
+            await first.messaging.publish(
+                f"device-connect.{self._link.tenant}.{first.device_id}.heartbeat", json.dumps(message).encode()
+            )
+        except (MessagingError, TypeError, ValueError) as exc:
+            # Without a link there is no reader; the device's own heartbeat reports a state that cannot be sent.
+            logger.debug("a heartbeat was not sent: %s", exc)
+
+
+_HEARTBEATS: dict[tuple[asyncio.AbstractEventLoop, LinkConfig], ProcessHeartbeat] = {}
+
+
+def process_heartbeat(link: LinkConfig) -> ProcessHeartbeat:
+    """Return the running loop's heartbeat on ``link``."""
+    return _HEARTBEATS.setdefault((asyncio.get_running_loop(), link), ProcessHeartbeat(link))
+
+
+def devices_in(data: bytes) -> Iterable[str]:
+    """Return the devices in the heartbeat of a process; none for the heartbeat of a single one."""
+    if MARK not in data:
+        return ()
+    devices = json_object(data).get("devices")
+    return [each for each in devices if isinstance(each, str)] if isinstance(devices, list) else ()
 
 
 class _SharedCollector:
@@ -89,6 +189,9 @@ class _SharedCollector:
         async with self._changing:
             self._users += 1
             if self._collector is None:
+                # A reader of heartbeats, which has no device, does not load what this loads.
+                from device_connect_edge.discovery import PresenceCollector  # noqa: PLC0415
+
                 try:
                     self._client = await open_client(self._link)
                     collector = PresenceCollector(self._client, self._link.tenant)
@@ -219,18 +322,18 @@ class PresenceView:
         known = await collector.list_devices()
         add(collector)
         if replayed is not None:
-            told = self._others(replayed)
+            report = self._others(replayed)
             for each in known:
-                result = told(str(each.get("device_id", "")))
+                result = report(str(each.get("device_id", "")))
                 if asyncio.iscoroutine(result):
                     await result
 
     def _others(self, callback: OnPeer) -> OnPeer:
-        def told(device_id: str) -> Any:
+        def report(device_id: str) -> Any:
             # The collector has no way to take a listener away again.
             return callback(device_id) if device_id != self._device_id and self._collector is not None else None
 
-        return told
+        return report
 
     async def _settled(self) -> Any:
         collector = await self._asked()

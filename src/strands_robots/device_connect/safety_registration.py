@@ -1,25 +1,28 @@
-"""Registration of a device with the safety plane, and its runtime's handler."""
+"""Registration of a device with the safety plane, and the emergency stops on its runtime's connection."""
 
 from __future__ import annotations
 
+import asyncio
 import json
 import time
 from collections.abc import Mapping
 from functools import cached_property
-from typing import Any
+from typing import Any, Protocol
 
 from device_connect_edge.drivers import DeviceDriver
+from device_connect_edge.messaging.exceptions import MessagingError
 
 from strands_robots.contract import Haltable, body_of
 from strands_robots.device_connect._compat import link_of, stated_id
 from strands_robots.device_connect.backends import LinkConfig
-from strands_robots.device_connect.enrollment import network_of
+from strands_robots.device_connect.discovery import parts
+from strands_robots.device_connect.links import network_of
 from strands_robots.device_connect.stop_link import NoStopLink, stop_link
 from strands_robots.envelope import Envelope
-from strands_robots.safety.estop_listener import ListenerRegistration, estop_listener
+from strands_robots.safety.estop_listener import ESTOP, ListenerRegistration, estop_listener
 from strands_robots.safety.gate import MotionGate
 from strands_robots.safety.identity import DEFAULT_TENANT, SigningIdentity, local_name, robot_identity
-from strands_robots.safety.orders import REASON_MAX, StopOrder, epoch_of
+from strands_robots.safety.orders import REASON_MAX, StopOrder, epoch_of, params_of
 from strands_robots.safety.persistence import hardware_key, simulation_key
 from strands_robots.safety.plane import Registered, plane
 from strands_robots.safety.resume import is_epoch
@@ -79,14 +82,14 @@ def register_served(driver: DeviceDriver, runtime: Any) -> SafetyRegistration | 
     """
     link = link_of(runtime)
     device_id = unreserved("device_id", runtime.device_id, RESERVED_DEVICE_IDS)
-    made = register_safety(
+    registration = register_safety(
         device_id, driver, link, named=stated_id(runtime), tenant=runtime.tenant, cell=cell_of(driver)
     )
-    if made is not None:
+    if registration is not None:
         try:
-            made.open()
+            registration.open()
         except BaseException:
-            made.leave()
+            registration.leave()
             raise
     if link is None:
         logger.warning(
@@ -94,7 +97,7 @@ def register_served(driver: DeviceDriver, runtime: Any) -> SafetyRegistration | 
             "locked by the runtime's events, and answers no controller.",
             runtime.device_id,
         )
-    return made
+    return registration
 
 
 def cell_of(driver: DeviceDriver, cell: str | None = None) -> str:
@@ -108,9 +111,9 @@ def cell_of(driver: DeviceDriver, cell: str | None = None) -> str:
 
 
 def _key(device_id: str, driver: DeviceDriver, robot: Any, *, named: bool) -> str | None:
-    own = getattr(robot, "safety_key", None)
-    if isinstance(own, str) and own:
-        return own
+    stated = getattr(robot, "safety_key", None)
+    if isinstance(stated, str) and stated:
+        return stated
     if getattr(driver, "hardware", True):
         return hardware_key(str(getattr(robot, "tool_name_str", "robot")), device_id if named else "unnamed")
     return simulation_key(device_id) if named else None
@@ -251,3 +254,81 @@ class SafetyRegistration:
         entry, self._held = self._held, None
         if entry is not None:
             entry.close()
+
+
+class RegisteredDevice(Protocol):
+    """A device that is registered with the safety plane."""
+
+    runtime: Any
+
+    async def on_estop(self, device_id: object, payload: object, raw: bytes | int | None = None) -> None:
+        """Act on an emergency stop of ``device_id``."""
+
+
+class RuntimeStops:
+    """Emergency stops on the runtime's connection, taken once for the devices of a loop and a link.
+
+    Each stop ends in the safety plane, which halts every robot of the process, so that one subscription does for all of
+    them; one of the devices holds it. The e-stop listener's own connection carries the same stops.
+    """
+
+    def __init__(self, link: LinkConfig) -> None:
+        self._link = link
+        self._devices: list[RegisteredDevice] = []
+        self._holder: RegisteredDevice | None = None
+        self._subscription: Any = None
+        self._changing = asyncio.Lock()
+
+    async def join(self, device: RegisteredDevice) -> None:
+        """Have emergency stops received for ``device`` as well.
+
+        Raises:
+            MessagingError: the first device cannot subscribe.
+        """
+        async with self._changing:
+            self._devices.append(device)
+            await self._subscribe()
+
+    async def leave(self, device: RegisteredDevice) -> None:
+        """Receive none for ``device`` any more; another one takes the subscription over."""
+        async with self._changing:
+            if device not in self._devices:
+                return
+            self._devices.remove(device)
+            if device is self._holder:
+                subscription, self._holder, self._subscription = self._subscription, None, None
+                try:
+                    # The next one subscribes first: no stop falls between the two.
+                    await self._subscribe()
+                finally:
+                    await subscription.unsubscribe()
+            if not self._devices:
+                _STOPS.pop((asyncio.get_running_loop(), self._link), None)
+
+    async def _subscribe(self) -> None:
+        while self._holder is None and self._devices:
+            device = self._devices[0]
+            subject = f"device-connect.{self._link.tenant}.*.event.{ESTOP}"
+            try:
+                self._subscription = await device.runtime.messaging.subscribe_to_stops(subject, self._on_stop)
+            except MessagingError as exc:
+                self._devices.remove(device)
+                if not self._devices:
+                    raise
+                logger.warning("A device cannot receive the emergency stops of the others: %s", exc)
+            else:
+                self._holder = device
+
+    async def _on_stop(self, data: bytes | int, subject: str, reply: str | None) -> None:
+        params = params_of(data)
+        # Not the holder: while the subscription passes from one device to the next there is none.
+        for device in self._devices[:1]:
+            await device.on_estop(parts(subject)[2], params, data)
+
+
+_STOPS: dict[tuple[asyncio.AbstractEventLoop, LinkConfig], RuntimeStops] = {}
+
+
+def stops_of(link: LinkConfig) -> RuntimeStops:
+    """Return the running loop's emergency stops on ``link``."""
+    return _STOPS.setdefault((asyncio.get_running_loop(), link), RuntimeStops(link))

@@ -54,7 +54,7 @@ class NoStopLink:
         """Nothing is open."""
 
 
-def _apart(link: LinkConfig) -> LinkConfig:
+def _without_shared_ports(link: LinkConfig) -> LinkConfig:
     """Return ``link`` without the ports that only one session can listen on.
 
     The e-stop listener joins the others there and listens on ports of its own, of which they learn by gossip.
@@ -63,9 +63,9 @@ def _apart(link: LinkConfig) -> LinkConfig:
         return link
     joined = [*link.connect, *(_from_here(endpoint) for endpoint in link.listen)]
     joined += [link.meeting_point] if link.meeting_point else []
-    own = tuple(f"{endpoint.rpartition(':')[0]}:0" for endpoint in link.listen)
+    anywhere = tuple(f"{endpoint.rpartition(':')[0]}:0" for endpoint in link.listen)
     multicast = False if link.meeting_point else link.multicast
-    return replace(link, mode="peer", meet_port=None, connect=tuple(joined), listen=own, multicast=multicast)
+    return replace(link, mode="peer", meet_port=None, connect=tuple(joined), listen=anywhere, multicast=multicast)
 
 
 def _from_here(endpoint: str) -> str:
@@ -80,7 +80,7 @@ class ZenohStopLink(StopSession):
     """Stop link over a Zenoh session; its callbacks run on Zenoh's threads."""
 
     def __init__(self, link: LinkConfig) -> None:
-        super().__init__(_apart(link).zenoh)
+        super().__init__(_without_shared_ports(link).zenoh)
         self._root = f"device-connect/{link.tenant}"
 
     def open(self, events: Collection[str], on_event: OnEvent, on_state: OnState) -> None:

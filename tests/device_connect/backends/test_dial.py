@@ -9,8 +9,9 @@ import pytest
 import zenoh
 from device_connect_edge.messaging.exceptions import MessagingConnectionError
 
-from strands_robots.device_connect.backends import LinkConfig, zenoh_session
+from strands_robots.device_connect.backends import LinkConfig
 from strands_robots.device_connect.backends import zenoh as backend
+from strands_robots.device_connect.backends import zenoh as zenoh_backend
 from strands_robots.device_connect.backends.dial import endpoint_problem
 from strands_robots.device_connect.backends.zenoh import ZenohBackend
 
@@ -32,7 +33,7 @@ async def test_look_up_that_hangs_holds_no_connect_back(monkeypatch: pytest.Monk
         ended.wait(20.0)
         return "too late"
 
-    monkeypatch.setattr(zenoh_session, "acquire", refused)
+    monkeypatch.setattr(zenoh_backend, "acquire", refused)
     monkeypatch.setattr(backend, "why_silent", hangs)
     monkeypatch.setattr(backend, "WHY_S", 0.05)
     try:

@@ -25,7 +25,7 @@ from strands_robots.cli.readiness import (
     state_problem,
 )
 from strands_robots.device_connect.backends import loopback_config
-from strands_robots.device_connect.backends.zenoh_session import acquire, release
+from strands_robots.device_connect.backends.zenoh import acquire, release
 from strands_robots.device_connect.reachy_mini_driver import ReachyMiniDriver
 from strands_robots.drivers.reachy.rest import DaemonUnreachableError, RestClient
 

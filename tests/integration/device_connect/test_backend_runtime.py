@@ -14,7 +14,8 @@ from fixtures.waiting import free_port, until
 from fixtures.zenoh_router import ZenohRouter
 
 from strands_robots.device_connect._compat import Runtime
-from strands_robots.device_connect.backends import LinkConfig, loopback_config, open_client, register, zenoh_session
+from strands_robots.device_connect.backends import LinkConfig, loopback_config, open_client, register
+from strands_robots.device_connect.backends import zenoh as zenoh_backend
 
 
 @pytest.fixture
@@ -35,7 +36,7 @@ async def runtime(link):
     yield made
     await made.shutdown()
     assert task.done()
-    assert not zenoh_session.open_links()
+    assert not zenoh_backend.open_links()
 
 
 async def test_ready_device_is_callable_and_discoverable_at_once(runtime, link):
@@ -85,7 +86,7 @@ async def test_driver_that_cannot_connect_is_reported_and_leaves_nothing_open(li
     with pytest.raises(OSError, match="no motor answers"):
         await runtime.wait_ready(30)
     await asyncio.gather(task, return_exceptions=True)
-    assert not zenoh_session.open_links()
+    assert not zenoh_backend.open_links()
 
 
 async def test_start_that_waits_for_a_router_can_be_ended():
@@ -95,7 +96,7 @@ async def test_start_that_waits_for_a_router_can_be_ended():
         await runtime.wait_ready(0.2)
     await runtime.shutdown()
     assert task.done()
-    await until(lambda: not zenoh_session.open_links())
+    await until(lambda: not zenoh_backend.open_links())
 
 
 async def test_router_that_comes_late_is_found_soon():
@@ -126,7 +127,7 @@ async def test_unauthenticated_link_needs_the_opt_in(link):
     with pytest.raises(ValueError, match="allow_insecure"):
         await runtime.wait_ready(30)
     await asyncio.gather(task, return_exceptions=True)
-    assert not zenoh_session.open_links()
+    assert not zenoh_backend.open_links()
 
 
 async def test_certificates_in_the_environment_do_not_change_an_explicit_link(link, monkeypatch):
@@ -151,7 +152,7 @@ async def test_stock_runtime_may_use_the_backend_by_name(link):
     finally:
         await runtime.stop()
         await asyncio.gather(task, return_exceptions=True)
-    assert not zenoh_session.open_links()
+    assert not zenoh_backend.open_links()
 
 
 async def test_departure_is_announced(link):

@@ -13,7 +13,8 @@ from fixtures.bare_caller import Caller
 from fixtures.echo_device import EchoDevice
 from fixtures.waiting import accepts, eventually, free_port, until
 
-from strands_robots.device_connect.backends import LinkConfig, loopback_config, open_client, zenoh_session
+from strands_robots.device_connect.backends import LinkConfig, loopback_config, open_client
+from strands_robots.device_connect.backends import zenoh as zenoh_backend
 
 FLEET = """
 import asyncio, json, os, sys, threading
@@ -81,7 +82,7 @@ import psutil
 from fixtures.echo_device import EchoDriver
 from fixtures.waiting import eventually
 from strands_robots.device_connect._compat import Runtime
-from strands_robots.device_connect.backends import LinkConfig, zenoh_session
+from strands_robots.device_connect.backends import LinkConfig, zenoh as zenoh_backend
 
 link = LinkConfig(**json.loads(sys.argv[1], object_hook=lambda d: {k: tuple(v) if isinstance(v, list) else v
                                                                    for k, v in d.items()}))
@@ -96,7 +97,7 @@ async def once():
 
 def cycle():
     asyncio.run(once())
-    assert not zenoh_session.open_links()
+    assert not zenoh_backend.open_links()
 
 def used():
     return me.num_threads(), me.num_fds()
@@ -170,8 +171,8 @@ def test_start_that_was_given_up_never_comes_online():
     )
     link = {"connect": [f"tcp/127.0.0.1:{absent}"], "connect_timeout_s": 0.3}
     program = program.replace("range(20)", "range(8)").replace(
-        "    assert not zenoh_session.open_links()\n",
-        "    eventually(lambda: not zenoh_session.open_links())\n",
+        "    assert not zenoh_backend.open_links()\n",
+        "    eventually(lambda: not zenoh_backend.open_links())\n",
     )
     assert "nothing grew" in run(program, json.dumps(link))
 
@@ -273,8 +274,8 @@ def test_interpreter_keeps_its_state_of_a_zenoh_thread_between_callbacks() -> No
         of_thread.calls = getattr(of_thread, "calls", 0) + 1
         seen.append(of_thread.calls)
 
-    listening = zenoh_session.acquire(LinkConfig(mode="peer", listen=(where,), multicast=False))
-    sending = zenoh_session.acquire(LinkConfig(mode="peer", connect=(where,), multicast=False))
+    listening = zenoh_backend.acquire(LinkConfig(mode="peer", listen=(where,), multicast=False))
+    sending = zenoh_backend.acquire(LinkConfig(mode="peer", connect=(where,), multicast=False))
     try:
         listening.subscribe("t/ticks", on_sample)
 
@@ -284,5 +285,5 @@ def test_interpreter_keeps_its_state_of_a_zenoh_thread_between_callbacks() -> No
 
         eventually(threads_remember, what="one thread that counts its callbacks")
     finally:
-        zenoh_session.release(sending)
-        zenoh_session.release(listening)
+        zenoh_backend.release(sending)
+        zenoh_backend.release(listening)

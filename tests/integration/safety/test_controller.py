@@ -17,12 +17,10 @@ from fixtures.zenoh_router import ZenohRouter
 from strands_robots.audit import read_audit_log
 from strands_robots.device_connect.backends import LinkConfig
 from strands_robots.device_connect.safety_controller import envelope, safety_controller
-from strands_robots.device_connect.safety_controller_driver import SafetyControllerDriver
 from strands_robots.envelope import is_error
 from strands_robots.safety import ed25519
 from strands_robots.safety.controller import Progress, SafetyController
 from strands_robots.safety.orders import StopRules
-from strands_robots.safety.sightings import sightings
 from strands_robots.utils import ValidationError
 
 Broker = ZenohRouter | NatsServer
@@ -214,33 +212,6 @@ def test_a_controller_that_falls_silent_stops_the_robot_that_needs_it(
     controller.close()
     eventually(robot.refuses)
     assert "safety-1" in eventually(lambda: robot.reasons)[0]
-
-
-async def test_the_controller_as_a_device_answers_by_name(
-    controller: SafetyController, site_of: Callable[..., Site]
-) -> None:
-    site_of("arm-1")
-    driver = SafetyControllerDriver(controller)
-    answer = await driver.stopAll("smoke", ["arm-1"])
-    assert list(answer["stopped"]) == ["arm-1"]
-    odd = {"reason": ["x"] * 9, "expected": ["arm-1", "arm/1", 5], "deadline_s": "nan", "other": [[]]}
-    stopped = await driver.invoke("stopAll", **odd)
-    assert stopped["status"] == "success"
-    for said in ("reason is a list", "expected names", "deadline_s", "1 unknown argument"):
-        assert said in stopped["ignored"]
-    assert (await driver.getStatus())["link_up"] is True
-
-
-async def test_the_controller_as_a_device_names_a_silent_robot_of_the_roster(
-    controller: SafetyController, site_of: Callable[..., Site]
-) -> None:
-    site_of("arm-1")
-    assert controller.network is not None
-    sightings().note(controller.network, "arm-2", stoppable=True)
-    assert sightings().flush(20.0)
-    answer = await SafetyControllerDriver(controller).stopAll("smoke", ["arm-1"])
-    assert (answer["status"], answer["silent"], list(answer["stopped"])) == ("error", ["arm-2"], ["arm-1"])
-    assert "1 of the 2 robots of the roster is known to stand still." in answer["reason"]
 
 
 def test_a_text_in_place_of_names_and_a_bad_deadline_are_refused(controller: SafetyController) -> None:

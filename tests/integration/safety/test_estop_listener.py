@@ -17,7 +17,8 @@ from fixtures.waiting import eventually, free_port
 from fixtures.zenoh_router import ZenohRouter
 
 from strands_robots.audit import read_audit_log
-from strands_robots.device_connect.backends import LinkConfig, loopback_config, zenoh_session
+from strands_robots.device_connect.backends import LinkConfig, loopback_config
+from strands_robots.device_connect.backends import zenoh as zenoh_backend
 from strands_robots.device_connect.stop_link import stop_link
 from strands_robots.safety import ed25519
 from strands_robots.safety.estop_listener import CHECK_IN, ESTOP, REFUSAL_INTERVAL_S, VERDICT, StopLink, notification
@@ -37,9 +38,9 @@ def network(request: pytest.FixtureRequest) -> Iterator[tuple[LinkConfig, Broker
             yield LinkConfig(connect=(router.endpoint,), mode="client"), router
     else:
         link = loopback_config(free_port())
-        data_plane = zenoh_session.acquire(link)
+        data_plane = zenoh_backend.acquire(link)
         yield link, None
-        zenoh_session.release(data_plane)
+        zenoh_backend.release(data_plane)
 
 
 class Listener:

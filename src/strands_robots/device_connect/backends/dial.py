@@ -1,24 +1,47 @@
-"""Dial of one endpoint by TCP and TLS, to name why nobody answers."""
+"""TLS of a link's clients, and the reasons of a failed connection: an endpoint is dialled to name why it is silent."""
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import re
 import socket
 import ssl
+import tempfile
+from pathlib import Path
 from urllib.parse import urlsplit
 
 from ...bounded_json import json_object
 from .config import ZENOH_PORT, LinkConfig, host_of
-from .reasons import reason_of
-from .tls import client_context
 
 DIAL_S = 0.5
 """Seconds for each step of a dial, after the transport itself has tried for longer."""
 
 NATS_PORT = 4222
 
+_WORDS = {
+    errno.ECONNREFUSED: "nothing listens there",
+    errno.ECONNRESET: "it cut the connection",
+    errno.EPIPE: "it cut the connection",
+    errno.EADDRINUSE: "another program holds the port",
+    errno.EHOSTUNREACH: "there is no route to it",
+    errno.ENETUNREACH: "there is no route to it",
+    errno.EADDRNOTAVAIL: "this machine has no such address",
+    errno.EACCES: "this user may not open that port",
+}
+
+
 _SYSTEM_ERROR = re.compile(r"\(os error (\d+)\)")
+
+
+def client_context(link: LinkConfig) -> ssl.SSLContext:
+    """Return a context that trusts the stated authority alone, else the system's."""
+    stated = {"cadata" if link.ca.lstrip().startswith("-----BEGIN") else "cafile": link.ca} if link.ca else {}
+    context = ssl.create_default_context(**stated)  # type: ignore[arg-type]  # both keys take text
+    context.check_hostname = link.verify_hostname
+    if link.cert:
+        _load_identity(context, link.cert, link.key)
+    return context
 
 
 def why_silent(link: LinkConfig, within: float = DIAL_S) -> str:
@@ -51,6 +74,30 @@ def endpoint_problem(link: LinkConfig, endpoint: str, within: float = DIAL_S) ->
     except ValueError:  # such as a host of more than 63 characters between two dots
         return "its host or port cannot be read"
     return ""
+
+
+def reason_of(error: BaseException) -> str:
+    """Return why a connection failed, as the end of a sentence."""
+    if isinstance(error, ssl.SSLCertVerificationError):
+        return f"its certificate is refused: {error.verify_message.rstrip('.')}"
+    if isinstance(error, ssl.SSLError):
+        alert = (error.reason or str(error)).replace("_", " ").lower()
+        if "key values mismatch" in alert:
+            return "our key is not that of our certificate"
+        if error.library in ("X509", "PEM") or "pem" in alert.split():
+            return "our certificates are no PEM files that fit; doctor, with the same flags, names the file"
+        _, refused, why = alert.partition("alert ")
+        if refused:
+            return f"it refuses our certificate: {why}"
+        return f"it does not speak TLS as we do: {alert}"
+    if isinstance(error, socket.gaierror):
+        return "no such host is known"
+    if isinstance(error, TimeoutError):
+        return "no answer in time"
+    if isinstance(error, OSError):
+        # asyncio gives the system's number with words of its own.
+        return _WORDS.get(error.errno or 0, error.strerror or str(error))
+    return str(error)
 
 
 def words_of(text: str) -> str:
@@ -94,3 +141,15 @@ def _shake_hands(raw: socket.socket, link: LinkConfig, host: str) -> None:
     with client_context(link).wrap_socket(raw, server_hostname=host) as secured, contextlib.suppress(TimeoutError):
         if not secured.recv(1):
             raise ssl.SSLError(1, "[SSL] the server ended the connection after the handshake")
+
+
+def _load_identity(context: ssl.SSLContext, cert: str, key: str) -> None:
+    """Load certificate and key, which the standard library reads from files only."""
+    if not cert.lstrip().startswith("-----BEGIN"):
+        context.load_cert_chain(cert, key)
+        return
+    with tempfile.TemporaryDirectory(prefix="strands-") as folder:
+        both = Path(folder, "identity.pem")
+        both.touch(mode=0o600)
+        both.write_text(f"{cert}\n{key}\n")
+        context.load_cert_chain(both)

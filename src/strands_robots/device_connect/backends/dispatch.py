@@ -136,6 +136,21 @@ class Backlog:
         return asleep
 
 
+class Fanout:
+    """One subscription on the network and the sinks that share it."""
+
+    __slots__ = ("sinks", "subscription")
+
+    def __init__(self) -> None:
+        self.sinks: tuple[Callable[[Any], None], ...] = ()
+        self.subscription: Any = None
+
+    def deliver(self, message: Any) -> None:
+        """Hand a message to every sink."""
+        for sink in self.sinks:
+            sink(message)
+
+
 class CommandServer:
     """Serves one device's commands, each in a task of its own.
 

@@ -29,8 +29,8 @@ from strands_robots.drivers.reachy.rest import (
 )
 from strands_robots.drivers.reachy.target import Target
 from strands_robots.stop_log import stop_logger
-from strands_robots.utils import ValidationError, identifier, missing_extra, shown
-from strands_robots.zenoh_session import close_in_background
+from strands_robots.utils import ValidationError, identifier, missing_extra, optional_module, shown
+from strands_robots.zenoh_session import LinkedSession, undeclare
 
 logger = stop_logger(__name__)
 
@@ -280,48 +280,30 @@ class ClientSession:
     """A Zenoh client session to one endpoint without scouting, against cross-talk."""
 
     def __init__(self, endpoint: str) -> None:
+        zenoh = optional_module("zenoh", what="A Reachy Mini daemon before 1.5", extra="reachy")
+        config = {
+            "mode": "client",
+            "connect": {"endpoints": [endpoint], "timeout_ms": int(CONNECT_S * 1000)},
+            "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        }
         try:
-            import zenoh  # noqa: PLC0415 - optional, only daemons before 1.5 need it
-        except ImportError as exc:
-            raise missing_extra("A Reachy Mini daemon before 1.5", "reachy") from exc
-        config = zenoh.Config()
-        for key, value in (
-            ("mode", "client"),
-            ("connect/endpoints", [endpoint]),
-            ("connect/timeout_ms", int(CONNECT_S * 1000)),
-            ("scouting/multicast/enabled", False),
-            ("scouting/gossip/enabled", False),
-        ):
-            config.insert_json5(key, json.dumps(value))
-        try:
-            self._session = zenoh.open(config)
+            self._session = LinkedSession(config)
         except zenoh.ZError as exc:
             raise DaemonUnreachableError(f"{endpoint} did not open: {exc}.") from exc
-        self._zenoh_error = zenoh.ZError
-        linked: Any = zenoh.handlers.Callback(lambda event: close_in_background(), indirect=False)
-        self._links = self._session.info.declare_transport_events_listener(linked, history=True)
+        self._session.watch_links()
 
     def subscribe(self, key: str, on_payload: Callable[[bytes], None], /) -> Callable[[], None]:
         def deliver(sample: Any) -> None:
             if len(sample.payload) <= SMALL_BYTES:
                 on_payload(sample.payload.to_bytes())
 
-        subscriber = self._session.declare_subscriber(key, deliver)
-
-        def unsubscribe() -> None:
-            # A session that has ended has dropped its subscribers with it.
-            with contextlib.suppress(self._zenoh_error):
-                subscriber.undeclare()  # type: ignore[no-untyped-call]  # zenoh's own stub lacks it
-
-        return unsubscribe
+        return partial(undeclare, self._session.subscribe(key, deliver))
 
     def publish(self, key: str, payload: bytes) -> None:
-        self._session.put(key, payload)
+        self._session.session.put(key, payload)
 
     def close(self) -> None:
-        with contextlib.suppress(self._zenoh_error):  # closing twice is fine
-            self._links.undeclare()  # type: ignore[no-untyped-call]  # zenoh's own stub lacks it
-            self._session.close()  # type: ignore[no-untyped-call]  # zenoh's own stub lacks it
+        self._session.close()
 
 
 @dataclass(frozen=True, slots=True)

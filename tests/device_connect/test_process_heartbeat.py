@@ -10,10 +10,10 @@ import pytest
 from device_connect_edge.messaging.exceptions import NotConnectedError
 from fixtures.waiting import until
 
-from strands_robots.device_connect import beat as beat_module
+from strands_robots.device_connect import presence
 from strands_robots.device_connect.backends import LinkConfig
-from strands_robots.device_connect.beat import Beating, beat_of, named_in
-from strands_robots.device_connect.discovery import BEATS_MAX, Discovery
+from strands_robots.device_connect.discovery import HEARTBEATS_MAX, Discovery
+from strands_robots.device_connect.presence import LivingDevice, devices_in, process_heartbeat
 
 LINK = LinkConfig(connect=("tcp/127.0.0.1:7447",))
 
@@ -35,24 +35,24 @@ class Messaging:
 
 @pytest.fixture(autouse=True)
 def fast(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(beat_module, "BEAT_S", 0.01)
+    monkeypatch.setattr(presence, "PROCESS_HEARTBEAT_S", 0.01)
 
 
-def device(name: str, messaging: Messaging, lives: Any = lambda: True, fields: Any = dict) -> Beating:
-    return Beating(name, messaging, lives, fields)
+def device(name: str, messaging: Messaging, lives: Any = lambda: True, fields: Any = dict) -> LivingDevice:
+    return LivingDevice(name, messaging, lives, fields)
 
 
 async def test_one_message_names_every_device_of_the_process() -> None:
     messaging = Messaging()
     devices = [device(f"arm-{each}", messaging) for each in range(50)]
     for each in devices:
-        beat_of(LINK).join(each)
+        process_heartbeat(LINK).join(each)
     await until(lambda: len(messaging.sent) >= 2)
     subject, data = messaging.sent[-1]
     for each in devices:
-        beat_of(LINK).leave(each)
+        process_heartbeat(LINK).leave(each)
     assert subject == "device-connect.default.arm-0.heartbeat"
-    assert named_in(data) == [f"arm-{each}" for each in range(50)]
+    assert devices_in(data) == [f"arm-{each}" for each in range(50)]
     # A reader that knows only heartbeats finds one.
     assert json.loads(data)["device_id"] == "arm-0"
 
@@ -62,45 +62,47 @@ async def test_beat_leaves_out_a_device_that_left_or_cannot_be_read() -> None:
     unread = device("arm-2", messaging, lives=lambda: False)
     first, second = device("arm-0", messaging), device("arm-1", messaging)
     for each in (first, second, unread):
-        beat_of(LINK).join(each)
-    beat_of(LINK).leave(first)
+        process_heartbeat(LINK).join(each)
+    process_heartbeat(LINK).leave(first)
     sent = len(messaging.sent)
     await until(lambda: len(messaging.sent) >= sent + 2)
     assert messaging.sent[-1][0] == "device-connect.default.arm-1.heartbeat"
-    assert named_in(messaging.sent[-1][1]) == ["arm-1"]
+    assert devices_in(messaging.sent[-1][1]) == ["arm-1"]
     for each in (second, unread):
-        beat_of(LINK).leave(each)
+        process_heartbeat(LINK).leave(each)
 
 
 async def test_last_device_ends_the_beat() -> None:
     messaging = Messaging()
     only = device("arm-0", messaging)
-    beat_of(LINK).join(only)
+    process_heartbeat(LINK).join(only)
     await until(lambda: messaging.sent)
-    before = beat_of(LINK)
+    before = process_heartbeat(LINK)
     before.leave(only)
-    assert beat_of(LINK) is not before
-    assert not [each for each in asyncio.all_tasks() if each.get_name() == "beat" and not each.cancelling()]
+    assert process_heartbeat(LINK) is not before
+    assert not [
+        each for each in asyncio.all_tasks() if each.get_name() == "process-heartbeat" and not each.cancelling()
+    ]
 
 
 async def test_beat_goes_on_after_a_lost_link_and_an_unsendable_state() -> None:
     messaging, facts = Messaging(), [{"state": object()}]
     only = device("arm-0", messaging, fields=lambda: facts[0])
-    beat_of(LINK).join(only)
+    process_heartbeat(LINK).join(only)
     await asyncio.sleep(0)
     messaging.down = True
     facts[0] = {}
     await until(lambda: messaging.refused)
     messaging.down = False
     await until(lambda: messaging.sent)
-    beat_of(LINK).leave(only)
+    process_heartbeat(LINK).leave(only)
 
 
 def test_heartbeat_of_one_device_names_no_other() -> None:
-    assert named_in(b'{"device_id": "arm-1", "ts": 1.0}') == ()
-    assert named_in(b'{"devices": "arm-1"}') == ()
-    assert named_in(b'"devices"') == ()
-    assert named_in(b'{"devices": [1, "arm-1", null]}') == ["arm-1"]
+    assert devices_in(b'{"device_id": "arm-1", "ts": 1.0}') == ()
+    assert devices_in(b'{"devices": "arm-1"}') == ()
+    assert devices_in(b'"devices"') == ()
+    assert devices_in(b'{"devices": [1, "arm-1", null]}') == ["arm-1"]
 
 
 async def test_client_takes_a_beat_as_a_sign_of_life_of_all_it_names() -> None:
@@ -123,7 +125,7 @@ async def test_beat_proves_only_its_own_device_where_devices_are_identified() ->
 
 async def test_memory_of_heartbeats_is_bounded() -> None:
     found = Discovery(Messaging())  # type: ignore[arg-type]
-    for number in range(BEATS_MAX + 100):
+    for number in range(HEARTBEATS_MAX + 100):
         await found._on_heartbeat(b"{}", f"device-connect.default.arm-{number}.heartbeat", None)
     assert found.last_heartbeat("arm-0") is None
-    assert found.last_heartbeat(f"arm-{BEATS_MAX + 99}") is not None
+    assert found.last_heartbeat(f"arm-{HEARTBEATS_MAX + 99}") is not None
