@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.table import Row
-from strands_robots.kinematics import grasp, sight
+from strands_robots.kinematics import moves, objects
 from strands_robots.kinematics.motion import Motion
 from strands_robots.kinematics.moves import Start, move_joints, move_to
 from strands_robots.kinematics.objects import Held, SeenObject
@@ -73,7 +73,7 @@ class Bench:
         self.world.step(100)
         return ""
 
-    def judged(self, motion: Motion, looked: sight.Sight) -> Told:
+    def judged(self, motion: Motion, looked: objects.Sight) -> Told:
         """Play a motion and return what its answer says."""
         blocked = self.play(motion)
         looked.after = self.world.objects("arm")
@@ -88,24 +88,24 @@ class Bench:
         start = self.start()
         target = next(each for each in start.objects if each.name == name)
         try:
-            sight.require_uncovered(target, start.objects)
-            motion, self.held = grasp.pick(start, target, None)
+            objects.require_uncovered(target, start.objects)
+            motion, self.held = moves.pick(start, target, None)
         except ValidationError as exc:
             return Told(str(exc), refused=True)
         wanted = self.held.centre(start.arm.chain.forward(motion.end_joints))
-        return self.judged(motion, sight.Sight(start.objects, name, wanted, sight.CARRIED_MM))
+        return self.judged(motion, objects.Sight(start.objects, name, wanted, objects.CARRIED_MM))
 
     def place(self, position: Floats, on: str = "") -> Told:
         """Put the held object down."""
         assert self.held is not None
         start = self.start()
         try:
-            sight.require_vacant(position, self.held, start.objects, on)
-            motion = grasp.place(start, position, None, self.held, on)
+            objects.require_vacant(position, self.held, start.objects, on)
+            motion = moves.place(start, position, None, self.held, on)
         except ValidationError as exc:
             return Told(str(exc), refused=True)
         wanted = position + np.array([0.0, 0.0, self.held.below])
-        return self.judged(motion, sight.Sight(start.objects, self.held.name, wanted))
+        return self.judged(motion, objects.Sight(start.objects, self.held.name, wanted))
 
     def object(self, name: str) -> SeenObject:
         """Return an object as it is now."""
@@ -168,7 +168,7 @@ def putting(count: int) -> Row:
         if not told.why:
             told = bench.place(goal, "shelf" if where == "shelf" else "")
         off = 1000 * float(np.linalg.norm(bench.object("thing").position - goal - np.array([0.0, 0.0, 0.0125])))
-        there = off <= sight.PLACED_MM
+        there = off <= objects.PLACED_MM
         good, honest = good + (not told.why and there), honest + bool(told.why)
         false += not told.why and not there
         bench.world.cleanup()
@@ -200,7 +200,7 @@ def around(count: int) -> Row:
             named = "post" in str(exc)
             refused, other = refused + named, other + (not named)
         else:
-            looked = sight.Sight(start.objects)
+            looked = objects.Sight(start.objects)
             told = bench.judged(motion, looked)
             reached, pushed, other = reached + (not told.why), pushed + bool(looked.moved), other + bool(told.why)
         bench.world.cleanup()

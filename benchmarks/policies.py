@@ -27,10 +27,9 @@ from benchmarks.table import Row
 from strands_robots.hardware import HardwareRobot
 from strands_robots.policies.base import Action, Ranges
 from strands_robots.policies.bench import StillBody
-from strands_robots.policies.inference import InferenceWorker
 from strands_robots.policies.lerobot_local import LeRobotPolicy
 from strands_robots.policies.openpi import OpenPiPolicy
-from strands_robots.policies.profiled import ProfiledPolicy
+from strands_robots.policies.profiled import InferenceWorker, ProfiledPolicy
 from strands_robots.policies.profiles import CameraMap, Profile
 from strands_robots.policies.rollout import Rollout
 from strands_robots.safety.gate import MotionGate, Permit

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from benchmarks import reach_network
 from benchmarks.table import Row
-from strands_robots.kinematics import grasp
+from strands_robots.kinematics import moves
 from strands_robots.kinematics.chain import built_in
 from strands_robots.kinematics.inverse import TipGoal, solve
 from strands_robots.kinematics.motion import Motion
@@ -145,7 +145,7 @@ class Table:
         cube = self.cube
         seen = SeenObject(cube.name, cube.position + np.array([*aside, 0.0]), cube.yaw, cube.size)
         try:
-            motion, self._held = grasp.pick(self._start(), seen, None)
+            motion, self._held = moves.pick(self._start(), seen, None)
         except ValidationError:
             return None
         self._play(motion)
@@ -155,7 +155,7 @@ class Table:
     def place(self, position: NDArray[np.float64]) -> None:
         """Put it down, and let it come to rest."""
         assert self._held is not None
-        self._play(grasp.place(self._start(), position, None, self._held))
+        self._play(moves.place(self._start(), position, None, self._held))
         self.world.step(100)
 
     def _start(self) -> Start:

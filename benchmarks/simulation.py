@@ -20,9 +20,8 @@ from benchmarks.table import Row
 from strands_robots import settings
 from strands_robots.device_connect import FleetClient, init_device_connect_sync, loopback_config, stop_device_connect
 from strands_robots.simulation import Simulation
-from strands_robots.simulation.catalog import find
-from strands_robots.simulation.plan import Plan, RobotPlan
-from strands_robots.simulation.stage import compile_stage
+from strands_robots.simulation.model import compile_stage
+from strands_robots.simulation.scene import Plan, RobotPlan, find
 
 STEPS = 10_000
 FLEET = 32

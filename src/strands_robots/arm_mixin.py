@@ -14,9 +14,8 @@ from typing import TYPE_CHECKING, Any, ParamSpec
 
 from strands_robots.contract import RUNNING, for_request
 from strands_robots.envelope import Envelope, error, success
-from strands_robots.kinematics.arm_parts import ArmParts
+from strands_robots.kinematics.arm_parts import ArmParts, StatedJoint
 from strands_robots.kinematics.arm_task import ArmTask
-from strands_robots.kinematics.stated_joint import StatedJoint
 from strands_robots.policies.base import Action
 from strands_robots.policies.rollout import Body, Rollout
 from strands_robots.recording.cameras import frames_of
@@ -27,11 +26,9 @@ from strands_robots.utils import ValidationError, choice, identifier, missing_ex
 
 if TYPE_CHECKING:  # numpy and MuJoCo are loaded with the first motion
     from strands_robots.kinematics.arm import Arm, ArmState
-    from strands_robots.kinematics.detector import Asking, ObjectDetector
     from strands_robots.kinematics.motion import JointSpace, Motion
     from strands_robots.kinematics.moves import Start
-    from strands_robots.kinematics.objects import Held, SeenObject
-    from strands_robots.kinematics.sight import Sight
+    from strands_robots.kinematics.objects import Asking, Held, ObjectDetector, SeenObject, Sight
 
 logger = stop_logger(__name__)
 
@@ -103,7 +100,7 @@ class ArmMixin:
         name = self.body(robot_name).name
         if self.detector is None:
             raise ValidationError(f"{name} has no detector of objects; give a position instead.")
-        from strands_robots.kinematics.detector import detected  # noqa: PLC0415 - numpy, with the first motion
+        from strands_robots.kinematics.objects import detected  # noqa: PLC0415 - numpy, with the first motion
 
         frames = frames_of(self)
         return detected(self.detector, {} if frames is None else frames())
@@ -286,27 +283,27 @@ class ArmMixin:
         request: MotionRequest | None = None,
     ) -> Envelope:
         """Pick up an object by its name, or one of a width at a point."""
-        from strands_robots.kinematics import grasp, objects, sight  # noqa: PLC0415 - loaded with the first motion
+        from strands_robots.kinematics import moves, objects  # noqa: PLC0415 - loaded with the first motion
 
         body, seen = self.body(robot_name), self._seen(robot_name, "pick")
         if object:
             target = _of_name(object, self._objects_in_time(body.name) if seen is None else seen)
-            sight.require_uncovered(target, seen or ())
+            objects.require_uncovered(target, seen or ())
         elif x is None or y is None or z is None:
             raise ValidationError("pick needs object, or x, y and z.")
         else:
             given, size = _vector(x, y, z), _vector(width, width, 2 * min(z, width))
-            target = objects.SeenObject(sight.nearest(given, seen or ()), given, math.radians(yaw), size)
+            target = objects.SeenObject(objects.nearest(given, seen or ()), given, math.radians(yaw), size)
         held: list[Held] = []
 
         def plan(start: Start) -> Motion:
-            motion, grasped = grasp.pick(start, target, approach)
+            motion, grasped = moves.pick(start, target, approach)
             held.append(grasped)
             if looked is not None:
                 looked.wanted = grasped.centre(start.arm.chain.forward(motion.end_joints))
             return motion
 
-        looked = None if seen is None else sight.Sight(seen, target.name, within_mm=sight.CARRIED_MM)
+        looked = None if seen is None else objects.Sight(seen, target.name, within_mm=objects.CARRIED_MM)
         kept = lambda: self._held.update({body.name: held[-1]})  # noqa: E731 - one argument of the call below
         return self._move(
             "pick", plan, speed, wait, robot_name, request=request, started=kept, sight=looked, around=around
@@ -328,7 +325,7 @@ class ArmMixin:
         request: MotionRequest | None = None,
     ) -> Envelope:
         """Put the held object down on the table at a point, or on another object."""
-        from strands_robots.kinematics import grasp, sight  # noqa: PLC0415 - loaded with the first motion
+        from strands_robots.kinematics import moves, objects  # noqa: PLC0415 - loaded with the first motion
 
         body, seen = self.body(robot_name), self._seen(robot_name, "place")
         held = self._held.get(body.name)
@@ -346,10 +343,10 @@ class ArmMixin:
             raise ValidationError("place needs on, or x and y.")
         else:
             position = _vector(x, y, self.arm(robot_name).chain.table_z if z is None else z)
-        sight.require_vacant(position, held, seen or (), on)
-        plan = partial(grasp.place, position=position, approach=approach, held=held, on=on)
+        objects.require_vacant(position, held, seen or (), on)
+        plan = partial(moves.place, position=position, approach=approach, held=held, on=on)
         stands = position + _vector(0.0, 0.0, held.below)
-        looked = None if seen is None else sight.Sight(seen, held.name, stands)
+        looked = None if seen is None else objects.Sight(seen, held.name, stands)
         return self._move("place", plan, speed, wait, robot_name, request=request, sight=looked, around=around)
 
     @planned
@@ -381,7 +378,7 @@ class ArmMixin:
 
         ``kept`` is false where that cannot be written: the place is then lost with this process.
         """
-        from strands_robots.kinematics.places import save_places  # noqa: PLC0415 - with the first place
+        from strands_robots.kinematics.arm_task import save_places  # noqa: PLC0415 - with the first place
 
         name, body, arm = identifier("place", place), self.body(robot_name), self.arm(robot_name).whole()
         if name == HOME:
@@ -403,7 +400,7 @@ class ArmMixin:
         return own if name == self.tool_name_str else f"{own}:{name}"
 
     def _saved_places(self, name: str) -> dict[str, dict[str, float]]:
-        from strands_robots.kinematics.places import load_places  # noqa: PLC0415 - with the first place
+        from strands_robots.kinematics.arm_task import load_places  # noqa: PLC0415 - with the first place
 
         if name not in self._places:
             self._places[name] = load_places(self._place_key(name))
@@ -476,7 +473,7 @@ class ArmMixin:
 
     @cached_property
     def _asking(self) -> Asking:
-        from strands_robots.kinematics.detector import Asking  # noqa: PLC0415 - numpy, with the first motion
+        from strands_robots.kinematics.objects import Asking  # noqa: PLC0415 - numpy, with the first motion
 
         return Asking()
 
@@ -506,7 +503,7 @@ class ArmMixin:
         around: bool = False,
     ) -> Envelope:
         from strands_robots.kinematics.moves import Start  # noqa: PLC0415 - loaded with the first motion
-        from strands_robots.kinematics.sight import Sight  # noqa: PLC0415 - as above
+        from strands_robots.kinematics.objects import Sight  # noqa: PLC0415 - as above
 
         body, arm = self.body(robot_name), self.arm(robot_name)
         arm = arm.whole() if whole else arm
@@ -538,15 +535,15 @@ class ArmMixin:
         *,
         request: MotionRequest | None,
     ) -> Envelope:
-        from strands_robots.kinematics import joint_motion  # noqa: PLC0415 - numpy, with the first motion
+        from strands_robots.kinematics import motion  # noqa: PLC0415 - numpy, with the first motion
 
-        body, goals = self.body(robot_name), joint_motion.chosen(stated, joints)
+        body, goals = self.body(robot_name), motion.chosen(stated, joints)
 
         def planned_at(hz: float, permit: Permit) -> Motion:
-            space = joint_motion.StatedJoints(tuple(goals))
+            space = motion.StatedJoints(tuple(goals))
             state = space.state(_observed(body)[1]).told(space.told(self.targets(body.name)))
             still = self.still_action(body.name)
-            return joint_motion.move_joints(goals, state, still, joints, hz=hz, speed=speed)
+            return motion.move_joints(goals, state, still, joints, hz=hz, speed=speed)
 
         return self._play("moveJoints", body, planned_at, wait, request=request)
 

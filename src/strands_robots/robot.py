@@ -26,7 +26,7 @@ logger = logging.getLogger(__name__)
 HARDWARE_OPTIONS = ("control_hz", "joint_ranges", "stop_level", "rest_pose", "model", "speed_limit")
 
 DETECTOR = "detector"
-"""Option of a real robot that is set on it: an :class:`~strands_robots.kinematics.detector.ObjectDetector`."""
+"""Option of a real robot that is set on it: an :class:`~strands_robots.kinematics.objects.ObjectDetector`."""
 
 NO_SUCH_MODEL = "NO_SUCH_MODEL"
 """Error code for a simulated robot whose model is unknown or cannot be loaded."""
@@ -188,8 +188,7 @@ def _print_to_terminal(text: str) -> None:
 
 
 def _simulated(name: str, tool_name: str | None, options: dict[str, Any]) -> Any:
-    from strands_robots.simulation import Simulation  # noqa: PLC0415 - loads MuJoCo
-    from strands_robots.simulation.tabletop import furnish  # noqa: PLC0415 - simulation only
+    from strands_robots.simulation import Simulation, furnish  # noqa: PLC0415 - simulation only
 
     label, scene, tip = _label(name), options.pop("scene", None), options.pop("tip", "")
     simulation = _construct(_networked(Simulation), tool_name=tool_name or label, **options)

@@ -20,7 +20,7 @@ from strands_robots.cli.output import CliError, Screen
 from strands_robots.recording.cameras import jpeg
 from strands_robots.safety.answers import Answer
 from strands_robots.safety.controller import StopReport
-from strands_robots.simulation.tabletop import TABLETOP
+from strands_robots.simulation import TABLETOP
 
 EPOCH = "0123456789abcdef0123456789abcdef"
 

@@ -11,7 +11,7 @@ import pytest
 
 from strands_robots.bus_access import action_ranges
 from strands_robots.hardware.arm import arm_of
-from strands_robots.hardware.speed import default_speeds
+from strands_robots.hardware.device_facts import default_speeds
 from strands_robots.utils import ValidationError
 
 MOTORS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")

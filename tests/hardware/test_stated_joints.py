@@ -17,7 +17,7 @@ from fixtures.planes import own_plane
 from fixtures.waiting import eventually
 
 from strands_robots.hardware import HardwareRobot
-from strands_robots.hardware.stated_joints import stated_joints, still_action
+from strands_robots.hardware.device_facts import stated_joints, still_action
 from strands_robots.kinematics.motion import Motion
 from strands_robots.policies.rollout import Rollout
 from strands_robots.safety.gate import Permit

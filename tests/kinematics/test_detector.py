@@ -10,7 +10,7 @@ import pytest
 from fixtures.devices import RecordingDevice
 
 from strands_robots.hardware import HardwareRobot
-from strands_robots.kinematics.detector import ObjectDetector, detected
+from strands_robots.kinematics.objects import ObjectDetector, detected
 from strands_robots.utils import ValidationError
 
 CUBE = {"name": "cube", "position": [0.2, 0.0, 0.0125], "size": [0.025, 0.025, 0.025]}

@@ -9,11 +9,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from strands_robots.kinematics import spares
-from strands_robots.kinematics.chain import MODELS, Chain, built_in
-from strands_robots.kinematics.contacts import ContactCheck
+from strands_robots.kinematics.chain import CONTACT_BITS, MODELS, SPARES, Chain, Spares, built_in, held_body
+from strands_robots.kinematics.contacts import CLEARANCE_M, ContactCheck, beside
 from strands_robots.kinematics.objects import Held, SeenObject
-from strands_robots.kinematics.obstacles import CLEARANCE_M, beside
 
 
 def objects(count: int) -> list[SeenObject]:
@@ -41,11 +39,11 @@ def compiled(seen: Sequence[SeenObject]) -> Any:
         kind, size = mujoco.mjtGeom.mjGEOM_BOX, [x + CLEARANCE_M, y + CLEARANCE_M, z]
         if each.round:
             kind, size = mujoco.mjtGeom.mjGEOM_CYLINDER, [max(x, y) + CLEARANCE_M, z, 0.0]
-        body.add_geom(type=kind, size=size, contype=spares.BITS, conaffinity=spares.BITS)
+        body.add_geom(type=kind, size=size, contype=CONTACT_BITS, conaffinity=CONTACT_BITS)
     return spec.compile()
 
 
-@pytest.mark.parametrize("count", [1, 5, spares.COUNT + 1])
+@pytest.mark.parametrize("count", [1, 5, SPARES + 1])
 def test_contacts_are_those_of_a_compiled_model(count: int) -> None:
     seen, chain = objects(count), built_in("so101")
     check, model = ContactCheck(beside(chain, seen)), compiled(seen)
@@ -86,11 +84,11 @@ def test_held_object_goes_where_the_tip_goes() -> None:
     draw = np.random.default_rng(2)
     for _ in range(20):
         joints = draw.uniform(chain.lows, chain.highs)
-        at = crowded.data(joints).xpos[spares.held_body(crowded.model)]
+        at = crowded.data(joints).xpos[held_body(crowded.model)]
         assert at == pytest.approx(held.centre(chain.forward(joints)), abs=1e-9)
 
 
 def test_planning_beside_objects_compiles_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     chain: Chain = built_in("so101")
-    monkeypatch.setattr(spares.Spares, "_grown", lambda *_: pytest.fail("a model was compiled"))
-    beside(chain, objects(spares.COUNT))
+    monkeypatch.setattr(Spares, "_grown", lambda *_: pytest.fail("a model was compiled"))
+    beside(chain, objects(SPARES))

@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
-from strands_robots.kinematics.rrt import path_around
+from strands_robots.kinematics.planner import path_around
 
 Floats = NDArray[np.float64]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import mujoco
 import pytest
 
-from strands_robots.kinematics.servos import actuator_kind, drives, is_servo
+from strands_robots.kinematics.model_file import actuator_kind, drives, is_servo
 
 MODEL = """
 <mujoco>

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from strands_robots.kinematics.objects import Held, SeenObject
-from strands_robots.kinematics.sight import Sight, nearest, require_uncovered, require_vacant
+from strands_robots.kinematics.objects import Held, SeenObject, Sight, nearest, require_uncovered, require_vacant
 from strands_robots.utils import ValidationError
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from strands_robots.kinematics.chain import Floats
-from strands_robots.kinematics.stall import RISE_A, StallWatch
+from strands_robots.kinematics.motion import RISE_A, StallWatch
 
 HZ = 50
 

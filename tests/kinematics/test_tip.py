@@ -5,7 +5,7 @@ from __future__ import annotations
 import mujoco
 import pytest
 
-from strands_robots.kinematics.tip import mark_tip
+from strands_robots.kinematics.model_file import mark_tip
 from strands_robots.utils import ValidationError
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from strands_robots.kinematics.trajectory import Bounds, joined, timed
+from strands_robots.kinematics.arm import Bounds, joined, timed
 
 BOUNDS = Bounds(np.array([1.0, 0.5]), np.array([4.0, 4.0]))
 CORNERED = np.array([[0.0, 0.0], [0.3, 0.05], [0.5, 0.2], [0.55, 0.4]])

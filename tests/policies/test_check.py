@@ -13,8 +13,7 @@ import pytest
 from fixtures.checkpoints import statistics, write_checkpoint, write_dataset, write_safetensors
 
 from strands_robots.policies.base import numbers
-from strands_robots.policies.check import PolicyCheck, check_policy, statements_of
-from strands_robots.policies.check_rows import RobotFacts
+from strands_robots.policies.check import PolicyCheck, RobotFacts, check_policy, statements_of
 from strands_robots.policies.profiles import load_profiles
 
 KEYS = ["pan.pos", "lift.pos", "grip.pos"]

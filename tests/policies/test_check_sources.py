@@ -13,9 +13,7 @@ from typing import Any
 import pytest
 from fixtures.checkpoints import MODES, Vectors, statistics, write_checkpoint, write_dataset, write_safetensors
 
-from strands_robots.policies import dataset_facts
-from strands_robots.policies.check import PolicyCheck, PolicyCheckError, check_policy, statements_of
-from strands_robots.policies.check_rows import RobotFacts
+from strands_robots.policies.check import PolicyCheck, PolicyCheckError, RobotFacts, check_policy, statements_of
 from strands_robots.policies.profiled import ProfiledPolicy
 from strands_robots.policies.profiles import CameraMap, Profile
 
@@ -346,7 +344,7 @@ def test_quantiles_are_not_compared_with_bounds(tmp_path: Path) -> None:
 def test_the_greatest_number_of_episodes_is_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, more: int, read: bool
 ) -> None:
-    monkeypatch.setattr(dataset_facts, "EPISODES_MAX", 4)
+    monkeypatch.setattr("strands_robots.policies.checkpoint.EPISODES_MAX", 4)
     profile = written(tmp_path, "v2.1", {})
     path = tmp_path / "dataset" / "meta" / "episodes_stats.jsonl"
     lines = path.read_text().splitlines() * 2

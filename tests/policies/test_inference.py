@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from fixtures.waiting import eventually
 
-from strands_robots.policies.inference import InferenceResult, InferenceWorker, InlineInference
+from strands_robots.policies.profiled import InferenceResult, InferenceWorker, InlineInference
 
 
 class Model:

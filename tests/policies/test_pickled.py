@@ -22,8 +22,8 @@ from fixtures.lerobot_pickles import (
     wired,
 )
 
-from strands_robots.policies import pickled as module
-from strands_robots.policies.pickled import UnreadablePickleError, pickled, read_actions
+from strands_robots.policies import lerobot_async as module
+from strands_robots.policies.lerobot_async import UnreadablePickleError, pickled, read_actions
 
 ROWS = [[1.0, 2.0, 3.0], [4.0, 5.0, 6.5]]
 
@@ -106,7 +106,7 @@ def test_the_bomb_of_these_tests_goes_off_where_pickles_are_loaded(tmp_path: Pat
         "lerobot.async_inference.helpers RemotePolicyConfig",
         "collections OrderedDict.fromkeys",
         "numpy.core.multiarray _reconstruct",
-        "strands_robots.policies.pickled read_actions",
+        "strands_robots.policies.lerobot_async read_actions",
     ],
 )
 def test_a_name_that_is_not_listed_ends_the_reading(name: str) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from strands_robots.policies.playback import Playback
+from strands_robots.policies.profiled import Playback
 
 
 def chunk(first: int, count: int = 10) -> list[dict[str, float]]:

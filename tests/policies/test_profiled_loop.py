@@ -13,7 +13,7 @@ from fixtures.waiting import eventually
 
 from strands_robots.contract import RolloutEvent
 from strands_robots.policies.base import PolicyError, Ranges
-from strands_robots.policies.check_rows import RobotFacts
+from strands_robots.policies.check import RobotFacts
 from strands_robots.policies.profiled import ProfiledPolicy
 from strands_robots.policies.profiles import CameraMap, Profile
 from strands_robots.policies.rollout import Rollout, RolloutObservers

@@ -17,7 +17,7 @@ from fixtures.waiting import eventually
 from strands_robots import policies
 from strands_robots.hardware import HardwareRobot
 from strands_robots.policies.base import PolicyError, Ranges
-from strands_robots.policies.check_rows import RobotFacts
+from strands_robots.policies.check import RobotFacts
 from strands_robots.policies.profiled import ProfiledPolicy, picture
 from strands_robots.policies.profiles import CameraMap, Profile, load_profiles
 from strands_robots.policies.warm import WarmModels, require_warm

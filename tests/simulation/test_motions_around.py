@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from strands_robots.kinematics import grasp
-from strands_robots.kinematics.contacts import ContactCheck
+from strands_robots.kinematics import moves
+from strands_robots.kinematics.contacts import ContactCheck, beside
 from strands_robots.kinematics.moves import Start
-from strands_robots.kinematics.obstacles import beside
 from strands_robots.simulation import Simulation
 
 SIDE = (0.22, -0.12, 0.05)
@@ -23,7 +22,7 @@ OTHER_SIDE = (0.22, 0.12, 0.05)
 def unhurried(monkeypatch: pytest.MonkeyPatch) -> None:
     """Bound the searches by their tries, for the time that they take depends on the machine."""
     monkeypatch.setattr("strands_robots.arm_mixin.PLAN_S", 600.0)
-    monkeypatch.setattr("strands_robots.kinematics.rrt.TRIES_MAX", 300)
+    monkeypatch.setattr("strands_robots.kinematics.planner.TRIES_MAX", 300)
 
 
 @pytest.fixture
@@ -165,12 +164,12 @@ def test_pick_goes_around_its_own_target_on_the_way_to_it(
     world: Simulation, monkeypatch: pytest.MonkeyPatch, hover: float
 ) -> None:
     # The lower one is still between the jaws.
-    monkeypatch.setattr(grasp, "HOVER_M", (hover,))
+    monkeypatch.setattr(moves, "HOVER_M", (hover,))
     body = world.body("arm")
     world.add_object("bottle", "box", (0.012, 0.012, 0.03), (0.22, 0.0, 0.03))
     seen = world.objects("arm")
     start = Start(body.arm, body.arm.state(body.get_joints()), 50, 1.0, seen)
-    motion, _ = grasp.pick(start, seen[0], None)
+    motion, _ = moves.pick(start, seen[0], None)
     transit = next(segment for segment in motion.segments if segment.name == "hover")
     path = np.array([body.arm.told(frame) for frame in transit.frames])
     assert ContactCheck(beside(body.arm.chain, seen), body.arm.jaw_radians(1.0)).along(path, {}) == ""

@@ -12,11 +12,9 @@ from fixtures.waiting import eventually
 
 from strands_robots.safety.gate import MotionGate, PermitVoidError
 from strands_robots.simulation import Simulation
-from strands_robots.simulation.catalog import find
-from strands_robots.simulation.pacing import WorldClock
-from strands_robots.simulation.physics import Physics
-from strands_robots.simulation.plan import Plan, RobotPlan
-from strands_robots.simulation.stage import compile_stage
+from strands_robots.simulation.model import compile_stage
+from strands_robots.simulation.physics import Physics, WorldClock
+from strands_robots.simulation.scene import Plan, RobotPlan, find
 
 
 def pacers() -> list[str]:

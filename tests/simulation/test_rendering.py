@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from strands_robots.simulation import Simulation, gl
+from strands_robots.simulation import Simulation, engine
+from strands_robots.simulation.pictures import Recording, save_animation
 from strands_robots.simulation.rendering import RenderingError, draw_path
-from strands_robots.simulation.scene import Recording, save_animation
 from strands_robots.utils import ValidationError
 
-OPENGL = any(gl.loads(backend) for backend in ("egl", "osmesa"))
-needs_opengl = pytest.mark.skipif(not OPENGL, reason=f"no OpenGL here: needs {gl.PACKAGES}")
+OPENGL = any(engine.loads(backend) for backend in ("egl", "osmesa"))
+needs_opengl = pytest.mark.skipif(not OPENGL, reason=f"no OpenGL here: needs {engine.PACKAGES}")
 
 
 @pytest.fixture
@@ -164,13 +164,13 @@ def test_available_backend_is_chosen_without_a_display(
 ) -> None:
     monkeypatch.setenv("MUJOCO_GL", "")
     monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.setattr(gl, "loads", lambda backend: backend in libraries)
+    monkeypatch.setattr(engine, "loads", lambda backend: backend in libraries)
     monkeypatch.setattr("platform.system", lambda: "Linux")
-    gl.prepare.cache_clear()
+    engine.prepare.cache_clear()
     try:
-        assert gl.prepare() == chosen
+        assert engine.prepare() == chosen
     finally:
-        gl.prepare.cache_clear()
+        engine.prepare.cache_clear()
 
 
 @pytest.mark.parametrize(("display", "chosen"), [("", "osmesa"), (":0", "glfw")])
@@ -179,24 +179,24 @@ def test_windowed_backend_is_taken_only_where_there_is_a_display(
 ) -> None:
     monkeypatch.setenv("MUJOCO_GL", "glfw")
     monkeypatch.setenv("DISPLAY", display)
-    monkeypatch.setattr(gl, "loads", lambda backend: backend == "osmesa")
-    gl.prepare.cache_clear()
+    monkeypatch.setattr(engine, "loads", lambda backend: backend == "osmesa")
+    engine.prepare.cache_clear()
     try:
-        assert gl.prepare() == chosen
+        assert engine.prepare() == chosen
         assert ("needs a display" in caplog.text) is (not display)
     finally:
-        gl.prepare.cache_clear()
+        engine.prepare.cache_clear()
 
 
 @pytest.mark.parametrize("configured", ["egl", "osmesa", "glfw"])
 def test_configured_backend_that_cannot_load_is_disabled(monkeypatch: pytest.MonkeyPatch, configured: str) -> None:
     monkeypatch.setenv("MUJOCO_GL", configured)
-    monkeypatch.setattr(gl, "loads", lambda backend: False)
-    gl.prepare.cache_clear()
+    monkeypatch.setattr(engine, "loads", lambda backend: False)
+    engine.prepare.cache_clear()
     try:
-        assert gl.prepare() == "disable"
+        assert engine.prepare() == "disable"
     finally:
-        gl.prepare.cache_clear()
+        engine.prepare.cache_clear()
 
 
 def test_world_without_opengl_steps_and_projects() -> None:

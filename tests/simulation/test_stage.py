@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from strands_robots.simulation import Simulation
-from strands_robots.simulation.catalog import BUILT_IN, MODELS, find
+from strands_robots.simulation.scene import BUILT_IN, MODELS, find
 from strands_robots.utils import ValidationError
 
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")

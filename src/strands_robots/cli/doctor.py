@@ -329,20 +329,24 @@ def _rendering() -> Iterator[Finding]:
     if _version("mujoco") is None:
         yield Finding("rendering", Mark.NOTE, "needs the [sim] extra", install_line("sim"))
         return
-    from strands_robots.simulation.gl import remedy  # noqa: PLC0415 - the simulation is not loaded for other commands
-
     try:
         tried = subprocess.run(
             [sys.executable, "-c", _RENDER], capture_output=True, text=True, timeout=_RENDER_S, check=False
         )
     except subprocess.TimeoutExpired:
-        yield Finding("rendering", Mark.WARN, f"no picture within {_RENDER_S:g} s", remedy())
+        yield Finding("rendering", Mark.WARN, f"no picture within {_RENDER_S:g} s", _rendering_remedy())
         return
     if tried.returncode == 0:
         yield Finding("rendering", Mark.OK, tried.stdout.strip().splitlines()[-1])
     else:
         last = (tried.stderr.strip() or f"ended with {tried.returncode}").splitlines()[-1]
-        yield Finding("rendering", Mark.WARN, f"OpenGL does not work here: {last}", remedy())
+        yield Finding("rendering", Mark.WARN, f"OpenGL does not work here: {last}", _rendering_remedy())
+
+
+def _rendering_remedy() -> str:
+    from strands_robots.simulation.engine import remedy  # noqa: PLC0415 - the simulation is not loaded for other commands
+
+    return remedy()
 
 
 def _state() -> Iterator[Finding]:

@@ -177,7 +177,7 @@ def serve(
         screen.say(f"Loading the policies {', '.join(loading)}.")
     with ExitStack() as stack:
         if emulated:
-            from strands_robots.hardware.emulated.process import emulated_arm  # noqa: PLC0415 - as above
+            from strands_robots.hardware.emulated import emulated_arm  # noqa: PLC0415 - as above
 
             chosen = stack.enter_context(emulated_arm()) | chosen
         body = Robot(robot, mode="real" if robot == "reachy_mini" else mode, **chosen)

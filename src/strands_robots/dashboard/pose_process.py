@@ -31,11 +31,14 @@ class PosePainter:
     def __init__(self, model: str) -> None:
         try:
             from strands_robots.kinematics.chain import built_in  # noqa: PLC0415 - MuJoCo may be missing
-            from strands_robots.simulation.catalog import find  # noqa: PLC0415 - as above
+            from strands_robots.simulation.model import compile_stage  # noqa: PLC0415 - as above
             from strands_robots.simulation.physics import Physics  # noqa: PLC0415 - as above
-            from strands_robots.simulation.plan import Plan, RobotPlan  # noqa: PLC0415 - as above
             from strands_robots.simulation.rendering import Renderer  # noqa: PLC0415 - as above
-            from strands_robots.simulation.stage import compile_stage  # noqa: PLC0415 - as above
+            from strands_robots.simulation.scene import (  # noqa: PLC0415 - as above
+                Plan,
+                RobotPlan,
+                find,
+            )
         except ModuleNotFoundError as exc:
             raise missing_extra("The 3-D pose", "sim") from exc
         self._chain = built_in(model)

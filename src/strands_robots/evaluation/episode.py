@@ -18,7 +18,7 @@ from strands_robots.evaluation.expert import EXPERT, ExpertPolicy
 from strands_robots.evaluation.tasks import ROBOT, EvaluationTask, task_of
 from strands_robots.policies import create_policy
 from strands_robots.policies.base import Action, Policy, Ranges
-from strands_robots.policies.check_rows import RobotFacts
+from strands_robots.policies.check import RobotFacts
 from strands_robots.policies.profiled import ProfiledPolicy
 from strands_robots.policies.rollout import Clock, Rollout, RolloutObservers
 from strands_robots.recording.file import STEP, Recorder

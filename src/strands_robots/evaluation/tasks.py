@@ -14,7 +14,7 @@ from strands_robots.kinematics.motion import Motion
 from strands_robots.kinematics.moves import Start
 from strands_robots.kinematics.objects import SeenObject
 from strands_robots.kinematics.planner import Planner
-from strands_robots.simulation.tabletop import CUBE, PLATE
+from strands_robots.simulation import CUBE, PLATE
 from strands_robots.simulation.world import Simulation
 from strands_robots.utils import ValidationError, choice
 
@@ -177,16 +177,16 @@ class PickPlace(_CubeTask):
         return float(np.linalg.norm(cube[:2] - plate[:2])) < ON_PLATE_M and resting and away > self.edge
 
     def plan(self, step: int, start: Start, world: Simulation) -> Motion | None:
-        from strands_robots.kinematics import grasp  # noqa: PLC0415 - the planner is loaded with the first plan
+        from strands_robots.kinematics import moves  # noqa: PLC0415 - the planner is loaded with the first plan
 
         if step == 0:
-            motion, self._held = grasp.pick(start, self.cube(world), None)
+            motion, self._held = moves.pick(start, self.cube(world), None)
             return motion
         if step > 1:
             return None
         plate = _object(world, PLATE)
         on = plate.position + np.array([0.0, 0.0, float(plate.size[2]) / 2])
-        return grasp.place(start, on, None, self._held)
+        return moves.place(start, on, None, self._held)
 
 
 TASKS: Mapping[str, type[EvaluationTask]] = {task.name: task for task in (Reach, PushCube, PickPlace)}

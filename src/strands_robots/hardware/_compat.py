@@ -18,7 +18,7 @@ from importlib.machinery import ModuleSpec
 from types import ModuleType
 from typing import Any
 
-from strands_robots.policies.lerobot_imports import LEROBOT_IMPORTS
+from strands_robots.policies.lerobot_local import LEROBOT_IMPORTS
 
 _STANDINS: Mapping[str, tuple[str, ...]] = {
     "torch": ("device", "dtype", "Tensor"),

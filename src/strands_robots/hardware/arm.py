@@ -14,8 +14,7 @@ from typing import Any
 
 import mujoco
 
-from strands_robots.hardware.arm_parts import model_name
-from strands_robots.hardware.device_facts import calibration, half_ranges, joint_units, kind
+from strands_robots.hardware.device_facts import calibration, half_ranges, joint_units, kind, model_name
 from strands_robots.kinematics.arm import Arm, JawMap, JointMap
 from strands_robots.kinematics.chain import MODELS, ArmJoint, Chain, built_in
 from strands_robots.kinematics.model_file import load_model

@@ -14,8 +14,7 @@ from typing import Any, TypeVar
 from strands_robots.bus_access import action_ranges, bus_lock, motor_buses, read_currents, read_joints, write_joints
 from strands_robots.hardware._compat import drop, forget_input, stop_base, unplugged
 from strands_robots.hardware.calibration import answer_lost, write_to_servos
-from strands_robots.hardware.device_facts import require_port
-from strands_robots.hardware.speed import default_speeds
+from strands_robots.hardware.device_facts import default_speeds, require_port
 from strands_robots.policies.base import Action, checked_speeds, is_velocity, numbers
 from strands_robots.safety.gate import MotionsHeldError, Permit, PermitVoidError
 from strands_robots.safety.stopping import StopLevel

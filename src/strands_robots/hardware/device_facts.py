@@ -1,4 +1,8 @@
-"""Port, identity, features, joint units and temperatures of a LeRobot device."""
+"""What is known of a LeRobot device: port, identity, units, speeds, joints, parts of an arm.
+
+Neither MuJoCo nor numpy is loaded: a robot says what it can do before its first motion. The model decides then; a
+calibration that does not fit it is found with the first motion.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +10,15 @@ import contextlib
 import math
 import os
 from collections.abc import Mapping
+from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from strands_robots.bus_access import joint_read_source
 from strands_robots.hardware._compat import forget_input
+from strands_robots.kinematics.arm_parts import ArmParts, StatedJoint
+from strands_robots.policies.base import JOINT_SPEED_RAD_S, Action, Ranges, is_velocity
 from strands_robots.utils import ValidationError, shown
 
 _PATTERNS = ("serial/by-id/*", "ttyACM*", "ttyUSB*", "tty.usbmodem*", "tty.usbserial*")
@@ -191,3 +199,143 @@ def _bus(device: Any) -> Any:
 def _motors(device: Any) -> Mapping[str, Any]:
     motors = getattr(_bus(device), "motors", None)
     return motors if isinstance(motors, Mapping) else {}
+
+
+def default_speeds(device: Any) -> dict[str, float]:
+    """Return 2 rad/s in the unit of each joint whose unit is an angle.
+
+    A gripper that is told in percent, a base's velocity and a joint without a known unit have no bound of their own.
+    """
+    return {key: JOINT_SPEED_RAD_S * per_radian for key, per_radian in units_per_radian(device).items()}
+
+
+def units_per_radian(device: Any) -> dict[str, float]:
+    """Return the device's units in one radian, by action key, where that is known."""
+    halves = half_ranges(device)
+    factors = {
+        key: _per_radian(unit, halves.get(key.removesuffix(".pos"))) for key, unit in joint_units(device).items()
+    }
+    return {key: per_radian for key, per_radian in factors.items() if per_radian}
+
+
+def _per_radian(unit: str, half_range: float | None) -> float:
+    """Return units per radian, 0 where that is not known."""
+    known: Mapping[str, float] = {
+        "radians": 1.0,
+        "degrees": 180 / math.pi,
+        "normalized": 100 / half_range if half_range else 0.0,
+    }
+    return known.get(unit, 0.0)
+
+
+SUFFIX = ".pos"
+"""End of LeRobot's keys of positions."""
+
+_OF_POSITIONS = ("degrees", "radians", "metres", "normalized", "percent")
+"""Units of positions; a key with another one, such as newtons, is none."""
+
+
+def stated_joints(device: Any, bounds: Ranges, speeds: Mapping[str, float] | None = None) -> tuple[StatedJoint, ...]:
+    """Return the joints of a device, in the order of its action keys.
+
+    Args:
+        device: its ``joint_units`` or its motors state the units.
+        bounds: range of every action key, in the device's unit.
+        speeds: greatest speed by action key, in its unit a second.
+    """
+    units, factors, known = joint_units(device), units_per_radian(device), of_known_encoder(device)
+    # A normalized position is an angle only by the counts of the calibration, of which one turn has to be known.
+    factors = {
+        key: each for key, each in factors.items() if units[key] != "normalized" or key.removesuffix(SUFFIX) in known
+    }
+    return tuple(
+        _stated(key, units.get(key, ""), factors.get(key, 0.0), bounds[key], (speeds or {}).get(key, math.inf))
+        for key in _positions(bounds, units)
+    )
+
+
+def still_action(device: Any, bounds: Ranges, told: Mapping[str, float], observed: Mapping[str, float]) -> Action:
+    """Return an action that leaves every joint where it was told to be, or is.
+
+    Velocities are zero. A key that may be no position, such as a force, is left out.
+    """
+    known = {key: value for key, value in {**observed, **told}.items() if key in bounds}
+    positions = {key: known[key] for key in _positions(bounds, joint_units(device)) if key in known}
+    return {**{key: 0.0 for key in bounds if is_velocity(key)}, **positions}
+
+
+def _positions(bounds: Ranges, units: Mapping[str, str]) -> list[str]:
+    return [key for key in bounds if not is_velocity(key) and (key.endswith(SUFFIX) or units.get(key) in _OF_POSITIONS)]
+
+
+def _stated(key: str, unit: str, factor: float, bounds: tuple[float, float], speed: float) -> StatedJoint:
+    name, slides = key.removesuffix(SUFFIX), unit == "metres"
+    if not (factor or slides):
+        what = "degrees" if unit else "degrees or metres"
+        return StatedJoint(
+            name, key, refusal=f"it is told in {unit or 'an unknown unit'}, of which no {what} can be made"
+        )
+    if not all(math.isfinite(end) for end in bounds):
+        return StatedJoint(name, key, not slides, refusal="its limits are not stated; give joint_ranges")
+    scale = 1.0 if slides else factor * math.pi / 180
+    low, high = sorted(end / scale for end in bounds)
+    return StatedJoint(name, key, not slides, round(low, 9), round(high, 9), 1.0 if slides else factor, speed)
+
+
+MODEL_OF = {"so100_follower": "so101", "so101_follower": "so101", "so_follower": "so101"}
+"""The built-in model of each of LeRobot's arms."""
+
+_BUILT_IN = ("so100", "so101")
+_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
+"""Joints of the built-in models."""
+
+_JAWS = "gripper"
+
+
+def model_name(device: Any, model: str | None) -> str:
+    """Return the model that is stated, else that of the device's type; "" for none."""
+    return model or MODEL_OF.get(kind(device), "")
+
+
+def arm_parts(device: Any, bounds: Ranges, model: str | None) -> ArmParts:
+    """Return what a device has of an arm.
+
+    Args:
+        device: the device.
+        bounds: range of every action key.
+        model: so100, so101 or the path of an MJCF file; by default that of the device's type.
+    """
+    name = model_name(device, model)
+    if not name:
+        movable = any(not each.refusal for each in stated_joints(device, bounds))
+        return ArmParts(joints=movable and _installed("numpy"))
+    if not (_installed("mujoco") and _installed("numpy")):
+        return ArmParts()
+    if name in _BUILT_IN:
+        return _parts(_jaws(bounds, _JAWS)) if _fits(device, bounds) else ArmParts()
+    if not Path(name).expanduser().is_file():
+        return ArmParts()
+    # LeRobot's grippers are told in percent; what the model calls its own is known once it is loaded.
+    percent = [key for key, unit in joint_units(device).items() if unit == "percent"]
+    return _parts(any(_jaws(bounds, key.removesuffix(".pos")) for key in (*percent, _JAWS)))
+
+
+@cache
+def _installed(package: str) -> bool:
+    return find_spec(package) is not None
+
+
+def _parts(jaws: bool) -> ArmParts:
+    return ArmParts(joints=True, model=True, tip=True, jaws=jaws)
+
+
+def _jaws(bounds: Ranges, name: str) -> bool:
+    return any(math.isfinite(end - low) for low, end in (bounds[key] for key in (f"{name}.pos", name) if key in bounds))
+
+
+def _fits(device: Any, bounds: Ranges) -> bool:
+    """Return True where the built-in joints are there, with known zero and sign."""
+    factors, calibrated = units_per_radian(device), calibration(device)
+    keys = [next((key for key in (f"{name}.pos", name) if key in bounds), "") for name in _JOINTS]
+    inverted = any(getattr(calibrated.get(name), "drive_mode", 0) for name in _JOINTS)
+    return not inverted and all(factors.get(key) for key in keys)

@@ -16,25 +16,26 @@ from strands_robots.audit import queue_safety_event
 from strands_robots.bus_access import joint_read_source
 from strands_robots.contract import Observer, Unsubscribe
 from strands_robots.envelope import Envelope, error, is_error, success
-from strands_robots.hardware.arm_parts import arm_parts, model_name
 from strands_robots.hardware.body import READ_TRIES, DeviceBody
 from strands_robots.hardware.device_facts import (
+    arm_parts,
     feature_type,
     has_temperatures,
     is_picture,
     joint_units,
     kind,
+    model_name,
     stable_id,
+    stated_joints,
+    still_action,
     temperatures,
 )
-from strands_robots.hardware.stated_joints import stated_joints, still_action
 from strands_robots.hardware.stops import TaskStop, TorqueRelease, failure, unfrozen
-from strands_robots.kinematics.arm_parts import ArmParts
+from strands_robots.kinematics.arm_parts import ArmParts, StatedJoint
 from strands_robots.kinematics.arm_task import motion_rollout
-from strands_robots.kinematics.stated_joint import StatedJoint
 from strands_robots.policies import create_policy, resolve_provider
 from strands_robots.policies.base import Action, checked_action, is_velocity, numbers
-from strands_robots.policies.check_rows import RobotFacts
+from strands_robots.policies.check import RobotFacts
 from strands_robots.policies.profiled import ProfiledPolicy
 from strands_robots.policies.profiles import profiles
 from strands_robots.policies.rollout import Rollout, RolloutObservers, RolloutsEnd, rollout_options, unfollowed

@@ -1,15 +1,27 @@
-"""Contacts of an arm with itself and its table along a path."""
+"""Contacts of an arm along a path: with itself, its table, and the objects around it."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import mujoco
 import numpy as np
 
-from strands_robots.kinematics.chain import TABLE, Chain, Floats
+from strands_robots.kinematics.chain import (
+    BALL,
+    BOX,
+    CYLINDER,
+    TABLE,
+    Chain,
+    Floats,
+    ObstacleShape,
+    held_body,
+    place_obstacle,
+    spare_body,
+)
+from strands_robots.kinematics.objects import Held, SeenObject
 
 STEP_RAD = 0.02
 """Largest step of a joint between two checked poses (rad or m)."""
@@ -86,3 +98,55 @@ def dense(path: Floats) -> Floats:
         shares = np.arange(1, count + 1)[:, None] / count
         parts.append(before + shares * (after - before))
     return np.concatenate(parts)
+
+
+CLEARANCE_M = 0.003
+"""Distance that a path keeps from an object's sides."""
+
+FLAT_M = 0.002
+"""Height above the table up to which a fixed object is a table itself."""
+
+
+def beside(chain: Chain, seen: Sequence[SeenObject], held: Held | None = None) -> Chain:
+    """Return a chain whose model has objects as obstacles.
+
+    Args:
+        chain: it is not changed.
+        seen: objects in the base frame. One of them that is held is no obstacle.
+        held: what is between the jaws, which goes where the tip goes.
+    """
+    obstacles = [each for each in seen if not _is_table(chain, each) and (held is None or each.name != held.name)]
+    # The base of a robot that moves about is not where its model has it.
+    if chain.floats or not (obstacles or held):
+        return chain
+    model = chain.spares.model(len(obstacles))
+    objects = {}
+    for index, each in enumerate(obstacles):
+        body = spare_body(model, index)
+        objects[body] = each.name
+        turned = np.array([np.cos(each.yaw / 2), 0.0, 0.0, np.sin(each.yaw / 2)])
+        half = each.size / 2 + np.array([CLEARANCE_M, CLEARANCE_M, 0.0])
+        kind = CYLINDER if each.round else BOX
+        place_obstacle(model, body, ObstacleShape(kind, half, each.position, turned))
+    if held is not None and held.radius > 0:
+        body = held_body(model)
+        objects[body] = held.name
+        place_obstacle(model, body, _carried(chain, held))
+    return chain.beside(objects, model)
+
+
+def _carried(chain: Chain, held: Held) -> ObstacleShape:
+    """Return the shape of the held object in the frame of the body that has the tip."""
+    site, turn = chain.model.site_quat[chain.site], np.zeros(4)
+    rotation, quaternion = np.zeros(9), np.zeros(4)
+    mujoco.mju_quat2Mat(rotation, site)
+    position = chain.model.site_pos[chain.site] + rotation.reshape(3, 3) @ held.offset
+    if not held.half.any():
+        return ObstacleShape(BALL, np.full(3, held.radius), position, np.array([1.0, 0.0, 0.0, 0.0]))
+    mujoco.mju_mat2Quat(turn, np.ascontiguousarray(held.turn).ravel())
+    mujoco.mju_mulQuat(quaternion, site, turn)
+    return ObstacleShape(CYLINDER if held.round else BOX, held.half, position, quaternion)
+
+
+def _is_table(chain: Chain, each: SeenObject) -> bool:
+    return each.fixed and float(each.position[2] + each.size[2] / 2) <= chain.table_z + FLAT_M

@@ -1,19 +1,29 @@
-"""Loading of a robot model's file, bounded before MuJoCo reads it.
+"""A robot model's file: loaded within bounds, with its position servos and its tip.
 
 A file of a few kilobytes may ask for a million bodies, a mesh or a picture of gigabytes, or a depth at which the
 parser's stack ends and the process with it. All of that is counted in the XML and in the sizes of the files that it
 names, and is refused by name.
+
+The tip is the site that motions place, the first of these:
+
+1. The site or body that the caller names.
+2. A site called ``gripper_tip``.
+3. Of the sites with one of :data:`WORDS` in their name, that with the most actuated joints before it, at least three.
+4. The last body of the longest chain of actuated joints. Where fingers branch off an arm, the body that carries them.
 """
 
 from __future__ import annotations
 
 import math
+import re
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 from xml.parsers import expat
+
+import mujoco
 
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.utils import ValidationError, shown
@@ -272,3 +282,211 @@ def _numbers(text: str, name: str) -> list[float]:
 def _require(condition: object, why: str) -> None:
     if not condition:
         raise ModelBoundError(why)
+
+
+_HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE.value, mujoco.mjtJoint.mjJNT_SLIDE.value
+_ON_JOINT = (mujoco.mjtTrn.mjTRN_JOINT.value, mujoco.mjtTrn.mjTRN_JOINTINPARENT.value)
+
+
+@dataclass(frozen=True, slots=True)
+class JointDrive:
+    """One actuator on one joint.
+
+    Attributes:
+        actuator: its index, None for one that the model does not have.
+        factor: command of a position servo for one radian or metre of the joint.
+        offset: its command for the joint's zero.
+        kind: ``position servo``, or what else it is.
+    """
+
+    actuator: int | None
+    factor: float
+    offset: float
+    kind: str
+
+    @property
+    def servo(self) -> bool:
+        """True where a command is a position."""
+        return self.kind == POSITION
+
+
+POSITION = "position servo"
+
+
+def is_servo(model: Any, index: int) -> bool:
+    """Return True for a position servo: its bias pulls back with its length."""
+    return actuator_kind(model, index) == POSITION
+
+
+def servo_line(model: Any, index: int) -> tuple[float, float]:
+    """Return offset and slope of the command by which a servo keeps its length.
+
+    Its force is gain * command + bias[0] + bias[1] * length, and zero where it stands.
+    """
+    gain, (constant, pull) = float(model.actuator_gainprm[index][0]), model.actuator_biasprm[index][:2]
+    return (-float(constant) / gain, -float(pull) / gain) if gain else (0.0, 1.0)
+
+
+def actuator_kind(model: Any, index: int) -> str:
+    """Return what an actuator's command is, by its dynamics, gain and bias."""
+    dynamics, gain, bias = (
+        int(each[index]) for each in (model.actuator_dyntype, model.actuator_gaintype, model.actuator_biastype)
+    )
+    if mujoco.mjtDyn.mjDYN_MUSCLE.value == dynamics or mujoco.mjtGain.mjGAIN_MUSCLE.value == gain:
+        return "muscle"
+    if int(model.actuator_trntype[index]) == mujoco.mjtTrn.mjTRN_BODY.value:
+        return "adhesion"
+    if dynamics == mujoco.mjtDyn.mjDYN_INTEGRATOR.value:
+        return "velocity servo"
+    if gain != mujoco.mjtGain.mjGAIN_FIXED.value or model.actuator_gainprm[index][0] == 0:
+        return "general actuator"
+    if bias == mujoco.mjtBias.mjBIAS_NONE.value:
+        return "torque motor"
+    pull, brake = (float(value) for value in model.actuator_biasprm[index][1:3])
+    if bias == mujoco.mjtBias.mjBIAS_AFFINE.value and pull < 0:
+        return POSITION
+    return "velocity servo" if brake < 0 else "general actuator"
+
+
+def drives(model: Any) -> dict[int, JointDrive]:
+    """Return the actuator of each hinge or slide by the joint's index.
+
+    A position servo precedes other actuators of its joint. An actuator of a tendon counts where that is of one joint.
+    A model without actuators describes an arm that has its own: each joint counts as a position servo.
+    """
+    if not model.nu:
+        single = (each for each in range(model.njnt) if int(model.jnt_type[each]) in (_HINGE, _SLIDE))
+        return {joint: JointDrive(None, 1.0, 0.0, POSITION) for joint in single}
+    found: dict[int, JointDrive] = {}
+    for index in range(model.nu):
+        joint, ratio = _joint(model, index)
+        if joint < 0 or not ratio or int(model.jnt_type[joint]) not in (_HINGE, _SLIDE):
+            continue
+        offset, slope = servo_line(model, index)
+        drive = JointDrive(index, slope * ratio, offset, actuator_kind(model, index))
+        if joint not in found or (drive.servo and not found[joint].servo):
+            found[joint] = drive
+    return found
+
+
+def _joint(model: Any, index: int) -> tuple[int, float]:
+    """Return an actuator's joint, -1 for none, and its length per radian or metre."""
+    kind, target = int(model.actuator_trntype[index]), int(model.actuator_trnid[index][0])
+    gear = float(model.actuator_gear[index][0])
+    if kind in _ON_JOINT:
+        return target, gear
+    if kind == mujoco.mjtTrn.mjTRN_TENDON.value and int(model.tendon_num[target]) == 1:
+        wrap = int(model.tendon_adr[target])
+        if int(model.wrap_type[wrap]) == mujoco.mjtWrap.mjWRAP_JOINT.value:
+            return int(model.wrap_objid[wrap]), gear * float(model.wrap_prm[wrap])
+    return -1, 0.0
+
+
+WORDS = frozenset({"tip", "tcp", "ee", "eef", "effector", "pinch", "grip", "gripper", "attachment"})
+"""Words of a site's name that make it a tip; names are split at everything but letters and digits."""
+
+ARM_JOINTS_MIN = 3
+"""Fewest joints that place a tip at a point."""
+
+FINGER_JOINTS_MAX = 5
+"""Most joints of a finger."""
+
+_NAMES_SHOWN = 12
+
+_SINGLE = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+_JOINT_TRANSMISSIONS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+
+
+@dataclass(frozen=True)
+class _Node:
+    """One body, and how many actuated joints lead to it."""
+
+    body: Any
+    joints: int
+    jointed: bool
+    children: tuple[_Node, ...]
+
+    @property
+    def below(self) -> int:
+        """Actuated joints of its longest branch below it."""
+        return max((child.joints + child.below - self.joints for child in self.children), default=0)
+
+    def nodes(self) -> Iterator[_Node]:
+        yield self
+        for child in self.children:
+            yield from child.nodes()
+
+    @property
+    def moves(self) -> bool:
+        return any(node.jointed for node in self.nodes())
+
+
+def mark_tip(spec: Any, tip: str = "") -> str:
+    """Return the name of the tip's site, which is added where the tip is a body.
+
+    Args:
+        spec: the model, which is changed.
+        tip: name of a site or a body; empty for the rule of this module.
+
+    Returns:
+        The site's name; empty for a model without a site for it and without an actuated joint.
+
+    Raises:
+        ValidationError: the model has no site and no body called ``tip``.
+    """
+    actuated = {each.target for each in spec.actuators if each.trntype in _JOINT_TRANSMISSIONS}
+    tree = _tree(spec.worldbody, 0, actuated if spec.actuators else None)
+    if tip:
+        return _named(tree, tip)
+    sites = [(node, str(site.name)) for node in tree.nodes() for site in node.body.sites]
+    for _, name in sites:
+        if name.endswith("gripper_tip"):
+            return name
+    worded = [(node.joints, name) for node, name in sites if WORDS & set(re.split(r"[^a-z0-9]+", name.lower()))]
+    joints, name = max(worded, key=lambda each: each[0], default=(0, ""))
+    if joints >= ARM_JOINTS_MIN:
+        return name
+    end = _end(tree)
+    return "" if end is None else _site_of(end.body, {name for _, name in sites})
+
+
+def _tree(body: Any, joints: int, actuated: set[str] | None) -> _Node:
+    own = [joint for joint in body.joints if joint.type in _SINGLE]
+    joints += sum(actuated is None or joint.name in actuated for joint in own)
+    return _Node(body, joints, bool(own), tuple(_tree(child, joints, actuated) for child in body.bodies))
+
+
+def _end(tree: _Node) -> _Node | None:
+    """Return the end of the longest actuated chain, or what carries its fingers."""
+    node = tree
+    if not node.below:
+        return None
+    while node.below:
+        fingers = sum(child.moves for child in node.children) > 1 and node.below <= FINGER_JOINTS_MAX
+        if fingers and node.joints >= ARM_JOINTS_MIN and node.joints > node.below:
+            break
+        node = max(node.children, key=lambda child: child.joints + child.below)
+    return node
+
+
+def _named(tree: _Node, tip: str) -> str:
+    sites = {str(site.name) for node in tree.nodes() for site in node.body.sites}
+    if tip in sites:
+        return tip
+    bodies = [node.body for node in tree.nodes()][1:]
+    body = next((each for each in bodies if each.name == tip), None)
+    if body is None:
+        known = [*sorted(sites - {""}), *(str(each.name) for each in bodies if each.name)]
+        more = f" and {len(known) - _NAMES_SHOWN} more" if len(known) > _NAMES_SHOWN else ""
+        raise ValidationError(
+            f"tip must be a site or a body of the model ({', '.join(known[:_NAMES_SHOWN])}{more}), not {shown(tip)}."
+        )
+    return _site_of(body, sites)
+
+
+def _site_of(body: Any, taken: set[str]) -> str:
+    name = "tip"
+    while name in taken:
+        name += "_"
+    body.add_site(name=name)
+    return name

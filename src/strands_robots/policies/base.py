@@ -59,6 +59,14 @@ class Paced(Protocol):
         """Skip the actions of control steps that came too late to be made."""
 
 
+@runtime_checkable
+class Counted(Protocol):
+    """Policy that counts what its loop did."""
+
+    def counts(self) -> Mapping[str, float]:
+        """Return the figures by name, as events, status and recordings have them."""
+
+
 def follows_instruction(policy: Policy) -> bool:
     """Return False for a policy that moves by itself, whatever it was told."""
     return getattr(policy, "follows_instruction", True) is not False

@@ -13,8 +13,7 @@ from typing import Any
 from strands_robots.contract import RolloutEvent
 from strands_robots.policies import create_policy
 from strands_robots.policies.base import Action, PolicyError, Ranges
-from strands_robots.policies.check import statements_of
-from strands_robots.policies.check_rows import RobotFacts
+from strands_robots.policies.check import RobotFacts, statements_of
 from strands_robots.policies.profiled import ProfiledPolicy
 from strands_robots.policies.profiles import Profile
 from strands_robots.policies.rollout import Rollout, RolloutObservers

@@ -1,23 +1,42 @@
 """A LeRobot checkpoint as a policy, computed in this process.
 
+LeRobot imports transformers, which replaces its own entry in ``sys.modules`` while it is being imported. A second
+thread that imports it meanwhile, such as one that loads a policy while another loads an arm's driver, gets a module
+without names.
+
 Calls are those of LeRobot 0.4.4 to 0.6.1: ``lerobot.policies.factory`` and ``lerobot.policies.utils``. A checkpoint
 does not say which joints it moves, so it is used through a profile alone.
 """
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Mapping
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from strands_robots.policies.base import Action, PolicyError, Ranges
 from strands_robots.policies.decoding import read_json
-from strands_robots.policies.lerobot_imports import LEROBOT_IMPORTS, lerobot_import
 from strands_robots.policies.profiles import Profile
 from strands_robots.policies.warm import WarmModels
 from strands_robots.utils import ValidationError, missing_extra, shown
+
+LEROBOT_IMPORTS = threading.RLock()
+"""Held by every import of LeRobot in this package."""
+
+
+def lerobot_import(name: str) -> ModuleType:
+    """Import a module of LeRobot's while no other thread does.
+
+    Raises:
+        ModuleNotFoundError: LeRobot, or something that the module needs, is not installed.
+    """
+    with LEROBOT_IMPORTS:
+        return import_module(name)
+
 
 STATE, ENVIRONMENT, IMAGES = "observation.state", "observation.environment_state", "observation.images."
 

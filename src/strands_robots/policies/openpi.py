@@ -23,6 +23,7 @@ from strands_robots.policies.decoding import ForeignDataError, decode_msgpack
 from strands_robots.policies.policy_server import (
     PolicyServerError,
     ServedPolicy,
+    ServerSocket,
     actions_of,
     compare,
     numbers_of,
@@ -30,7 +31,6 @@ from strands_robots.policies.policy_server import (
     wait_for_answer,
 )
 from strands_robots.policies.profiles import Profile
-from strands_robots.policies.server_socket import ServerSocket
 from strands_robots.policies.warm import WarmModels
 from strands_robots.utils import ValidationError, optional_module, shown
 

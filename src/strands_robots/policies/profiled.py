@@ -1,27 +1,285 @@
-"""A policy as its profile describes it: order, units, pictures and speed bound."""
+"""A policy as its profile describes it: order, units, pictures, speed bound, chunks in time.
+
+A position counts the policy's own steps, of which there are ``rate`` in a second. It goes on only while an action is
+played, so a robot that waits for its policy misses nothing of the path. A chunk begins at the position of its
+observation: what was played while it was computed is stale and is never played.
+"""
 
 from __future__ import annotations
 
 import logging
 import math
+import queue
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from importlib import import_module
 from typing import Any, Protocol, runtime_checkable
 
 from strands_robots.policies.base import Action, Policy, PolicyError, Ranges, SpeedLimit, is_velocity, numbers
-from strands_robots.policies.check import CONVERTIBLE, PolicyCheckError, check_policy, statements_of
-from strands_robots.policies.check_rows import RobotFacts
-from strands_robots.policies.inference import Inference, InferenceWorker, InlineInference
-from strands_robots.policies.loop_counts import LoopCounts
-from strands_robots.policies.playback import Playback
+from strands_robots.policies.check import CONVERTIBLE, PolicyCheckError, RobotFacts, check_policy, statements_of
 from strands_robots.policies.profiles import CameraMap, Profile
-from strands_robots.policies.warm import Warmable, require_warm
+from strands_robots.policies.warm import Warmable, computing, require_warm
 from strands_robots.safety.gate import MotionRefused
 from strands_robots.utils import ValidationError, missing_extra, number, shown
 
+LATENCIES = 10
+"""Latencies of which the worst decides when to ask."""
+
+_EXACT = 1e-6
+"""Part of a step that is none: 50 Hz and 25 Hz meet at every second tick."""
+
+
+class Playback:
+    """Position in a policy's steps, and the chunk that is played there.
+
+    Args:
+        rate: the policy's steps a second.
+        hz: control steps a second, at least ``rate``; between two actions it interpolates.
+        horizon: actions that are played of each chunk; None for all.
+    """
+
+    def __init__(self, *, rate: float, hz: float, horizon: int | None = None) -> None:
+        self.position = 0.0
+        self.stale = 0
+        """Actions that came too late to be played."""
+        self._rate = rate
+        self._hz = hz
+        self._horizon = horizon
+        self._actions: Sequence[Action] = ()
+        self._base = 0.0
+        self._end = 0.0
+        self._observed_at: float | None = None
+        self._playing = False
+        self._latencies: deque[float] = deque(maxlen=LATENCIES)
+
+    @property
+    def latency_s(self) -> float:
+        """The worst of the last latencies; 0 before the first."""
+        return max(self._latencies, default=0.0)
+
+    @property
+    def delay(self) -> int:
+        """Steps that will be played before an answer that is asked for now has come."""
+        return math.ceil(self.latency_s * self._rate - _EXACT)
+
+    @property
+    def played(self) -> int:
+        """Actions of the present chunk that were played or are stale."""
+        return min(len(self._actions), math.ceil(self.position - self._base - _EXACT))
+
+    @property
+    def left(self) -> float:
+        """Steps until the chunk is over."""
+        return self._end - self.position
+
+    def advance(self, ticks: int = 1) -> None:
+        """Go on by ``ticks`` control steps, more than one where some were missed."""
+        if not self._playing:
+            return
+        self.position = min(self.position + ticks * self._rate / self._hz, self._end)
+        if self._end - self.position < _EXACT:
+            self.position = self._end
+        self._playing = False
+
+    def due(self, ahead: int = 0) -> bool:
+        """Return True when it is time to ask, ``ahead`` control steps from now."""
+        # One step more, because an answer is played at the control step after it came.
+        lead = self.delay + (1 if self.latency_s > 0 else 0)
+        if lead >= self._end - self._base:
+            # The whole answer would be stale; the robot has to wait for it anyway.
+            lead = 0
+        return self.left - ahead * self._rate / self._hz <= lead + _EXACT
+
+    def take(self, actions: Sequence[Action], asked_at: float, observed_at: float, latency_s: float) -> int:
+        """Replace the chunk by one that was asked for at the position ``asked_at``.
+
+        Returns the number of its actions that are stale.
+        """
+        self._latencies.append(latency_s)
+        usable = len(actions) if self._horizon is None else min(len(actions), self._horizon)
+        stale = min(usable, math.ceil(self.position - asked_at - _EXACT))
+        self.stale += stale
+        if stale < usable:
+            self._actions, self._base, self._end = actions, asked_at, asked_at + usable
+            self._observed_at = observed_at
+        return stale
+
+    def play(self) -> Action | None:
+        """Return the action of this position, None where the chunk is over."""
+        at = self.position - self._base
+        if self.left < _EXACT or not self._actions:
+            return None
+        self._playing = True
+        first = math.floor(at + _EXACT)
+        part = at - first
+        if part < _EXACT or first + 1 >= len(self._actions):
+            return dict(self._actions[first])
+        before, after = self._actions[first], self._actions[first + 1]
+        return {key: value + part * (after[key] - value) for key, value in before.items()}
+
+    def age_s(self, now: float) -> float:
+        """Return the age of the observation that the present chunk answers, in seconds."""
+        return 0.0 if self._observed_at is None else now - self._observed_at
+
+    def clear(self) -> None:
+        """Drop the chunk."""
+        self._actions, self._end = (), self.position
+        self._playing = False
+
+
 logger = logging.getLogger(__name__)
+
+Infer = Callable[[Any], Any]
+"""Computes the answer to one request; may take long, and may raise."""
+
+
+@dataclass(frozen=True)
+class InferenceResult:
+    """The answer to a request, or what was raised instead, and how long it took."""
+
+    value: Any
+    failure: BaseException | None
+    latency_s: float
+
+
+class Inference(Protocol):
+    """Asks a model; no call waits for it."""
+
+    def ask(self, request: Any) -> None:
+        """Ask; there must be no request in flight."""
+
+    def answer(self) -> InferenceResult | None:
+        """Return the answer, once, when it is there."""
+
+    @property
+    def waited_s(self) -> float | None:
+        """Seconds since the request in flight, None without one."""
+
+    def close(self) -> None:
+        """Drop the request in flight and its answer."""
+
+
+class InferenceWorker:
+    """Inference on a thread of its own, which begins with the first request.
+
+    Args:
+        name: named in the thread and in the log.
+        infer: called on the thread.
+        finish: called once when no inference runs any more, as the last thing: it may free the model.
+        now: monotonic time in seconds.
+    """
+
+    def __init__(
+        self, name: str, infer: Infer, finish: Callable[[], None], now: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._name = name
+        self._infer = infer
+        self._finish = finish
+        self._now = now
+        self._asked_at: float | None = None
+        self._requests: queue.SimpleQueue[tuple[Any] | None] = queue.SimpleQueue()
+        self._answers: queue.SimpleQueue[InferenceResult] = queue.SimpleQueue()
+        self._thread: threading.Thread | None = None
+        self._closed = False
+
+    def ask(self, request: Any) -> None:
+        if self._closed:
+            return
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._run, name=f"inference-{self._name}", daemon=True)
+            self._thread.start()
+        self._asked_at = self._now()
+        self._requests.put((request,))
+
+    def answer(self) -> InferenceResult | None:
+        try:
+            answer = self._answers.get_nowait()
+        except queue.Empty:
+            return None
+        self._asked_at = None
+        return None if self._closed else answer
+
+    @property
+    def waited_s(self) -> float | None:
+        return None if self._asked_at is None else self._now() - self._asked_at
+
+    def close(self) -> None:
+        """Drop the request in flight; the model is freed once it has returned."""
+        if self._closed:
+            return
+        self._closed = True
+        if self._thread is None:
+            self._finish()
+            return
+        waited = self.waited_s
+        if waited is not None:
+            logger.info("The policy %s has been computing for %.1f s; its answer is dropped.", self._name, waited)
+        self._requests.put(None)
+
+    def _run(self) -> None:
+        try:
+            while (request := self._requests.get()) is not None and not self._closed:
+                began = self._asked_at if self._asked_at is not None else self._now()
+                value, failure = None, None
+                try:
+                    with computing(f"The inference of the policy {self._name}"):
+                        value = self._infer(request[0])
+                except BaseException as exc:  # noqa: BLE001 - raised again in the control thread
+                    failure = exc
+                self._answers.put(InferenceResult(value, failure, self._now() - began))
+        finally:
+            self._finish()
+
+
+class InlineInference:
+    """Inference in the calling thread, for a clock that is moved by hand.
+
+    Args:
+        infer: called by :meth:`ask`.
+        finish: called by :meth:`close`.
+        now: time in seconds.
+        latency_s: seconds of that time after which an answer is there.
+    """
+
+    def __init__(
+        self, infer: Infer, finish: Callable[[], None], now: Callable[[], float], latency_s: float = 0.0
+    ) -> None:
+        self._infer = infer
+        self._finish = finish
+        self._now = now
+        self._latency_s = latency_s
+        self._asked_at: float | None = None
+        self._answer: InferenceResult | None = None
+        self._closed = False
+
+    def ask(self, request: Any) -> None:
+        self._asked_at = self._now()
+        value, failure = None, None
+        try:
+            value = self._infer(request)
+        except Exception as exc:  # noqa: BLE001 - raised again where the answer is fetched
+            failure = exc
+        self._answer = InferenceResult(value, failure, self._latency_s)
+
+    def answer(self) -> InferenceResult | None:
+        if self._asked_at is None or self._now() - self._asked_at < self._latency_s - 1e-9:
+            return None
+        answer, self._answer, self._asked_at = self._answer, None, None
+        return answer
+
+    @property
+    def waited_s(self) -> float | None:
+        return None if self._asked_at is None else self._now() - self._asked_at
+
+    def close(self) -> None:
+        self._answer = self._asked_at = None
+        if not self._closed:
+            self._closed = True
+            self._finish()
+
 
 UNBOUNDED_PER_S = 10.0
 """Speed bound of a key without a range, in its unit a second."""
@@ -30,6 +288,63 @@ LOAD_POLL_S = 0.05
 
 GRACE_S = 0.1
 """Seconds beyond the deadline in which a provider may say by itself why it did not answer."""
+
+
+COUNTED_LATENCIES = 1000
+"""Latencies of which the quantiles are taken."""
+
+
+@dataclass
+class LoopCounts:
+    """Counts of one rollout; times in seconds.
+
+    Attributes:
+        inferences: answers that came.
+        underruns: how often no action was there in time; ``underrun_steps`` has the control steps without one.
+        stale_actions: actions that came too late to be played.
+        speed_limited_steps: steps that the profile's ``max_speed`` held back.
+        chunk_age_s: age of the observation behind the last action; ``chunk_age_max_s`` the greatest.
+    """
+
+    inferences: int = 0
+    underruns: int = 0
+    underrun_steps: int = 0
+    stale_actions: int = 0
+    speed_limited_steps: int = 0
+    chunk_age_s: float = 0.0
+    chunk_age_max_s: float = 0.0
+    latencies: deque[float] = field(default_factory=lambda: deque(maxlen=COUNTED_LATENCIES))
+
+    def answered(self, latency_s: float) -> None:
+        """Count an answer."""
+        self.inferences += 1
+        self.latencies.append(latency_s)
+
+    def aged(self, seconds: float) -> None:
+        """Note the age of the chunk that an action was taken of."""
+        self.chunk_age_s = seconds
+        self.chunk_age_max_s = max(self.chunk_age_max_s, seconds)
+
+    def as_dict(self) -> dict[str, float]:
+        """Return the figures by name."""
+        ordered = sorted(self.latencies) or [0.0]
+        return {
+            "inferences": self.inferences,
+            "latency_ms": round(1000 * (self.latencies[-1] if self.latencies else 0.0), 2),
+            "latency_p50_ms": round(1000 * _quantile(ordered, 0.5), 2),
+            "latency_p99_ms": round(1000 * _quantile(ordered, 0.99), 2),
+            "latency_max_ms": round(1000 * ordered[-1], 2),
+            "chunk_age_s": round(self.chunk_age_s, 3),
+            "chunk_age_max_s": round(self.chunk_age_max_s, 3),
+            "underruns": self.underruns,
+            "underrun_steps": self.underrun_steps,
+            "stale_actions": self.stale_actions,
+            "speed_limited_steps": self.speed_limited_steps,
+        }
+
+
+def _quantile(ordered: list[float], share: float) -> float:
+    return ordered[min(len(ordered) - 1, int(share * len(ordered)))]
 
 
 @runtime_checkable

@@ -25,8 +25,7 @@ from typing import Any, NoReturn
 
 from strands_robots.policies.base import Action, Ranges, checked_action, numbers
 from strands_robots.policies.decoding import ForeignDataError, decode_json, decode_msgpack
-from strands_robots.policies.policy_server import CHUNK_MAX, SLICE_S, PolicyServerError
-from strands_robots.policies.server_socket import ServerSocket
+from strands_robots.policies.policy_server import CHUNK_MAX, SLICE_S, PolicyServerError, ServerSocket
 from strands_robots.utils import ValidationError, choice, dial_host_error, flag, number, optional_module, shown, whole
 
 _module = partial(optional_module, what="The remote policy", extra="remote")

@@ -20,6 +20,7 @@ from strands_robots.contract import Observer, RolloutEvent, Unsubscribe
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.policies.base import (
     Action,
+    Counted,
     Paced,
     Policy,
     PolicyError,
@@ -30,7 +31,6 @@ from strands_robots.policies.base import (
     is_velocity,
     numbers,
 )
-from strands_robots.policies.loop_counts import Counted
 from strands_robots.safety.gate import Permit, PermitVoidError
 from strands_robots.safety.stopping import READ_EVERY_S, PendingVerdict, StopVerdict, halt_each
 from strands_robots.safety.turns import shorten_turns

@@ -1,4 +1,4 @@
-"""One robot of a simulated world: observations, actions, base and units."""
+"""One robot of a simulated world: observations, actions, base, units, objects around it."""
 
 from __future__ import annotations
 
@@ -13,16 +13,41 @@ import numpy as np
 
 from strands_robots.kinematics.arm import Arm
 from strands_robots.kinematics.arm_parts import ArmParts
-from strands_robots.kinematics.chain import Chain
+from strands_robots.kinematics.chain import Chain, Floats
+from strands_robots.kinematics.objects import SeenObject
 from strands_robots.policies.base import Observation, checked_speeds
 from strands_robots.safety.gate import Permit
-from strands_robots.simulation.catalog import ModelSource
 from strands_robots.simulation.engine import mujoco
-from strands_robots.simulation.fitting import load_named
-from strands_robots.simulation.pacing import WorldClock
-from strands_robots.simulation.physics import Physics, Snapshot
-from strands_robots.simulation.stage import Actuator, RobotParts
+from strands_robots.simulation.model import Actuator, RobotParts, load_named
+from strands_robots.simulation.physics import Physics, Snapshot, WorldClock
+from strands_robots.simulation.scene import ModelSource, ObjectPlan
 from strands_robots.utils import ValidationError, mapping, number, w_positive, yaw_of
+
+
+def targets_of(snapshot: Snapshot, base: dict[str, Any]) -> list[SeenObject]:
+    """Return the objects in the frame of ``base``, a ``RobotBody.base_pose``."""
+    data = snapshot.data()
+    cosine, sine = np.cos(base["theta"]), np.sin(base["theta"])
+    into_base = np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    origin = np.array([base["x"], base["y"], base["z"]])
+    found = []
+    for item in snapshot.stage.plan.objects:
+        body = data.body(item.name)
+        position = into_base @ (body.xpos - origin)
+        yaw = yaw_of([float(v) for v in body.xquat]) - float(base["theta"])
+        yaw = float((yaw + np.pi) % (2 * np.pi) - np.pi)
+        found.append(SeenObject(item.name, position, yaw, _extents(item), item.shape != "box", item.fixed))
+    return found
+
+
+def _extents(item: ObjectPlan) -> Floats:
+    """Return the extents of an upright object along its own axes (m)."""
+    x, y, z = item.size
+    if item.shape == "box":
+        return 2 * np.array([x, y, z])
+    half = {"sphere": x, "cylinder": y, "capsule": x + y}[item.shape]
+    return 2 * np.array([x, x, half])
+
 
 WORLD_CAMERAS = ("front", "table")
 """Cameras of the world that every robot observes with, besides its own."""

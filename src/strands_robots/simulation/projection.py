@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from strands_robots.simulation.engine import mujoco
+from strands_robots.simulation.model import Floats, Stage
 from strands_robots.simulation.rendering import CameraView
-from strands_robots.simulation.stage import Floats, Stage
 
 Pixels = NDArray[np.float32]
 

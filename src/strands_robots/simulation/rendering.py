@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from strands_robots.errors import StrandsRobotsError
-from strands_robots.simulation import gl
-from strands_robots.simulation.engine import BACKEND, mujoco
+from strands_robots.simulation.engine import BACKEND, mujoco, remedy
+from strands_robots.simulation.model import MAX_HEIGHT, MAX_WIDTH, Floats, Stage
 from strands_robots.simulation.physics import Snapshot
-from strands_robots.simulation.stage import MAX_HEIGHT, MAX_WIDTH, Floats, Stage
 from strands_robots.utils import ValidationError, shown
 
 Picture = NDArray[np.uint8]
@@ -195,7 +194,7 @@ class Renderer:
         except Exception as exc:
             # Each OpenGL binding raises its own kind when its library or driver is missing.
             why = " ".join(str(exc).split())[:200]
-            raise RenderingError(f"no OpenGL picture (MUJOCO_GL={BACKEND or 'unset'}: {why}); {gl.remedy()}.") from exc
+            raise RenderingError(f"no OpenGL picture (MUJOCO_GL={BACKEND or 'unset'}: {why}); {remedy()}.") from exc
         return self._contexts[key]
 
 

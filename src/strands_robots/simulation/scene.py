@@ -1,82 +1,268 @@
-"""Files of a motion: a picture with the gripper's path, and a short animation."""
+"""The contents of a world as data, made from checked arguments, and the sources of robot models."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import importlib
+import importlib.util
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
-import numpy as np
-from PIL import Image
+from strands_robots.kinematics.model_file import load_model
+from strands_robots.utils import ValidationError, alike, choice, flag, identifier, number, shown, text
 
-from strands_robots.simulation.rendering import Picture
-from strands_robots.simulation.world import Simulation
-from strands_robots.utils import ValidationError
+MODELS = Path(__file__).parents[1] / "models"
+BUILT_IN = ("so100", "so101", "rover")
+"""Models that come with the package; nothing is downloaded for them."""
+
+ALIASES = {
+    "so_arm100": "so100",
+    "so-100": "so100",
+    "so100_follower": "so100",
+    "so_arm101": "so101",
+    "so-101": "so101",
+    "so101_follower": "so101",
+}
+
+_SUFFIXES = (".xml", ".mjcf", ".urdf")
 
 
-def save_picture(picture: Picture, path: str | Path) -> Path:
-    """Write an RGB picture (height, width, 3) in the format of the path's suffix."""
-    target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(picture).save(target)
-    return target
+@dataclass(frozen=True, slots=True)
+class ModelSource:
+    """A model's label and its file."""
+
+    label: str
+    path: Path
+
+    def load(self) -> Any:
+        """Return a fresh ``MjSpec``. Raises :class:`ValidationError` with the reason."""
+        return load_model(self.path, self.label)
 
 
-def save_animation(frames: Sequence[Picture], path: str | Path, fps: float = 12.5) -> Path:
-    """Write pictures of one size as an endless GIF; ``fps`` is from 1 to 50.
+def find(model: object) -> ModelSource:
+    """Return the source of a built-in name, a file, or a ``robot_descriptions`` name.
 
     Raises:
-        ValidationError: no frames, or ``fps`` out of its domain.
+        ValidationError: no such model; the message names similar ones.
     """
-    if not frames:
-        raise ValidationError("frames must hold at least one picture.")
-    if not 1 <= fps <= 50:
-        raise ValidationError(f"fps must be from 1 to 50, not {fps!r}.")
-    target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    # One palette for all frames: a palette each makes still parts flicker.
-    sample = Image.fromarray(np.concatenate([frames[0], frames[len(frames) // 2], frames[-1]]))
-    palette = sample.quantize(colors=192, method=Image.Quantize.MEDIANCUT)
-    images = [Image.fromarray(f).quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG) for f in frames]
-    images[0].save(target, save_all=True, append_images=images[1:], duration=round(1000 / fps), loop=0, optimize=True)
-    return target
+    if isinstance(model, Path):
+        model = str(model)
+    if not isinstance(model, str) or not model.strip() or len(model) > 4096 or "\0" in model:
+        raise ValidationError(f"model must be a model's name or the path of an MJCF or URDF file, not {shown(model)}.")
+    name = ALIASES.get(model.lower(), model.lower())
+    if name in BUILT_IN:
+        return ModelSource(name, MODELS / f"{name}.xml")
+    if model.lower().endswith(_SUFFIXES) or "/" in model:
+        return _find_file(model)
+    return _find_description(model)
 
 
-class Recording:
-    """Frames of a motion with the gripper's path, taken by :meth:`capture`."""
+def _find_file(model: str) -> ModelSource:
+    path = Path(model).expanduser()
+    if not path.is_file():
+        raise ValidationError(f"model must be an existing MJCF or URDF file; there is no {shown(model)}.")
+    if path.suffix.lower() not in _SUFFIXES:
+        raise ValidationError(f"model must end in {', '.join(_SUFFIXES)}, not {shown(model)}.")
+    return ModelSource(path.stem, path)
 
-    def __init__(
-        self,
-        world: Simulation,
+
+def _find_description(model: str) -> ModelSource:
+    names = _description_names()
+    for candidate in (model, f"{model}_mj_description", f"{model}_description"):
+        if candidate in names:
+            # Importing one of these modules fetches the description unless its cache has it.
+            try:
+                module = importlib.import_module(f"robot_descriptions.{candidate}")
+            except Exception as exc:  # that package clones with git, whose failures have no common type
+                raise ValidationError(f"model {shown(model)} cannot be fetched: {_first_line(exc)}") from exc
+            path = getattr(module, "MJCF_PATH", None) or getattr(module, "URDF_PATH", None)
+            if isinstance(path, str):
+                return ModelSource(model, Path(path))
+    similar = alike(model.lower(), [*BUILT_IN, *ALIASES, *names], most=5)
+    hint = f"near it: {', '.join(similar)}" if similar else f"known: {', '.join(BUILT_IN)}"
+    raise ValidationError(f"model {shown(model)} is not known; {hint}. A path to an MJCF or URDF file works too.")
+
+
+def _description_names() -> list[str]:
+    if importlib.util.find_spec("robot_descriptions") is None:
+        return []
+    return sorted(importlib.import_module("robot_descriptions").DESCRIPTIONS)
+
+
+def _first_line(exc: BaseException) -> str:
+    text = " ".join(str(exc).split())
+    return text[:300] or type(exc).__name__
+
+
+Triple = tuple[float, float, float]
+
+REACH_M = 100.0
+"""Largest coordinate of anything that is placed, in metres."""
+
+SPACING_M = 0.45
+"""Distance between robots that are added without a position, in metres."""
+
+SHAPES = {"box": 3, "sphere": 1, "cylinder": 2, "capsule": 2}
+"""How many sizes each shape of an object has."""
+
+TURN_RAD = 6.2831853072
+"""Largest yaw of anything that is placed, in radians."""
+
+_RESERVED = ("floor", "world")
+
+
+@dataclass(frozen=True, slots=True)
+class RobotPlan:
+    """One robot: ``position`` in m, ``yaw`` in rad, ``tip`` a site or a body."""
+
+    name: str
+    source: ModelSource
+    position: Triple = (0.0, 0.0, 0.0)
+    yaw: float = 0.0
+    tip: str = ""
+
+    @classmethod
+    def checked(
+        cls, name: object, model: str | Path | None, position: object, yaw: object, tip: object = ""
+    ) -> RobotPlan:
+        """Check a robot, and find its model, which may be fetched.
+
+        :meth:`Simulation.add_robot` has the domains.
+
+        Raises:
+            ValidationError: an argument outside its domain, or no such model.
+        """
+        label = identifier("name", name)
+        heading = number("yaw", yaw, low=-TURN_RAD, high=TURN_RAD)
+        source = find(name if model is None else model)
+        place = (0.0, 0.0, 0.0) if position is None else _triple("position", position)
+        return cls(label, source, place, heading, text("tip", tip, longest=128, empty=True))
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectPlan:
+    """One object of primitive shape: metres, kilograms, radians, colour from 0 to 1."""
+
+    name: str
+    shape: str
+    size: Triple
+    position: Triple
+    color: tuple[float, float, float, float]
+    mass: float
+    fixed: bool
+    yaw: float = 0.0
+
+    @classmethod
+    def checked(
+        cls,
         *,
-        camera: str = "overview",
-        width: int = 480,
-        height: int = 360,
-        robot_name: str | None = None,
-    ) -> None:
-        self._world = world
-        self._camera = camera
-        self._size = (width, height)
-        self._robot = robot_name
-        self.frames: list[Picture] = []
-        self.path: list[tuple[float, float, float]] = []
-        self.how = ""
+        name: object,
+        shape: object,
+        size: object,
+        position: object,
+        color: object,
+        mass: object,
+        fixed: object,
+        yaw: object = 0.0,
+    ) -> ObjectPlan:
+        """Check an object; see :meth:`Simulation.add_object` for the domains.
 
-    def trace(self) -> None:
-        """Add the gripper's place to the path; cheap enough for every control step."""
-        self.path.append(self._world.tip_position(self._robot))
+        Raises:
+            ValidationError: an argument outside its domain.
+        """
+        kind = choice("shape", shape, tuple(SHAPES))
+        return cls(
+            identifier("name", name),
+            kind,
+            _sizes(kind, size),
+            _triple("position", position),
+            _colour(color),
+            number("mass", mass, low=1e-4, high=1000),
+            flag("fixed", fixed),
+            number("yaw", yaw, low=-TURN_RAD, high=TURN_RAD),
+        )
 
-    def capture(self) -> None:
-        """Take a frame, with the path so far drawn over it."""
-        self.trace()
-        frame, self.how = self._world.picture(self._camera, *self._size, path=self.path)
-        self.frames.append(frame)
 
-    def save_picture(self, path: str | Path, width: int = 960, height: int = 720) -> Path:
-        """Write the present world, larger, with the whole path."""
-        self.trace()
-        picture, self.how = self._world.picture(self._camera, width, height, path=self.path)
-        return save_picture(picture, path)
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """Everything in the world.
 
-    def save_animation(self, path: str | Path, fps: float = 12.5) -> Path:
-        """Write the captured frames as a GIF."""
-        return save_animation(self.frames, path, fps)
+    ``timestep`` in seconds, ``gravity`` in m/s² along z, ``density`` in kg/m³ and ``viscosity`` in Pa·s of the medium.
+    """
+
+    timestep: float = 0.002
+    gravity: float = -9.81
+    density: float = 0.0
+    viscosity: float = 0.0
+    robots: tuple[RobotPlan, ...] = ()
+    objects: tuple[ObjectPlan, ...] = ()
+
+    @classmethod
+    def checked(cls, timestep: object, gravity: object, density: object, viscosity: object) -> Plan:
+        """Return an empty plan. Raises :class:`ValidationError`."""
+        return cls(
+            number("timestep", timestep, low=1e-4, high=2e-2),
+            number("gravity", gravity, low=-100, high=100),
+            number("density", density, low=0, high=20_000),
+            number("viscosity", viscosity, low=0, high=1000),
+        )
+
+    def with_robot(self, robot: RobotPlan, *, beside: bool = False) -> Plan:
+        """Add a robot, ``beside`` those that are there or where its plan says.
+
+        Raises:
+            ValidationError: its name is taken.
+        """
+        self._require_free(robot.name)
+        placed = replace(robot, position=(0.0, -SPACING_M * len(self.robots), 0.0)) if beside else robot
+        return replace(self, robots=(*self.robots, placed))
+
+    def without_robot(self, name: str) -> Plan:
+        """Remove a robot."""
+        return replace(self, robots=tuple(r for r in self.robots if r.name != name))
+
+    def with_object(self, item: ObjectPlan) -> Plan:
+        """Add an object. Raises :class:`ValidationError` where its name is taken."""
+        self._require_free(item.name)
+        return replace(self, objects=(*self.objects, item))
+
+    def without_object(self, name: object) -> Plan:
+        """Remove an object. Raises :class:`ValidationError` for an unknown name."""
+        names = [o.name for o in self.objects]
+        if name not in names:
+            raise ValidationError(f"name must be one of {names}, not {shown(name)}.")
+        return replace(self, objects=tuple(o for o in self.objects if o.name != name))
+
+    def _require_free(self, name: str) -> None:
+        if name in _RESERVED or name in {r.name for r in self.robots} | {o.name for o in self.objects}:
+            raise ValidationError(f"name {shown(name)} is taken; choose another.")
+
+
+def _triple(name: str, value: object) -> Triple:
+    if not isinstance(value, list | tuple) or len(value) != 3:
+        raise ValidationError(f"{name} must be three numbers, not {shown(value)}.")
+    x, y, z = (number(f"{name}[{i}]", v, low=-REACH_M, high=REACH_M) for i, v in enumerate(value))
+    return x, y, z
+
+
+def _colour(value: object) -> tuple[float, float, float, float]:
+    """Check red, green, blue and optionally alpha, each from 0 to 1."""
+    if not isinstance(value, list | tuple) or len(value) not in (3, 4):
+        raise ValidationError(f"color must be three or four numbers from 0 to 1, not {shown(value)}.")
+    r, g, b, a = (number(f"color[{i}]", v, low=0, high=1) for i, v in enumerate([*value, 1.0][:4]))
+    return r, g, b, a
+
+
+def _sizes(shape: str, value: object) -> Triple:
+    """Check a shape's sizes and add zeros up to three; a cube needs one number."""
+    count = SHAPES[shape]
+    values = list(value) if isinstance(value, list | tuple) else [value]
+    if count == 3 and len(values) == 1:
+        values = values * 3
+    if len(values) != count:
+        raise ValidationError(
+            f"size of a {shape} must be {count} number{'s' if count > 1 else ''} in metres, not {shown(value)}."
+        )
+    checked = [number(f"size[{i}]", v, low=0.001, high=10) for i, v in enumerate(values)]
+    x, y, z = [*checked, 0.0, 0.0][:3]
+    return x, y, z

@@ -10,9 +10,8 @@ from strands_robots.policies.settling import Settling, checked_rest_pose
 from strands_robots.safety.gate import MotionGate
 from strands_robots.safety.stopping import StopVerdict, checked_level
 from strands_robots.simulation.body import RobotBody
-from strands_robots.simulation.pacing import WorldClock
-from strands_robots.simulation.physics import Physics
-from strands_robots.simulation.stage import RobotParts
+from strands_robots.simulation.model import RobotParts
+from strands_robots.simulation.physics import Physics, WorldClock
 from strands_robots.utils import ValidationError, mapping
 
 

@@ -20,7 +20,7 @@ from strands_robots.kinematics.motion import Motion
 from strands_robots.kinematics.objects import SeenObject
 from strands_robots.policies import create_policy
 from strands_robots.policies.base import SPEED_MAX
-from strands_robots.policies.check_rows import RobotFacts
+from strands_robots.policies.check import RobotFacts
 from strands_robots.policies.profiled import ProfiledPolicy
 from strands_robots.policies.profiles import profiles
 from strands_robots.policies.rollout import (
@@ -35,14 +35,12 @@ from strands_robots.safety.gate import MotionGate, MotionRequest, Permit, Waitin
 from strands_robots.safety.halted_verbs import halted_with_verbs, verbs_to_end
 from strands_robots.safety.stop_targets import note_motion
 from strands_robots.safety.stopping import PendingVerdict, StopLevel, StopVerdict, halts_in_parts, read_verdict
-from strands_robots.simulation.body import PICTURE, RobotBody
-from strands_robots.simulation.objects import targets_of
-from strands_robots.simulation.pacing import WorldClock
-from strands_robots.simulation.physics import CHUNK, Physics
+from strands_robots.simulation.body import PICTURE, RobotBody, targets_of
+from strands_robots.simulation.model import compile_stage, in_floor, sunk_sentence
+from strands_robots.simulation.physics import CHUNK, Physics, WorldClock
 from strands_robots.simulation.pictures import PicturesMixin
-from strands_robots.simulation.plan import ObjectPlan, Plan, RobotPlan
 from strands_robots.simulation.rendering import Renderer, camera_names
-from strands_robots.simulation.stage import compile_stage, in_floor, sunk_sentence
+from strands_robots.simulation.scene import ObjectPlan, Plan, RobotPlan
 from strands_robots.simulation.stop_torque import StopTorque
 from strands_robots.stop_log import stop_logger
 from strands_robots.teleop_mixin import TeleopMixin
@@ -179,8 +177,8 @@ class Simulation(PicturesMixin, ArmMixin, TeleopMixin):
                 name; by default ``name``.
             position: of its base, metres; by default beside the robots that are there.
             yaw: heading, radians from -2π to 2π.
-            tip: site or body of the model that motions place; by default as :mod:`~strands_robots.kinematics.tip`
-                finds it.
+            tip: site or body of the model that motions place; by default as
+                :mod:`~strands_robots.kinematics.model_file` finds it.
 
         ``in_floor`` of the answer has the depth of each body that starts in the floor, metres.
         """

@@ -49,7 +49,7 @@ PARSERS = {
     "drivers/reachy/rest.py": BOUNDED,
     "fleet/mesh/standing.py": BOUNDED,
     "hardware/calibration.py": OWN_FILE,
-    "kinematics/places.py": OWN_FILE,
+    "kinematics/arm_task.py": OWN_FILE,
     "mesh/commands.py": BOUNDED,
     "mesh/input_receiver.py": BOUNDED,
     "mesh/missed.py": BOUNDED,

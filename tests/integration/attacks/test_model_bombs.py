@@ -14,7 +14,7 @@ import mujoco
 import pytest
 
 from strands_robots.kinematics import model_file
-from strands_robots.simulation import catalog
+from strands_robots.simulation import scene
 from strands_robots.utils import ValidationError
 
 Bomb = Callable[[Path], str]
@@ -169,7 +169,7 @@ def test_bomb_is_refused_by_name_before_mujoco_reads_it(
     monkeypatch.setattr(mujoco.MjSpec, "from_file", lambda path: pytest.fail("MuJoCo read it"))
     before, began = resource.getrusage(resource.RUSAGE_SELF), time.process_time()
     with pytest.raises(ValidationError, match="model 'model' is refused: ") as refused:
-        catalog.find(path).load()
+        scene.find(path).load()
     assert why in str(refused.value)
     assert time.process_time() - began < 5.0
     grown_mb = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before.ru_maxrss) / 1024
@@ -177,8 +177,8 @@ def test_bomb_is_refused_by_name_before_mujoco_reads_it(
 
 
 def test_models_that_come_with_the_package_are_within_the_bounds() -> None:
-    for name in catalog.BUILT_IN:
-        assert catalog.find(name).load().bodies
+    for name in scene.BUILT_IN:
+        assert scene.find(name).load().bodies
 
 
 def test_model_with_meshes_pictures_and_parts_loads(tmp_path: Path) -> None:
@@ -191,7 +191,7 @@ def test_model_with_meshes_pictures_and_parts_loads(tmp_path: Path) -> None:
     asset = '<compiler meshdir="parts"/><asset><mesh name="hull" file="hull.stl"/></asset><include file="more.xml"/>'
     text = world('<replicate count="10" offset="0 0 1"><body><geom type="mesh" mesh="hull"/></body></replicate>', asset)
     (tmp_path / "model.xml").write_text(text)
-    assert len(catalog.find(tmp_path / "model.xml").load().bodies) == 12
+    assert len(scene.find(tmp_path / "model.xml").load().bodies) == 12
 
 
 @pytest.mark.parametrize("text", ["", "<mujoco", "no model", "<mujoco>\0</mujoco>"])

@@ -16,13 +16,11 @@ from pathlib import Path
 
 import pytest
 
-from strands_robots.policies.groot import GrootPolicy
+from strands_robots.policies.groot import GrootPolicy, RequestSocket, ZmtpError
 from strands_robots.policies.openpi import OpenPiPolicy
-from strands_robots.policies.policy_server import PolicyServerError
+from strands_robots.policies.policy_server import PolicyServerError, ServerSocket
 from strands_robots.policies.profiles import CameraMap, Profile
 from strands_robots.policies.remote import RemotePolicy
-from strands_robots.policies.server_socket import ServerSocket
-from strands_robots.policies.zmtp import RequestSocket, ZmtpError
 
 KEYS = ("a", "b")
 DEADLINE_S = 0.3

@@ -13,8 +13,19 @@ from fixtures.feetech_bus import REGISTERS, FeetechBus, Packet, Parser, arm_serv
 from fixtures.feetech_bus.twin import ArmTwin
 from fixtures.waiting import eventually
 
-from strands_robots.hardware.emulated.packets import BROADCAST, OVERLOAD, PING, READ, SYNC_READ, SYNC_WRITE, WRITE
-from strands_robots.hardware.emulated.servo import CURRENT_UNIT_A, STALL_A, STALL_NM, STIFFNESS_NM
+from strands_robots.hardware.emulated import (
+    BROADCAST,
+    CURRENT_UNIT_A,
+    OVERLOAD,
+    PING,
+    READ,
+    STALL_A,
+    STALL_NM,
+    STIFFNESS_NM,
+    SYNC_READ,
+    SYNC_WRITE,
+    WRITE,
+)
 
 
 class Line:

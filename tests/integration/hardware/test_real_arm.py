@@ -15,7 +15,7 @@ from fixtures.feetech_bus import MOTORS, FeetechBus, arm_calibration, arm_servos
 from fixtures.waiting import eventually
 
 from strands_robots.hardware import _compat, body
-from strands_robots.hardware.emulated.arm import HIGH, LOW
+from strands_robots.hardware.emulated import HIGH, LOW
 from strands_robots.utils import ValidationError
 
 pytestmark = pytest.mark.system

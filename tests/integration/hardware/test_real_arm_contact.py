@@ -15,7 +15,7 @@ import pytest
 from fixtures.feetech_bus import REGISTERS, FeetechBus
 from fixtures.waiting import eventually
 
-from strands_robots.hardware.emulated.servo import COUNTS, STALL_A, STALL_NM
+from strands_robots.hardware.emulated import COUNTS, STALL_A, STALL_NM
 
 PAN, LIFT = 1, 2
 CONTACT_S = 0.3

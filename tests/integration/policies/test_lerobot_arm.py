@@ -96,7 +96,7 @@ def test_two_threads_import_a_policy_and_a_driver() -> None:
     program = (
         "import threading\n"
         "from strands_robots.hardware.lerobot_device import lerobot_module\n"
-        "from strands_robots.policies.lerobot_imports import lerobot_import\n"
+        "from strands_robots.policies.lerobot_local import lerobot_import\n"
         "loader = threading.Thread(target=lerobot_import, args=('lerobot.policies.factory',))\n"
         "loader.start()\n"
         "lerobot_module('lerobot.robots.so_follower')\n"

@@ -26,8 +26,7 @@ from fixtures.waiting import eventually, free_port
 
 from strands_robots.hardware import HardwareRobot
 from strands_robots.policies import create_policy
-from strands_robots.policies.lerobot_async import LeRobotAsyncConnection, LeRobotAsyncPolicy, _pieces
-from strands_robots.policies.pickled import pickled
+from strands_robots.policies.lerobot_async import LeRobotAsyncConnection, LeRobotAsyncPolicy, _pieces, pickled
 from strands_robots.policies.policy_server import PolicyServerError
 from strands_robots.policies.profiles import CameraMap, Profile, load_profiles
 from strands_robots.utils import ValidationError

@@ -67,7 +67,7 @@ def _run(screen: DemoScreen, report: DemoReport, output: Path) -> None:
     from strands_robots.device_connect.backends import loopback_config  # noqa: PLC0415
     from strands_robots.device_connect.safety_controller import safety_controller  # noqa: PLC0415
     from strands_robots.safety.ed25519 import load_signing_key  # noqa: PLC0415
-    from strands_robots.simulation.tabletop import TABLETOP  # noqa: PLC0415
+    from strands_robots.simulation import TABLETOP  # noqa: PLC0415
 
     port = free_port()
     screen.head(f"Another process serves a simulated {ROBOT} at a table; this one is the agent, by a script")

@@ -124,9 +124,8 @@ def draw_motion(
     Raises:
         CliError: nothing to draw, or the folder cannot be written.
     """
-    from strands_robots.simulation import Simulation  # noqa: PLC0415 - MuJoCo is loaded after the live part
-    from strands_robots.simulation.scene import Recording  # noqa: PLC0415 - as above
-    from strands_robots.simulation.tabletop import furnish  # noqa: PLC0415 - as above
+    from strands_robots.simulation import Simulation, furnish  # noqa: PLC0415 - MuJoCo is loaded after the live part
+    from strands_robots.simulation.pictures import Recording  # noqa: PLC0415 - as above
 
     moves = replayed(setpoints)
     if len(moves) < 2:

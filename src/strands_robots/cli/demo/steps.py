@@ -25,7 +25,7 @@ from strands_robots.policies.base import plain_numbers
 from strands_robots.safety.controller import SafetyController
 from strands_robots.safety.ed25519 import keygen
 from strands_robots.safety.resume import sign
-from strands_robots.simulation.tabletop import CUBE, PLATE
+from strands_robots.simulation import CUBE, PLATE
 
 NEEDED = ("getObjects", "getPicture", "pick", "place", "setGripper", "wait", "stop", "getStatus", "getFeatures")
 CONTROLLER = "demo-safety"
