@@ -11,7 +11,7 @@ from fixtures.driver_bench import DriverBench
 from fixtures.planes import own_plane
 
 from strands_robots.device_connect.bringup import driver_for
-from strands_robots.device_connect.mobile_base_driver import MobileBaseDeviceDriver
+from strands_robots.device_connect.robot_driver import MobileBaseDeviceDriver
 from strands_robots.drivers.ros import rtps_robot, velocity_publisher
 from strands_robots.drivers.ros.ackermann_robot import AckermannRosRobot
 from strands_robots.drivers.ros.mobile_base import MobileBaseRobot

@@ -10,7 +10,7 @@ import pytest
 from fixtures.driver_bench import DriverBench
 
 from strands_robots.device_connect.bringup import driver_for
-from strands_robots.device_connect.mobile_base_driver import MobileBaseDeviceDriver
+from strands_robots.device_connect.robot_driver import MobileBaseDeviceDriver
 from strands_robots.drivers.ros.mobile_base import MobileBaseRobot
 from strands_robots.ros.gate import CommandGate
 from strands_robots.ros.memory import MemoryLink

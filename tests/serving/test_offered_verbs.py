@@ -16,7 +16,7 @@ from fixtures.pan_tilt import ArmDevice, BarePanTilt, PanTilt
 from fixtures.toy_robots import ToyRobot, ToyWorld
 
 from strands_robots.contract import adapt
-from strands_robots.device_connect.mobile_base_driver import MobileBaseDeviceDriver
+from strands_robots.device_connect.robot_driver import MobileBaseDeviceDriver
 from strands_robots.drivers.reachy import ReachyDriver
 from strands_robots.drivers.ros.mobile_base import MobileBaseRobot
 from strands_robots.hardware import HardwareRobot

@@ -8,9 +8,12 @@ from typing import Any
 
 import pytest
 
-from strands_robots.device_connect.mobile_base_driver import MobileBaseDeviceDriver, NavigatingBaseDeviceDriver
 from strands_robots.device_connect.reachy_mini_driver import ReachyMiniDriver
-from strands_robots.device_connect.robot_driver import RobotDeviceDriver
+from strands_robots.device_connect.robot_driver import (
+    MobileBaseDeviceDriver,
+    NavigatingBaseDeviceDriver,
+    RobotDeviceDriver,
+)
 from strands_robots.device_connect.simulation_driver import SimulationDeviceDriver
 from strands_robots.mesh.security import validate_command
 from strands_robots.serving.arm_verbs import ARM_MOTION_VERBS, PICTURE_VERBS

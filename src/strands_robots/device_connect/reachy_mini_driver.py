@@ -86,17 +86,10 @@ class ReachyMiniDriver(RobotDriver):
             return super().status
         return DeviceStatus(availability=UNAVAILABLE, busy_score=0.0, error_state=away)
 
-    def heartbeat(self) -> dict[str, Any]:
-        """Fields of every heartbeat besides the id and the time."""
-        told = super().heartbeat()
-        return {**told, "availability": UNAVAILABLE} if self.activity.fault else told
-
-    async def refresh(self) -> Activity:
-        """Ask the robot again; the answer is what status and presence say from now on."""
-        activity = await super().refresh()
-        if activity.fault:
-            self.runtime.status["availability"] = UNAVAILABLE
-        return activity
+    def status_of(self, activity: Activity) -> dict[str, Any]:
+        """Return the fields of the status for an activity; a robot that is away is unavailable."""
+        fields = super().status_of(activity)
+        return {**fields, "availability": UNAVAILABLE} if activity.fault else fields
 
     async def connect(self) -> None:
         """Begin to connect; a daemon that is away is connected to when it appears."""
@@ -161,4 +154,4 @@ class ReachyMiniDriver(RobotDriver):
             await self.motionComplete(
                 name=event.instruction, state=event.state, detail=event.error, duration=round(event.elapsed_s, 3)
             )
-            self.wake()
+            self.reports.wake()

@@ -1,4 +1,4 @@
-"""A robot with one body as a device: its verbs, and the events of its tasks."""
+"""A robot with one body, or a mobile base, as a device: its verbs, and the events of its tasks."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from strands_robots.safety.approval import Approval
 from strands_robots.safety.authorization import Authorization
 from strands_robots.serving.pipeline import Command
 from strands_robots.serving.policy_arguments import profile_list
-from strands_robots.serving.robot_verbs import ARM_VERBS
+from strands_robots.serving.robot_verbs import ARM_VERBS, BASE_VERBS, NAVIGATING_BASE_VERBS
 from strands_robots.serving.verbs import Arguments, Verb
 
 
@@ -171,3 +171,16 @@ class RobotDeviceDriver(RobotDriver):
                 error=event.error,
                 loop=dict(event.loop),
             )
+
+
+class MobileBaseDeviceDriver(RobotDeviceDriver):
+    """A mobile base. Start it with drive, end it with stop."""
+
+    labels: ClassVar[Labels] = {"category": "mobile_base"}
+    verbs: ClassVar[Mapping[str, Verb]] = BASE_VERBS
+
+
+class NavigatingBaseDeviceDriver(MobileBaseDeviceDriver):
+    """A mobile base that was made with a ``nav_action``. Start it with drive or navigateTo, end it with stop."""
+
+    verbs: ClassVar[Mapping[str, Verb]] = NAVIGATING_BASE_VERBS

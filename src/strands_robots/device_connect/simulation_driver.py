@@ -22,7 +22,7 @@ from strands_robots.serving.robot_verbs import WORLD_VERBS, served_world, world_
 from strands_robots.serving.stops import WorldStop, robot_stop
 from strands_robots.serving.verbs import Verb
 
-Observed = tuple[float, int, dict[str, dict[str, float]]]
+Observed = tuple[float, int, Mapping[str, Mapping[str, float]]]
 """Simulated time, physics steps, and the joints of each robot."""
 
 
@@ -50,7 +50,6 @@ class SimulationDeviceDriver(RobotDriver):
         self.world = world
         self._model = world.tool_name_str
         self.device_type = stated_type(sim, self.device_type)
-        self._observed: dict[str, dict[str, float]] = {}
 
     @property
     def identity(self) -> DeviceIdentity:
@@ -151,41 +150,34 @@ class SimulationDeviceDriver(RobotDriver):
         """
 
     def glance(self) -> Activity:
-        """Return time, steps and policies of the world; store the joints for events."""
+        """Return time, steps, policies and joints of the world."""
         facts = fields_of(self.world.get_state())
         rows = self.world.list_policies_running()
         running = {str(row.get("robot", "")): {k: v for k, v in row.items() if k != "robot"} for row in rows}
         robots = facts.get("robots")
-        self._observed = {
-            str(name): plain_numbers(joints) for name, joints in (robots.items() if isinstance(robots, Mapping) else ())
+        joints = {
+            str(name): plain_numbers(each) for name, each in (robots.items() if isinstance(robots, Mapping) else ())
         }
         told = plain_numbers({key: facts.get(key) for key in ("sim_time", "step_count")})
-        return Activity(
-            bool(running),
-            {
-                "sim_time": told.get("sim_time", 0.0),
-                "step_count": int(told.get("step_count", 0)),
-                "running_policies": running,
-            },
-        )
-
-    def unchanged(self) -> bool:
-        """Look at the world, on a worker; False when its state or a joint is another one."""
-        observed = self._observed
-        return super().unchanged() and self._observed == observed
+        state = {
+            "sim_time": told.get("sim_time", 0.0),
+            "step_count": int(told.get("step_count", 0)),
+            "running_policies": running,
+        }
+        return Activity(bool(running), state, joints=joints)
 
     def watches(self) -> list[Any]:
         """State as every robot, and observations besides."""
         hz = settings.number("STRANDS_DC_OBSERVATION_HZ")
-        return [*super().watches(), self.reporting(self._look_at_joints, self._tell_observations, eq, hz, hz)]
+        return [*super().watches(), self.reports.watch(self._look_at_joints, self._tell_observations, eq, hz, hz)]
 
     async def tell(self, activity: Activity) -> None:
         """Emit ``stateUpdate``."""
         await self.stateUpdate(**activity.facts)
 
     async def _look_at_joints(self) -> Observed | None:
-        activity = await self.refresh()
-        return None if activity.fault else (activity.facts["sim_time"], activity.facts["step_count"], self._observed)
+        activity = await self.reports.refresh()
+        return None if activity.fault else (activity.facts["sim_time"], activity.facts["step_count"], activity.joints)
 
     async def _tell_observations(self, observed: Observed) -> None:
         sim_time, step_count, robots = observed
