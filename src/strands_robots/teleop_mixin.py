@@ -14,6 +14,7 @@ from strands_robots.policies.rollout import STOP_JOIN_S, Body, Rollout, RolloutO
 from strands_robots.safety.gate import MotionGate, Permit, Waiting, answered
 from strands_robots.teleoperators.leader import FULL_RANGES_PER_S, InputSink, LeaderPolicy
 from strands_robots.utils import ValidationError, choice, flag, identifier, number, teleoperator_contract_error
+from strands_robots.utils import duration as checked_duration
 
 METHODS = ("arm", "gamepad", "keyboard", "phone")
 
@@ -97,7 +98,7 @@ class TeleopMixin:
             hz: frames a second, 1 to 1000.
             publish: also carry the leader's frames on the network.
         """
-        seconds = None if duration is None else number("duration", duration, above=0, high=3600)
+        seconds = None if duration is None else checked_duration("duration", duration)
         rate = number("hz", hz, low=1, high=1000)
         sink = self._teleop_sink(flag("publish", publish))
         permit = self.gate.permit("teleoperate")

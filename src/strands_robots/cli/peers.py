@@ -19,7 +19,7 @@ from strands_robots.fleet.adapter import FIND_S
 from strands_robots.fleet.callers import SOURCE
 from strands_robots.fleet.networks import STILL
 from strands_robots.serving.advertised import QUICK, STOPS, TEXTS, VERBS, WAITING
-from strands_robots.utils import WAIT_S, ValidationError, identifier, number
+from strands_robots.utils import WAIT_S, ValidationError, duration, identifier, number
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -155,7 +155,7 @@ def call(
     """
     given = arguments or []
     params = assignments(given)
-    stated = None if timeout is None else number("--timeout", timeout, above=0, high=3600)
+    stated = None if timeout is None else duration("--timeout", timeout)
     flags = f"{' --mesh' if on_mesh else ''}{network.flags}"
     with network.joined(on_mesh=on_mesh, source=source, in_turn=function in STILL - STOPS) as there:
         try:

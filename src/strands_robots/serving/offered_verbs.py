@@ -17,10 +17,8 @@ from strands_robots.serving.arm_verbs import ARM_MOTION_VERBS
 from strands_robots.serving.verbs import (
     LEASE_NAMES,
     POLICY_PROVIDER,
-    REQUIRED,
     Arguments,
     Kind,
-    Parameter,
     Verb,
     described,
 )
@@ -215,12 +213,7 @@ def _served(body: object, declared: DeclaredVerb) -> Verb:
         name,
         Kind.MOTION if declared.motion else Kind.READ,
         declared.summary,
-        tuple(
-            Parameter(
-                each.name, each.type, each.meaning, each.check, REQUIRED if each.required else each.default, each.schema
-            )
-            for each in declared.parameters
-        ),
+        declared.parameters,
         returns=declared.returns,
         begin=begin,
         lasts=declared.lasts > 0,

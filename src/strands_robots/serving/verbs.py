@@ -15,13 +15,10 @@ from strands_robots.contract import for_request
 from strands_robots.safety.gate import MotionRequest
 from strands_robots.safety.resume import is_epoch
 from strands_robots.utils import DURATION_MAX_S, ValidationError, duration, identifier, number, shown, text, whole
-from strands_robots.verb_parameters import JSON_TYPES
+from strands_robots.verb_parameters import JSON_TYPES, REQUIRED, Check, Parameter, checked_arguments
 
 Arguments = Mapping[str, Any]
 """Checked arguments, by parameter."""
-
-Check = Callable[[str, object], Any]
-"""Gives the value that is used, or raises :class:`ValidationError` naming parameter, value and domain."""
 
 Run = Callable[[Any, Arguments], object]
 """Carries a verb out on a robot; returns an envelope. What it raises is reported as a failure inside the device."""
@@ -31,9 +28,6 @@ Begin = Callable[[Any, Arguments, MotionRequest | None], object]
 
 Suits = Callable[[Any], bool]
 """Says whether a robot can carry a verb out now."""
-
-REQUIRED: Any = object()
-"""Stands for the default of a parameter that has none."""
 
 
 class Kind(Enum):
@@ -50,24 +44,6 @@ class Kind(Enum):
 
     RESUME = "resume"
     """Authorized by what it brings: the operator's signature, or the secret of a lease."""
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """One parameter of a verb.
-
-    Attributes:
-        meaning: a line for callers, with the unit and the domain.
-        type: the Python type that its schema is made from.
-        schema: JSON Schema of a robot's own verb; the others have that of their type.
-    """
-
-    name: str
-    type: type
-    meaning: str
-    check: Check
-    default: Any = REQUIRED
-    schema: Mapping[str, Any] | None = None
 
 
 LEASE_ID = "lease_id"
@@ -166,7 +142,7 @@ class Verb:
     own: bool = False
     lasts_s: float = 0.0
     by_name: Mapping[str, Parameter] = field(init=False, repr=False, compare=False)
-    _required: frozenset[str] = field(init=False, repr=False, compare=False)
+    _defaults: Mapping[str, Any] = field(init=False, repr=False, compare=False)
     leased: bool = field(init=False, repr=False, compare=False)
     """True for a motion of the lease's holder alone; it takes :data:`OF_THE_LEASE`."""
 
@@ -176,8 +152,7 @@ class Verb:
             more = [replace(each, default=None) if self.drops_unknown else each for each in OF_THE_LEASE]
             object.__setattr__(self, "parameters", (*self.parameters, *more))
         object.__setattr__(self, "by_name", {each.name: each for each in self.parameters})
-        required = frozenset(each.name for each in self.parameters if each.default is REQUIRED)
-        object.__setattr__(self, "_required", required)
+        object.__setattr__(self, "_defaults", {each.name: each.default for each in self.parameters})
 
     def carry_out(self, robot: Any, arguments: Arguments, request: MotionRequest | None = None) -> object:
         """Carry the verb out with a robot, and return its answer.
@@ -197,9 +172,10 @@ class Verb:
     def unfit(self, names: Collection[str]) -> str | None:
         """Return the reason why arguments of these names do not fit, or None."""
         unknown = [name for name in names if name not in self.by_name]
-        missing = [each for each in self.by_name if each in self._required and each not in names]
-        if not unknown and not missing:
-            return None
+        missing = [each.name for each in self.parameters if each.default is REQUIRED and each.name not in names]
+        return self._unfit(unknown, missing) if unknown or missing else None
+
+    def _unfit(self, unknown: list[str], missing: list[str]) -> str:
         takes = ", ".join(name for name in self.by_name if name not in LEASE_NAMES) or "no parameters"
         problem = f"it has no {', '.join(unknown)}" if unknown else f"{', '.join(missing)} is missing"
         return f"{self.name} takes {takes}: {problem}."
@@ -212,12 +188,7 @@ class Verb:
         """
         if self.drops_unknown:
             given = {name: value for name, value in given.items() if name in self.by_name and value is not None}
-        if not (self._required <= given.keys() <= self.by_name.keys()):
-            raise ValidationError(str(self.unfit(given)))
-        arguments = {
-            name: each.check(name, given[name]) if name in given else each.default
-            for name, each in self.by_name.items()
-        }
+        arguments = {**self._defaults, **checked_arguments(self.by_name, given, self._unfit)}
         return {name: value for name, value in arguments.items() if value is not None or not self.drops_unknown}
 
     def readable(self, given: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
