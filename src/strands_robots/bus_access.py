@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import threading
 import weakref
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from strands_robots.policies.base import numbers
@@ -70,22 +70,31 @@ def read_joints(device: Any) -> dict[str, float]:
     Else, as of a base that computes its speed, the numbers of a whole observation, which a failing camera fails.
     Raises what the device raises.
     """
+    return joint_reader(device)()
+
+
+def joint_reader(device: Any) -> Callable[[], dict[str, float]]:
+    """Return what reads the joints of a device as :func:`read_joints` does; its buses are looked for once."""
     source = joint_read_source(device)
     if source is None:
-        return {}
-    with bus_lock(source):
-        own = getattr(source, "get_joints", None)
-        answer = own() if callable(own) else None
-        if answer is not None and "status" not in answer:
-            return numbers(answer)
-        buses = motor_buses(source)
-        if not buses:
-            return numbers(source.get_observation())
-        joints: dict[str, float] = {}
-        for prefix, bus in buses:
-            positions = bus.sync_read("Present_Position")
-            joints |= numbers({f"{prefix}{name}.pos": positions[name] for name in bus.motors})
-        return joints
+        return dict
+    lock, buses = bus_lock(source), motor_buses(source)
+
+    def read() -> dict[str, float]:
+        with lock:
+            own = getattr(source, "get_joints", None)
+            answer = own() if callable(own) else None
+            if answer is not None and "status" not in answer:
+                return numbers(answer)
+            if not buses:
+                return numbers(source.get_observation())
+            joints: dict[str, float] = {}
+            for prefix, bus in buses:
+                positions = bus.sync_read("Present_Position")
+                joints |= numbers({f"{prefix}{name}.pos": positions[name] for name in bus.motors})
+            return joints
+
+    return read
 
 
 def read_currents(device: Any) -> dict[str, float]:

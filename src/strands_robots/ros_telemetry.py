@@ -260,7 +260,7 @@ class RosTelemetryBase:
             # Whatever was commanded then, the arm may be elsewhere now.
             state: dict[str, Any] = getattr(self._robot, "get_state", dict)()
             start = {**start, **numbers(state.get("joints") or {})}
-        limit = SpeedLimit(dict.fromkeys(action, (-math.inf, math.inf)), 1.0, self._max_speed)
+        limit = SpeedLimit.of_ranges(dict.fromkeys(action, (-math.inf, math.inf)), 1.0, self._max_speed)
         cut = limit.limit(action, start, min(max(since, self._period_s), STREAM_S))
         if cut != action:
             logger.info("A command on %s is cut to %g a second: %s.", self.command_topic, self._max_speed, cut)

@@ -136,7 +136,8 @@ class TeleopMixin:
 
     def teleoperated_by(self, robot: str) -> str:
         """Return the leader that drives the body of that name; empty when none does."""
-        return next((name for name, each in self.teleoperating().items() if each.robot == robot), "")
+        sessions = list(self._teleop_sessions.items())
+        return next((name for name, (each, _) in sessions if each.robot == robot and each.running), "")
 
     def void_leaders(self, robot: str) -> None:
         """Void the waiting starts of all leaders of the body of that name."""

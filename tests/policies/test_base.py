@@ -65,7 +65,7 @@ def test_plain_numbers_of_a_value_that_is_no_mapping_are_empty(value: object) ->
 
 @given(st.floats(-5, 5), st.floats(-5, 5), st.floats(0.001, 0.1))
 def test_speed_limit_bounds_every_step(before: float, wanted: float, dt: float) -> None:
-    limit = SpeedLimit(RANGES, full_ranges_per_s=2.0, unbounded_per_s=10.0)
+    limit = SpeedLimit.of_ranges(RANGES, full_ranges_per_s=2.0, unbounded_per_s=10.0)
     after = limit.limit({"a": wanted, "b": wanted}, {"a": before, "b": before}, dt)
     assert abs(after["a"] - before) <= 4 * dt + 1e-9
     assert abs(after["b"] - before) <= 10 * dt + 1e-9

@@ -63,7 +63,7 @@ def world() -> Iterator[Simulation]:
 def run(world: Simulation, name: str, **arguments: Any) -> dict[str, Any]:
     verb = WORLD_MOTION_VERBS[name]
     checked = verb.checked(arguments)
-    answer = verb.carry_out(world, {key: value for key, value in checked.items() if not key.startswith("lease_")})
+    answer = verb.call(world, {key: value for key, value in checked.items() if not key.startswith("lease_")})()
     assert isinstance(answer, dict)
     return answer
 

@@ -36,11 +36,11 @@ from strands_robots.safety.stop_executor import stop_executor
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.control import ControlChange
 from strands_robots.serving.offered_verbs import Offers, own_verbs
-from strands_robots.serving.pipeline import Command, Pipeline, Result
+from strands_robots.serving.pipeline import Command, Pipeline, Result, busy
 from strands_robots.serving.stop_arguments import noted
 from strands_robots.serving.stops import stop_within
 from strands_robots.serving.verbs import REQUIRED, Arguments, Kind, Verb, described, labels_of, text_of
-from strands_robots.serving.workers import called, loop_future
+from strands_robots.serving.workers import ShareFullError, called, loop_future
 from strands_robots.stop_log import stop_logger
 from strands_robots.utils import START_S, WAIT_S, ValidationError, shown, text
 
@@ -156,6 +156,8 @@ class RobotDriver(CollectedOnce):
             own={"resume": self.stops.resume, "getStatus": self._status},
         )
         self.runtime: Any = None
+        self.policy_provider = ""
+        """Of the last motion that was asked for, for a robot that tells no events."""
         self._watchers: list[asyncio.Task[None]] = []
         self._unsubscribe: Unsubscribe | None = None
         self._end_control: Callable[[], None] = lambda: None
@@ -183,17 +185,20 @@ class RobotDriver(CollectedOnce):
             return error(problem) if problem else await super().invoke(function_name, **params)
         caller = params.pop("source_device", None)
         moves = verb.kind is Kind.MOTION
+        command = self.pipeline.arrived(verb, params, caller)
         answered, hand_over = loop_future()
-        request = self.pipeline.receive(verb, params, caller, hand_over)
         try:
+            self.pipeline.share(verb).submit(partial(self.pipeline.serve, command, hand_over))
             # Not wait_for: in Python 3.11 it forgets a cancellation that comes together with the answer.
             within_s = (START_S if moves else READ_DEADLINE_S) + (verb.lasts_s or WAIT_S if verb.lasts else 0.0)
             async with asyncio.timeout(within_s):
                 result: Result = await answered
+        except ShareFullError:
+            result = busy(command)
         except TimeoutError:
             # This command alone: to revoke the gate without a halt would leave what moves with its last command.
-            if request is not None:
-                request.give_up()
+            if command.request is not None:
+                command.request.give_up()
             return error(f"The robot did not answer {verb.name} in time; what it may still start is void.")
         if moves and result.refusal is None:
             logger.info("%s: %s by caller %s (self-declared).", self.peer_id, verb.name, shown(caller))
@@ -204,16 +209,16 @@ class RobotDriver(CollectedOnce):
         """Refuse a caller or a policy that is not allowed; return the caller's name."""
         if command.verb.kind is not Kind.MOTION:
             return ()
-        refusal = self.authorization.motion(command.caller, command.verb.name)
-        if refusal is None and "policy_provider" in arguments:
-            refusal = self.authorization.provider(arguments["policy_provider"])
+        provider = arguments.get("policy_provider", "")
+        self.policy_provider = provider or self.policy_provider
+        refusal = self.authorization.motion(command.caller, command.verb.name, provider)
         if refusal is not None:
             raise Refused(RefusalReason.CALLER, refusal)
         return (caller_name(command.caller) or ANONYMOUS,)
 
     def _status(self, arguments: Arguments, request: MotionRequest | None) -> object:
         """The robot's status with its lockouts, the dead-man check-in and who holds it."""
-        answer = self.verbs["getStatus"].carry_out(self.robot, arguments)
+        answer = self.verbs["getStatus"].call(self.robot, arguments)()
         if not isinstance(answer, dict):
             return answer
         lockouts = self.stops.facts(arguments.get("nonce", ""))

@@ -16,10 +16,9 @@ from strands_robots.envelope import fields_of
 from strands_robots.policies.base import plain_numbers
 from strands_robots.safety.approval import Approval
 from strands_robots.safety.authorization import Authorization
-from strands_robots.serving.pipeline import Command
 from strands_robots.serving.policy_arguments import profile_list
 from strands_robots.serving.robot_verbs import ARM_VERBS, BASE_VERBS, NAVIGATING_BASE_VERBS
-from strands_robots.serving.verbs import Arguments, Verb
+from strands_robots.serving.verbs import Verb
 
 
 class RobotDeviceDriver(RobotDriver):
@@ -48,7 +47,6 @@ class RobotDeviceDriver(RobotDriver):
         wrapped = body_of(task_robot)
         self.device_type = stated_type(wrapped, self.device_type)
         self._tells = callable(getattr(wrapped, "subscribe", None))
-        self._provider = ""
         self._began: float | None = None
 
     @property
@@ -60,12 +58,6 @@ class RobotDeviceDriver(RobotDriver):
             model=self._model,
             description=f"Robot {self._model}{profile_list()}",
         )
-
-    def authorize(self, command: Command, arguments: Arguments) -> tuple[str, ...]:
-        """Refuse as every device does; note the policy for a robot without events."""
-        callers = super().authorize(command, arguments)
-        self._provider = arguments.get("policy_provider", self._provider)
-        return callers
 
     @emit()
     async def taskStarted(self, instruction: str, policy_provider: str, follows_instruction: bool = True) -> None:
@@ -142,7 +134,7 @@ class RobotDeviceDriver(RobotDriver):
         runs = activity.facts["task_status"] in RUNNING and instruction not in self.own_verbs
         if runs and self._began is None:
             self._began = time.monotonic()
-            await self.taskStarted(instruction=instruction, policy_provider=self._provider)
+            await self.taskStarted(instruction=instruction, policy_provider=self.policy_provider)
         elif not runs and self._began is not None:
             duration, self._began = time.monotonic() - self._began, None
             state = activity.facts["task_status"]

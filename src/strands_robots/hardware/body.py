@@ -11,7 +11,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial
 from typing import Any, TypeVar
 
-from strands_robots.bus_access import action_ranges, bus_lock, motor_buses, read_currents, read_joints, write_joints
+from strands_robots.bus_access import action_ranges, bus_lock, joint_reader, motor_buses, read_currents, write_joints
 from strands_robots.hardware._compat import drop, forget_input, stop_base, unplugged
 from strands_robots.hardware.calibration import answer_lost, write_to_servos
 from strands_robots.hardware.device_facts import default_speeds, require_port
@@ -83,7 +83,8 @@ class DeviceBody:
         self.lock = bus_lock(device)
         self.bounds = {**action_ranges(device), **_checked(joint_ranges or {}, device)}
         positions = [key for key in self.bounds if not is_velocity(key)]
-        self._speeds = {} if speed_limit is None else checked_speeds(speed_limit, positions)
+        self._speed_limit = {} if speed_limit is None else checked_speeds(speed_limit, positions)
+        self._look_at_device()
         self._latest: tuple[float, dict[str, float]] | None = None
         self.targets: dict[str, float] = {}
         """What it was told last by an action, by key; empty once it was frozen or let go."""
@@ -94,11 +95,6 @@ class DeviceBody:
         self._current_lost = False
         self.driven = False
         """True from an action until it was frozen or let go."""
-
-    @property
-    def speeds(self) -> dict[str, float]:
-        """Greatest speed by action key: as given, else 2 rad/s for an angle."""
-        return default_speeds(self.device) | self._speeds
 
     @property
     def lost(self) -> bool:
@@ -130,9 +126,16 @@ class DeviceBody:
             elif self.is_connected and hasattr(self.device, "is_connected"):
                 return
             self.bring_up(self.device)
+            self._look_at_device()
             self._lost, self._was_connected = False, True
             # A driver that connects switches the torque on.
             self._limp = set()
+
+    def _look_at_device(self) -> None:
+        """Find its buses, and how fast its joints may be by the calibration that it has now."""
+        self._read_joints = joint_reader(self.device)
+        self.speeds = default_speeds(self.device) | self._speed_limit
+        """Greatest speed by action key: as given, else 2 rad/s for an angle."""
 
     @staticmethod
     def bring_up(device: Any) -> None:
@@ -159,13 +162,18 @@ class DeviceBody:
             self._latest = (began, numbers(observation))
             return observation
 
-    def get_joints(self, tries: int = READ_TRIES) -> dict[str, float]:
+    def get_joints(self, tries: int = READ_TRIES, *, urgent: bool = False) -> dict[str, float]:
         """Read the joints; repeat after a lost answer unless a stop waits for the bus.
+
+        Args:
+            urgent: repeat all the same, for this is the stop.
 
         Raises what the device raises.
         """
         with self.lock:
-            return self._joints(tries)
+            joints = self._exchange(self._read_joints, tries, urgent=urgent)
+            self._latest = (time.monotonic(), joints)
+            return dict(joints)
 
     def get_positions(self) -> dict[str, float]:
         """Read the joints, which are called as the action keys are."""
@@ -306,11 +314,6 @@ class DeviceBody:
     def running(self) -> AbstractContextManager[None]:
         return nullcontext()
 
-    def _joints(self, tries: int, *, urgent: bool = False) -> dict[str, float]:
-        joints = self._exchange(lambda: read_joints(self.device), tries, urgent=urgent)
-        self._latest = (time.monotonic(), joints)
-        return dict(joints)
-
     def _exchange(self, exchange: Callable[[], T], tries: int = READ_TRIES, *, urgent: bool = False) -> T:
         """Repeat an exchange after a lost answer unless a stop waits for the bus."""
         for left in reversed(range(tries)):
@@ -342,12 +345,12 @@ class DeviceBody:
             self._stop_base(still)
         age, known = self.latest_joints or (math.inf, {})
         try:
-            present = self._joints(1)
+            present = self.get_joints(1)
         except ConnectionError:
             # One silent motor must not leave the others running to their goals while it is asked again.
             if age <= HOLD_FRESH_S and (targets := still | self._targets(known)):
                 write_joints(self.device, targets)
-            present = self._joints(READ_TRIES, urgent=urgent)
+            present = self.get_joints(READ_TRIES, urgent=urgent)
         targets = still | self._targets(present)
         if targets:
             # LeRobot cannot send an action to an arm of which no motor is in it.

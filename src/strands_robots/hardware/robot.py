@@ -620,9 +620,11 @@ class HardwareRobot(ArmMixin, TeleopMixin):
         permit = self.gate.permit(verb, request)
         with self._waiting.until_begun(permit), self.starting:
             permit.check()
-            self._stand_by()
+            if not self._ready:
+                self._stand_by()
             self._free()
-            self._reconnect()
+            if self._body.lost:
+                self._reconnect()
             if not self._body.is_connected:
                 raise ValidationError(f"{self.tool_name_str} is not connected; connect() it first.")
             task = self._task = made(permit)
@@ -631,8 +633,6 @@ class HardwareRobot(ArmMixin, TeleopMixin):
 
     def _reconnect(self) -> None:
         """Connect again before a motion, if the port is back."""
-        if not self._body.lost:
-            return
         try:
             self._body.connect()
         except Exception as exc:

@@ -297,7 +297,7 @@ class Children:
             def begin(arguments: Arguments, request: MotionRequest | None) -> object:
                 if arguments.get("robot_name", name) != name:
                     return error(f"robot_name must be {name}, or be left out.")
-                return verb.carry_out(self._world, {**arguments, **named}, request)
+                return verb.call(self._world, {**arguments, **named}, request)()
 
             return begin
 

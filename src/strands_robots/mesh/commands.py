@@ -21,10 +21,11 @@ from strands_robots.safety.identity import SigningIdentity
 from strands_robots.safety.peer_answers import with_stop_statement
 from strands_robots.safety.stopping import Outcome, StopVerdict, explain, grade
 from strands_robots.serving.peer_verbs import PEER_VERBS, peer_stop_answer, run_to_end
-from strands_robots.serving.pipeline import Command, Own, Pipeline, Result
+from strands_robots.serving.pipeline import Command, Own, Pipeline, Result, busy
 from strands_robots.serving.stops import Request as StopRequest
 from strands_robots.serving.stops import StopRequests, robot_stop, stop_within
 from strands_robots.serving.verbs import Arguments, Kind, Verb
+from strands_robots.serving.workers import ShareFullError
 from strands_robots.stop_log import stop_logger
 from strands_robots.utils import RESERVED_IDS, ValidationError, shown
 
@@ -213,7 +214,11 @@ class CommandReceiver:
             # It reaches nothing below the mesh, so it waits for no worker and no worker waits for it.
             self._pipeline.serve(Command(verb, given, request.sender_id, proof=request), answered)
             return
-        self._pipeline.receive(verb, given, request.sender_id, answered, request)
+        command = self._pipeline.arrived(verb, given, request.sender_id, request)
+        try:
+            self._pipeline.share(verb).submit(partial(self._pipeline.serve, command, answered))
+        except ShareFullError:
+            answered(busy(command))
 
     def _refuse_retained(self, request: wire.Request, key: str) -> None:
         """Refuse a command that a broker stored; no peer waits for its answer.

@@ -81,7 +81,7 @@ def status_of(robot: Robot, facts: Callable[[str], Mapping[str, Any]]) -> Own:
     """
 
     def status(arguments: Arguments, request: MotionRequest | None) -> object:
-        answer = PEER_VERBS["status"].carry_out(robot, arguments)
+        answer = PEER_VERBS["status"].call(robot, arguments)()
         return {**answer, **facts(arguments.get("nonce", ""))} if isinstance(answer, Mapping) else answer
 
     return status

@@ -46,10 +46,11 @@ def resolve_provider(provider: object) -> str:
     Raises:
         ValidationError: no such provider; the message names similar ones.
     """
-    names = policy_names()
     name = ALIASES.get(provider, provider) if isinstance(provider, str) else ""
-    if name in names:
+    # Plug-ins come last: to find them reads the disk.
+    if name in _BUILT_IN or name in profiles() or name in _plug_ins():
         return name
+    names = policy_names()
     similar = alike(str(name), names)
     hint = f" Did you mean {' or '.join(similar)}?" if similar else ""
     raise ValidationError(f"policy_provider must be one of {', '.join(names)}, not {shown(provider)}.{hint}")

@@ -172,26 +172,29 @@ def checked_speeds(value: object, keys: Iterable[str]) -> dict[str, float]:
 
 
 class SpeedLimit:
-    """Bound on how fast each target may change, in units a second of its key.
+    """Bound on how fast each target may change.
 
     Args:
-        ranges: a key with a finite range may cross it ``full_ranges_per_s`` times a second.
-        full_ranges_per_s: above 0.
-        unbounded_per_s: bound of a key without a range, in its unit a second.
+        per_s: greatest speed by action key, in its unit a second; a key that is not named has no bound.
     """
 
-    def __init__(self, ranges: Ranges, full_ranges_per_s: float, unbounded_per_s: float) -> None:
-        self._per_s: dict[str, float] = {
-            key: (high - low) * full_ranges_per_s if math.isfinite(high - low) else unbounded_per_s
-            for key, (low, high) in ranges.items()
-        }
+    def __init__(self, per_s: Mapping[str, float]) -> None:
+        self._per_s = dict(per_s)
 
     @classmethod
-    def per_second(cls, speeds: Mapping[str, float]) -> SpeedLimit:
-        """Return the bound of each key's own speed; a key that is not named has none."""
-        made = cls({}, 1.0, 1.0)
-        made._per_s = dict(speeds)
-        return made
+    def of_ranges(cls, ranges: Ranges, full_ranges_per_s: float, unbounded_per_s: float) -> SpeedLimit:
+        """Bound a key with a finite range by how often it may cross it in a second, any other by a speed.
+
+        Args:
+            full_ranges_per_s: above 0.
+            unbounded_per_s: of a key without a range, in its unit a second.
+        """
+        return cls(
+            {
+                key: (high - low) * full_ranges_per_s if math.isfinite(high - low) else unbounded_per_s
+                for key, (low, high) in ranges.items()
+            }
+        )
 
     def limit(self, target: Action, last: Mapping[str, float], dt: float) -> Action:
         """Return ``target``, moved no further from ``last`` than ``dt`` seconds allow.

@@ -458,7 +458,9 @@ class ProfiledPolicy:
     def reset(self, instruction: str, ranges: Ranges) -> None:
         profile = self.profile
         inner = {key: _scaled_range(ranges[key], self._scale[key]) for key in profile.action}
-        self._limit = None if profile.max_speed is None else SpeedLimit(ranges, profile.max_speed, UNBOUNDED_PER_S)
+        self._limit = (
+            None if profile.max_speed is None else SpeedLimit.of_ranges(ranges, profile.max_speed, UNBOUNDED_PER_S)
+        )
         self._last = {}
         horizon = 1 if getattr(self._inner, "every_tick", False) else profile.horizon
         self._playback = Playback(rate=profile.rate or self._hz, hz=self._hz, horizon=horizon)

@@ -223,12 +223,12 @@ class Rollout:
         self._observers = observers or RolloutObservers()
         self._clock = clock or Clock()
         self._ends_at_rest = ends_at_rest
-        self._speed = SpeedLimit.per_second(body.speeds)
+        self._speed = SpeedLimit(body.speeds)
         self._last: dict[str, float] = {}
         self._written_at = -math.inf
         self._held_back: Action = {}
         self._moving = False
-        self._holds = permit.holds
+        self._holds = permit.request.gate.holds
         self._stop_requested = threading.Event()
         self._begun = threading.Event()
         self._paced = policy if isinstance(policy, Paced) else None
@@ -381,7 +381,8 @@ class Rollout:
                 return "completed"
             if self._steps is not None and self.step_count >= self._steps:
                 return "completed"
-            observation = self._observe()
+            body = self._body
+            observation = body.get_observation() if self._policy.uses_cameras else dict(body.get_joints())
             if not chunk:
                 actions = self._policy.act(observation)
                 if actions is None:
@@ -421,7 +422,7 @@ class Rollout:
             self._moving = False
             self._body.hold(self._permit)
         self._permit.wait()
-        before, self._holds = self._holds, self._permit.holds
+        before, self._holds = self._holds, self._permit.request.gate.holds
         return self._holds != before
 
     def _limited(self, action: Action, observation: Mapping[str, Any]) -> Action:
@@ -441,9 +442,6 @@ class Rollout:
         if self._paced is not None and late > 0:
             self._paced.miss(late)
         return tick + 1 + max(late, 0)
-
-    def _observe(self) -> Mapping[str, Any]:
-        return self._body.get_observation() if self._policy.uses_cameras else dict(self._body.get_joints())
 
     def _hold(self, state: State) -> State:
         try:
@@ -469,7 +467,7 @@ class Rollout:
         self._observers.notify(
             RolloutEvent(
                 kind=kind,
-                robot=self.robot,
+                robot=self._body.name,
                 instruction=self.instruction,
                 policy=self.policy_name,
                 step=self.step_count,

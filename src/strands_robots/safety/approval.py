@@ -191,6 +191,11 @@ class Approval:
         self._bypass = bypass
         self._grants = grants
 
+    def standing(self, verb: str, peer: str, callers: Collection[str]) -> bool:
+        """Return whether ``verb`` is approved until further notice, so that nothing has to be claimed."""
+        allow = self._read("STRANDS_ROBOT_COMMAND_ALLOW")
+        return (bool(allow) and listed(verb, peer, allow, callers)) or self._bypass()
+
     def claim(self, verb: str, peer: str, callers: Collection[str] = (), arguments_digest: str = "") -> Leave | None:
         """Return leave to do ``verb`` on ``peer`` now, or None when not approved.
 
@@ -198,18 +203,15 @@ class Approval:
             callers: the names that an approval may know the caller by.
             arguments_digest: of the command's arguments, see :func:`digest`.
         """
-        if self._standing(verb, peer, callers):
+        if self.standing(verb, peer, callers):
             return Leave()
         return self._grants().claim(verb, peer, callers, arguments_digest)
 
     def given(self, verb: str, peer: str, callers: Collection[str] = (), arguments_digest: str = "") -> bool:
         """Return whether :meth:`claim` would give leave now; nothing is taken."""
-        if self._standing(verb, peer, callers):
+        if self.standing(verb, peer, callers):
             return True
         return bool(self._grants().fitting(verb, peer, callers, arguments_digest))
-
-    def _standing(self, verb: str, peer: str, callers: Collection[str]) -> bool:
-        return listed(verb, peer, self._read("STRANDS_ROBOT_COMMAND_ALLOW"), callers) or self._bypass()
 
     @staticmethod
     def refusal(verb: str, peer: str) -> str:

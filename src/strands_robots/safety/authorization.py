@@ -112,9 +112,9 @@ class Authorization:
         self._robot = robot
         self._warned = threading.Event()
 
-    def motion(self, source: object, verb: str) -> str | None:
-        """Return and log the reason why ``source`` may not do ``verb``, or None."""
-        allow = self._read("DEVICE_CONNECT_RPC_ALLOW")
+    def motion(self, source: object, verb: str, provider: str = "") -> str | None:
+        """Return and log the reason why ``source`` may not do ``verb`` by a policy, or None."""
+        allow, providers = self._read("DEVICE_CONNECT_RPC_ALLOW"), self._read("STRANDS_MESH_POLICY_TYPE_ALLOW")
         refusal = motion_refusal(source, allow, hardware=self.hardware)
         if refusal is not None:
             logger.warning("%s: %s refused to caller %s (self-declared).", self._robot, verb, shown(source))
@@ -124,6 +124,8 @@ class Authorization:
                 "%s moves for any caller on its network: it is a simulation and DEVICE_CONNECT_RPC_ALLOW is not set.",
                 self._robot,
             )
+        if refusal is None and provider and providers:
+            return provider_refusal(provider, providers)
         return refusal
 
     def opened(self) -> str | None:
@@ -135,7 +137,3 @@ class Authorization:
     def estop(self, source: object) -> str | None:
         """Return the reason why an emergency stop of ``source`` does not count, or None."""
         return estop_refusal(source, self._read("DEVICE_CONNECT_ESTOP_ALLOW"))
-
-    def provider(self, provider: str) -> str | None:
-        """Return the reason why ``provider`` is refused over the network, or None."""
-        return provider_refusal(provider, self._read("STRANDS_MESH_POLICY_TYPE_ALLOW"))

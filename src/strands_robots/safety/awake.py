@@ -47,15 +47,11 @@ class AwakeClock:
         self._clock = clock
         self._last = float("inf")
         self._held_until = float("-inf")
-        self._pauses = 0
+        self.pauses = 0
+        """Number of times that the process was found not to have run."""
         self._watching = threading.Lock()
         self._watchers: tuple[Callable[[], None], ...] = ()
         self._over: threading.Event | None = None
-
-    @property
-    def pauses(self) -> int:
-        """Number of times that the process was found not to have run."""
-        return self._pauses
 
     def look(self) -> float:
         """Return the present moment, in s of the clock; hold the motions after a pause.
@@ -70,7 +66,7 @@ class AwakeClock:
         if now - last >= PAUSE_S:
             # Before the mark below: whoever finds a fresh mark also finds the hold.
             self._held_until = now + (HOLD_S if now - last < LINKS_LOST_S else LONG_HOLD_S)
-            self._pauses += 1
+            self.pauses += 1
         if now > last:
             self._last = now
         return now
@@ -110,12 +106,12 @@ class AwakeClock:
             self._over = over
 
     def _run(self, over: threading.Event) -> None:
-        reported = self._pauses
+        reported = self.pauses
         while not over.wait(BEAT_S):
             self.look()
-            if self._pauses == reported:
+            if self.pauses == reported:
                 continue
-            reported = self._pauses
+            reported = self.pauses
             logger.warning(
                 "This process did not run for a while; its motions hold for %.1f s.", self._held_until - self._last
             )

@@ -96,9 +96,9 @@ class MotionRequest:
 
     __slots__ = ("__weakref__", "begun", "gate", "generation", "given_up", "read")
 
-    def __init__(self, gate: MotionGate, generation: int, read: str = "") -> None:
+    def __init__(self, gate: MotionGate, generation: int | None = None, read: str = "") -> None:
         self.gate = gate
-        self.generation = generation
+        self.generation = gate._generation if generation is None else generation
         self.read = read
         self.given_up = False
         self.begun = False
@@ -106,7 +106,7 @@ class MotionRequest:
     @property
     def overtaken(self) -> bool:
         """True for ever once the robot was halted since, or the call was given up."""
-        return self.given_up or self.generation != self.gate.generation
+        return self.given_up or self.generation != self.gate._generation
 
     def give_up(self) -> None:
         """Void what the call began or may still begin, and nothing else."""
@@ -156,11 +156,6 @@ class Permit:
     def held(self) -> bool:
         """True while motions hold: nothing may be written now, and the permit lives on."""
         return self._gate.held
-
-    @property
-    def holds(self) -> int:
-        """Rises with every hold of the robot."""
-        return self._gate.holds
 
     def wait(self) -> None:
         """Wait until no hold is on, or this permit is void.
@@ -425,11 +420,15 @@ class MotionGate:
         return getattr(self._of_thread, "request", None)
 
     def _dated(self, request: MotionRequest | None) -> MotionRequest:
-        made = MotionRequest(self, self._generation)
-        if request is not None and request.gate is not self:
-            # It was made of a robot that has this one inside: a halt of either refuses the motion.
-            made.given_up, request = request.overtaken, None
-        return self._outer() or request or made
+        outer: MotionRequest | None = getattr(self._of_thread, "request", None)
+        if outer is not None:
+            return outer
+        if request is not None and request.gate is self:
+            return request
+        made = MotionRequest(self)
+        # One of a robot that has this one inside: a halt of either refuses the motion.
+        made.given_up = request is not None and request.overtaken
+        return made
 
     def _refusal(self, verb: str, request: MotionRequest) -> Envelope | None:
         if request.read:

@@ -202,7 +202,7 @@ def _of_reachy(verb: Verb) -> Verb:
         body = body_of(robot)
         if not isinstance(body, ReachyDriver):
             return error(f"{verb.name}: this robot is no Reachy Mini.")
-        return verb.carry_out(body, arguments, request)
+        return verb.call(body, arguments, request)()
 
     return replace(verb, drops_unknown=True, begin=begin, suits=lambda robot: isinstance(body_of(robot), ReachyDriver))
 

@@ -14,7 +14,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -28,7 +27,7 @@ from strands_robots.serving.control_leases import ControlLeases, leases_of
 from strands_robots.serving.offered_verbs import tasks_refused, unoffered
 from strands_robots.serving.policy_arguments import MOCK, mock_refusal
 from strands_robots.serving.verbs import LEASE_ID, LEASE_NAMES, LEASE_TTL_S, Arguments, Kind, Verb
-from strands_robots.serving.workers import Share, ShareFullError, Shares, shares_of
+from strands_robots.serving.workers import Share, Shares, shares_of
 from strands_robots.stop_log import stop_logger
 from strands_robots.utils import ValidationError
 
@@ -64,6 +63,13 @@ class Result:
 
     result: Any
     refusal: Refused | None = None
+
+
+def busy(command: Command) -> Result:
+    """Return the answer to a command for which no thread of the robot is left."""
+    text = f"{command.verb.name} refused: the robot has not yet answered earlier calls; try again later."
+    refused = Refused(RefusalReason.BUSY, text, reason="busy")
+    return Result(refused.envelope, refused)
 
 
 Authorize = Callable[[Command, Arguments], Collection[str] | None]
@@ -110,7 +116,7 @@ class PendingCommands:
         """
         if self._gate is None:
             return None
-        request = self._gate.request()
+        request = MotionRequest(self._gate)
         with self._lock:
             self._pending[request] = self._robot or (robot if isinstance(robot, str) else "")
         return request
@@ -169,19 +175,10 @@ class Pipeline:
                 parts["leases"] = leases_of(robot, hardware=parts["hardware"])
         return cls(robot, peer_id, **parts)
 
-    def receive(
-        self, verb: Verb, arguments: Mapping[str, Any], caller: object, answered: Answered, proof: Any = None
-    ) -> MotionRequest | None:
-        """Have a command carried out on a thread of the robot; return at once, with the request of a motion."""
+    def arrived(self, verb: Verb, arguments: Mapping[str, Any], caller: object, proof: Any = None) -> Command:
+        """Return the command of a call that arrives now; a stop from now on voids a motion."""
         request = self.pending.arrive(arguments.get("robot_name")) if verb.kind is Kind.MOTION else None
-        command = Command(verb, arguments, caller, request, proof)
-        try:
-            self.share(verb).submit(partial(self.serve, command, answered))
-        except ShareFullError:
-            text = f"{verb.name} refused: the robot has not yet answered earlier calls; try again later."
-            refused = Refused(RefusalReason.BUSY, text, reason="busy")
-            answered(Result(refused.envelope, refused))
-        return request
+        return Command(verb, arguments, caller, request, proof)
 
     def share(self, verb: Verb) -> Share:
         """Return the share of threads for a verb; only motions wait for motions."""
@@ -211,7 +208,7 @@ class Pipeline:
             elif self.robot is None:
                 result = error(f"{verb.name}: no robot is registered on this peer.")
             else:
-                result = verb.carry_out(self.robot, arguments, command.request)
+                result = verb.call(self.robot, arguments, command.request)()
             begun = not is_error(result)
         except Refused as refused:
             refusal, result, begun = refused, refused.envelope, False

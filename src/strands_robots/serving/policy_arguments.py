@@ -12,14 +12,15 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 
 from strands_robots import settings
 from strands_robots.policies import provider_names
 from strands_robots.policies.profiles import profiles
 from strands_robots.safety.authorization import provider_refusal
-from strands_robots.serving.verbs import Check
+from strands_robots.serving.workers import UNBOUNDED
 from strands_robots.utils import ValidationError, identifier, number, shown, text
+from strands_robots.verb_parameters import Check
 
 POLICY_HOST_NOT_ALLOWED = "POLICY_HOST_NOT_ALLOWED"
 LOOPBACK_NAMES = frozenset({"localhost", "127.0.0.1", "::1"})
@@ -97,20 +98,13 @@ class PolicyHosts:
 
     def _within(self, name: str) -> tuple[tuple[str, ...], str]:
         """Resolve on a thread: a resolver may take half a minute, and takes no deadline."""
-        found: list[str] = []
-        problem = [f"no answer in {RESOLVE_S:g} s"]
-
-        def ask() -> None:
-            try:
-                found.extend(self._resolve(name))
-                problem[0] = "it has no address"
-            except (OSError, UnicodeError) as exc:
-                problem[0] = str(exc)
-
-        asking = threading.Thread(target=ask, name="policy-host", daemon=True)
-        asking.start()
-        asking.join(RESOLVE_S)
-        return tuple(found), problem[0]
+        try:
+            found = tuple(UNBOUNDED.call(partial(self._resolve, name)).result(RESOLVE_S))
+        except TimeoutError:
+            return (), f"no answer in {RESOLVE_S:g} s"
+        except (OSError, UnicodeError) as exc:
+            return (), str(exc)
+        return found, "it has no address"
 
 
 def _refused(why: str) -> ValidationError:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from functools import partial
 from typing import Any
 
 from strands_robots.contract import for_request
@@ -154,8 +155,8 @@ class Verb:
         object.__setattr__(self, "by_name", {each.name: each for each in self.parameters})
         object.__setattr__(self, "_defaults", {each.name: each.default for each in self.parameters})
 
-    def carry_out(self, robot: Any, arguments: Arguments, request: MotionRequest | None = None) -> object:
-        """Carry the verb out with a robot, and return its answer.
+    def call(self, robot: Any, arguments: Arguments, request: MotionRequest | None = None) -> Callable[[], object]:
+        """Return the call that carries the verb out with a robot, and returns its answer.
 
         Args:
             robot: behind its contract.
@@ -163,11 +164,10 @@ class Verb:
             request: what a motion begins for; a halt since it was made refuses the motion.
         """
         if self.begin is not None:
-            return self.begin(robot, arguments, request)
+            return partial(self.begin, robot, arguments, request)
         if self.run is not None:
-            return self.run(robot, arguments)
-        answer: object = for_request(request, getattr(robot, self.method))(**arguments)
-        return answer
+            return partial(self.run, robot, arguments)
+        return partial(for_request(request, getattr(robot, self.method)), **arguments)
 
     def unfit(self, names: Collection[str]) -> str | None:
         """Return the reason why arguments of these names do not fit, or None."""

@@ -106,7 +106,7 @@ class LeaderPolicy:
             key: (max(low, -MAGNITUDE_MAX) if low == -math.inf else low, MAGNITUDE_MAX if high == math.inf else high)
             for key, (low, high) in ranges.items()
         }
-        self._limit = SpeedLimit(ranges, self._max_speed, UNBOUNDED_PER_S)
+        self._limit = SpeedLimit.of_ranges(ranges, self._max_speed, UNBOUNDED_PER_S)
         self._last = {}
         self._usable_at = self._now()
 
@@ -129,7 +129,7 @@ class LeaderPolicy:
         self._usable_at = now
         if not self._last:
             self._last = {key: value for key, value in numbers(observation).items() if key in self._ranges}
-        limit = self._limit or SpeedLimit(self._ranges, self._max_speed, UNBOUNDED_PER_S)
+        limit = self._limit or SpeedLimit.of_ranges(self._ranges, self._max_speed, UNBOUNDED_PER_S)
         self._last = {**self._last, **limit.limit(target, self._last, dt)}
         self._publish(frame)
         return {key: self._last[key] for key in target}
