@@ -265,14 +265,6 @@ def _acquire(robot: Robot, arguments: Arguments) -> Envelope:
     return _of_one(robot, arguments, answer)
 
 
-def _renew(robot: Robot, arguments: Arguments) -> Envelope:
-    return _lease(arguments).renew(arguments[LEASE_ID])
-
-
-def _release(robot: Robot, arguments: Arguments) -> Envelope:
-    return _lease(arguments).release(arguments[LEASE_ID])
-
-
 def _take(robot: Robot, arguments: Arguments) -> Envelope:
     name, device = arguments.get("robot_name", "") or "", arguments["robot"]
     who = f"{device}/{name}" if name else device
@@ -293,6 +285,10 @@ def _read(robot: Robot, arguments: Arguments) -> Envelope:
     return success(held, **facts)
 
 
+def _on_lease(name: str, summary: str, *parameters: Parameter, kind: Kind = Kind.RESUME, **carried_out: Any) -> Verb:
+    return Verb(name, kind, summary, parameters, on_lease=True, urgent=True, **carried_out)
+
+
 CONTROL_VERBS = table(
     [
         Verb(
@@ -305,44 +301,34 @@ CONTROL_VERBS = table(
             on_lease=True,
             critical=False,
         ),
-        Verb(
+        _on_lease(
             "renewControl",
-            Kind.RESUME,
             "Start the time of your lease anew; every motion does so too.",
-            (_HELD,),
+            _HELD,
             returns="epoch, expires_in_s",
-            run=_renew,
-            on_lease=True,
-            urgent=True,
+            run=lambda robot, arguments: _lease(arguments).renew(arguments[LEASE_ID]),
         ),
-        Verb(
+        _on_lease(
             "releaseControl",
-            Kind.RESUME,
             "Free the robot for others.",
-            (_HELD,),
+            _HELD,
             returns="epoch",
-            run=_release,
-            on_lease=True,
-            urgent=True,
+            run=lambda robot, arguments: _lease(arguments).release(arguments[LEASE_ID]),
         ),
-        Verb(
+        _on_lease(
             "takeControl",
-            Kind.RESUME,
             "A human takes the robot from its holder, by the operator's signature; it is halted before the answer.",
-            (_REASON, _ASSERTION),
+            _REASON,
+            _ASSERTION,
             returns="lease_id, epoch, expires_in_s",
             run=_take,
-            on_lease=True,
-            urgent=True,
         ),
-        Verb(
+        _on_lease(
             "getControl",
-            Kind.READ,
             "Read who holds the robot.",
             returns="held, holder, kind, epoch, for_one_motion, expires_in_s",
             run=_read,
-            on_lease=True,
-            urgent=True,
+            kind=Kind.READ,
         ),
     ]
 )
