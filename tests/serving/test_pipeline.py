@@ -119,7 +119,7 @@ def test_a_closed_pipeline_refuses_and_names_what_still_runs(robot: ToyRobot) ->
     line = pipeline(robot)
     results: list[Result] = []
     command = Command(ARM_VERBS["execute"], {"instruction": "wave"}, "agent", line.pending.arrive())
-    line.share(command.verb).submit(lambda: line.serve(command, results.append))
+    line.shares.motion.submit(lambda: line.serve(command, results.append))
     assert started.wait(20.0)
     assert line.close() == ["execute"]
     refused = served(line, instruction="wave").refusal

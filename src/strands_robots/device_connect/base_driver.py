@@ -185,10 +185,11 @@ class RobotDriver(CollectedOnce):
             return error(problem) if problem else await super().invoke(function_name, **params)
         caller = params.pop("source_device", None)
         moves = verb.kind is Kind.MOTION
-        command = self.pipeline.arrived(verb, params, caller)
+        request = self.pipeline.pending.arrive(params.get("robot_name")) if moves else None
+        command = Command(verb, params, caller, request)
         answered, hand_over = loop_future()
         try:
-            self.pipeline.share(verb).submit(partial(self.pipeline.serve, command, hand_over))
+            self.pipeline.shares.by_name[verb.share].submit(partial(self.pipeline.serve, command, hand_over))
             # Not wait_for: in Python 3.11 it forgets a cancellation that comes together with the answer.
             within_s = (START_S if moves else READ_DEADLINE_S) + (verb.lasts_s or WAIT_S if verb.lasts else 0.0)
             async with asyncio.timeout(within_s):
@@ -197,8 +198,8 @@ class RobotDriver(CollectedOnce):
             result = busy(command)
         except TimeoutError:
             # This command alone: to revoke the gate without a halt would leave what moves with its last command.
-            if command.request is not None:
-                command.request.give_up()
+            if request is not None:
+                request.give_up()
             return error(f"The robot did not answer {verb.name} in time; what it may still start is void.")
         if moves and result.refusal is None:
             logger.info("%s: %s by caller %s (self-declared).", self.peer_id, verb.name, shown(caller))

@@ -214,9 +214,10 @@ class CommandReceiver:
             # It reaches nothing below the mesh, so it waits for no worker and no worker waits for it.
             self._pipeline.serve(Command(verb, given, request.sender_id, proof=request), answered)
             return
-        command = self._pipeline.arrived(verb, given, request.sender_id, request)
+        arrived = self._pipeline.pending.arrive(request.command.get("robot_name"))
+        command = Command(verb, given, request.sender_id, arrived, request)
         try:
-            self._pipeline.share(verb).submit(partial(self._pipeline.serve, command, answered))
+            self._pipeline.shares.by_name[verb.share].submit(partial(self._pipeline.serve, command, answered))
         except ShareFullError:
             answered(busy(command))
 

@@ -67,11 +67,6 @@ class Counted(Protocol):
         """Return the figures by name, as events, status and recordings have them."""
 
 
-def follows_instruction(policy: Policy) -> bool:
-    """Return False for a policy that moves by itself, whatever it was told."""
-    return getattr(policy, "follows_instruction", True) is not False
-
-
 def checked_action(action: object, ranges: Ranges) -> Action:
     """Return ``action`` with every value clamped to the range of its key.
 

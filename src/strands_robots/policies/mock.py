@@ -67,17 +67,17 @@ class MockPolicy:
         # The quintic from 0 to 1, smooth in velocity and acceleration.
         share = part * part * part * (part * (6 * part - 15) + 10)
         self._step += 1
-        return {key: (1 - share) * self._start[key] + share * self._wave(key, seconds) for key in self._ranges}
+        action: Action = {}
+        for key, (low, high) in self._ranges.items():
+            slow, slow_phase, fast, fast_phase = self._waves[key]
+            swing = 0.7 * math.sin(math.tau * slow * seconds + slow_phase)
+            swing += 0.3 * math.sin(math.tau * fast * seconds + fast_phase)
+            wave = (low + high) / 2 + self._amplitude * (high - low) / 2 * swing
+            action[key] = (1 - share) * self._start[key] + share * wave
+        return action
 
     def interrupt(self) -> None:
         """Do nothing: this policy never waits."""
 
     def close(self) -> None:
         """Do nothing: this policy has no resources."""
-
-    def _wave(self, key: str, seconds: float) -> float:
-        low, high = self._ranges[key]
-        slow, slow_phase, fast, fast_phase = self._waves[key]
-        swing = 0.7 * math.sin(math.tau * slow * seconds + slow_phase)
-        swing += 0.3 * math.sin(math.tau * fast * seconds + fast_phase)
-        return (low + high) / 2 + self._amplitude * (high - low) / 2 * swing

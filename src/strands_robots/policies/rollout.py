@@ -27,7 +27,6 @@ from strands_robots.policies.base import (
     Ranges,
     SpeedLimit,
     checked_action,
-    follows_instruction,
     is_velocity,
     numbers,
 )
@@ -232,7 +231,7 @@ class Rollout:
         self._stop_requested = threading.Event()
         self._begun = threading.Event()
         self._paced = policy if isinstance(policy, Paced) else None
-        self.follows_instruction = follows_instruction(policy)
+        self.follows_instruction = getattr(policy, "follows_instruction", True) is not False
         """False for a policy that moves by itself, whatever it was told."""
         self._started_at: float | None = None
         self._ended_at: float | None = None
@@ -345,7 +344,7 @@ class Rollout:
                         self._begun.set()
                     finally:
                         self._notify("started")
-                    self._permit.begin()
+                    self._permit.request.begun = True
                     state = self._loop(bounds)
                 except PermitVoidError:
                     state = "stopped"

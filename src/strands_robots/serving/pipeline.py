@@ -14,6 +14,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -27,7 +28,7 @@ from strands_robots.serving.control_leases import ControlLeases, leases_of
 from strands_robots.serving.offered_verbs import tasks_refused, unoffered
 from strands_robots.serving.policy_arguments import MOCK, mock_refusal
 from strands_robots.serving.verbs import LEASE_ID, LEASE_NAMES, LEASE_TTL_S, Arguments, Kind, Verb
-from strands_robots.serving.workers import Share, Shares, shares_of
+from strands_robots.serving.workers import Shares, shares_of
 from strands_robots.stop_log import stop_logger
 from strands_robots.utils import ValidationError
 
@@ -83,9 +84,6 @@ Answered = Callable[[Result], None]
 
 Own = Callable[[Arguments, MotionRequest | None], object]
 """Carries out a verb that is the network peer's own and not its robot's, for the command's request."""
-
-_Terms = tuple[str, str | None, float]
-"""``lease_id``, the robot of a world (None for all of them) and ``lease_ttl_s`` of a motion under a lease."""
 
 
 class PendingCommands:
@@ -175,31 +173,18 @@ class Pipeline:
                 parts["leases"] = leases_of(robot, hardware=parts["hardware"])
         return cls(robot, peer_id, **parts)
 
-    def arrived(self, verb: Verb, arguments: Mapping[str, Any], caller: object, proof: Any = None) -> Command:
-        """Return the command of a call that arrives now; a stop from now on voids a motion."""
-        request = self.pending.arrive(arguments.get("robot_name")) if verb.kind is Kind.MOTION else None
-        return Command(verb, arguments, caller, request, proof)
-
-    def share(self, verb: Verb) -> Share:
-        """Return the share of threads for a verb; only motions wait for motions."""
-        if verb.urgent:
-            return self.shares.urgent
-        if verb.lasts and not (verb.own and verb.kind is Kind.READ):
-            return self.shares.lasting
-        if verb.kind is Kind.MOTION:
-            return self.shares.motion
-        return self.shares.own_read if verb.own else self.shares.read
-
     def serve(self, command: Command, answered: Answered) -> None:
         """Carry ``command`` out on this thread and hand its answer to ``answered``."""
-        verb, leave = command.verb, Leave()
+        verb = command.verb
+        arguments: dict[str, Any] | None = None
+        leave: Leave | None = None
         result: object = None
         refusal: Refused | None = None
         begun = False
         with self._changed:
             self._serving.append(verb.name)
         try:
-            arguments = self._checked(command)
+            arguments = verb.checked(command.arguments)
             leave = self.leave(command, arguments)
             # Of what ends in an exception nobody knows whether it moves.
             begun = True
@@ -214,8 +199,14 @@ class Pipeline:
             refusal, result, begun = refused, refused.envelope, False
         except NotHolderError as exc:
             result, begun = RefusalReason.CONTROL.noted(exc.envelope), False
+            if leave is None:
+                refusal = Refused(RefusalReason.CONTROL, str(exc), envelope=exc.envelope)
         except REFUSALS as exc:
-            result, begun = _own_refusal(verb.name, exc), False
+            begun = False
+            if arguments is None:
+                result, refusal = self._misfit(verb, exc)
+            else:
+                result = _own_refusal(verb.name, exc)
         except BaseException:
             # A binding's panic is no Exception; the caller is answered all the same, and the thread goes on.
             logger.exception("%s: %s failed.", self.peer_id(), verb.name)
@@ -224,7 +215,8 @@ class Pipeline:
         try:
             try:
                 # A motion that began and ended badly is answered with an error, too.
-                leave.settle(begun or command.begun)
+                if leave is not None:
+                    leave.settle(begun or command.begun)
             except OSError:
                 logger.exception("%s: the grant of %s is still in its folder.", self.peer_id(), verb.name)
             answered(Result(result, refusal))
@@ -252,30 +244,36 @@ class Pipeline:
             MotionRefused: the robot does not offer the verb, or was halted since the command arrived.
         """
         verb = command.verb
+        if self.closed:
+            text = f"{verb.name} refused: this peer has left its network."
+            raise Refused(RefusalReason.BUSY, text, reason="closed")
         try:
             callers = self.authorize(command, arguments) or ()
         except Refused:
             self._refuse_unoffered(verb)
             raise
-        terms = self._terms(command, arguments) if verb.leased or verb.on_lease else None
+        if verb.on_lease:
+            self._give_leases(command, arguments)
+        leases, admitted = self.leases, None
+        if verb.leased and not verb.on_lease:
+            lease_id, ttl_s = arguments.pop(LEASE_ID, "") or "", arguments.pop(LEASE_TTL_S, 0.0) or 0.0
+            if ttl_s and not lease_id:
+                needs = f"{LEASE_TTL_S} needs a {LEASE_ID}: a secret of the caller's own."
+                raise Refused(RefusalReason.ARGUMENTS, needs)
+            name = None if verb.of_world else arguments.get("robot_name", "")
+            if leases is not None:
+                admitted = partial(
+                    leases.admit, verb.name, command.caller, lease_id, name, ttl_s, begun=lambda: command.begun
+                )
         if verb.kind is not Kind.MOTION:
             return Leave()
-        self._admit(command, terms, hold=False)
+        if admitted is not None:
+            admitted(hold=False)
         self._refuse_locked(verb, command.request)
-        if not self.hardware:
-            return self._admit(command, terms)
-        if arguments.get("policy_provider") == MOCK and getattr(self.robot, "runs_policies", False):
-            refusal = mock_refusal()
-            if refusal is not None:
-                raise Refused(RefusalReason.APPROVAL, f"{verb.name} is refused: {refusal}", reason="mock on hardware")
-        peer = self.peer_id()
-        if self.approval.standing(verb.name, peer, callers):
-            return self._admit(command, terms)
-        own = {name: value for name, value in command.arguments.items() if name in verb.by_name.keys() - LEASE_NAMES}
-        wanted = verb.name, peer, callers, digest(own)
-        if not self.approval.given(*wanted):
-            raise self._unapproved(verb)
-        held = self._admit(command, terms)
+        wanted = self._unclaimed(command, arguments, callers) if self.hardware else None
+        held = Leave() if admitted is None else admitted(hold=True)
+        if wanted is None:
+            return held
         claimed = None
         try:
             claimed = self.approval.claim(*wanted)
@@ -286,43 +284,40 @@ class Pipeline:
             raise self._unapproved(verb)
         return Leave(held.settle, claimed.settle)
 
-    def _checked(self, command: Command) -> dict[str, Any]:
-        if self.closed:
-            raise Refused(
-                RefusalReason.BUSY, f"{command.verb.name} refused: this peer has left its network.", reason="closed"
-            )
-        try:
-            return command.verb.checked(command.arguments)
-        except ValidationError as exc:
-            lacking = None if self.robot is None else tasks_refused(self.robot, command.verb, self.peer_id())
-            if lacking is not None:
-                raise MotionRefused(error(lacking)) from None
-            raise Refused(RefusalReason.ARGUMENTS, str(exc)) from None
+    def _unclaimed(
+        self, command: Command, arguments: Arguments, callers: Collection[str]
+    ) -> tuple[str, str, Collection[str], str] | None:
+        """Return the grant that a motion of real hardware has to claim; None where it is approved anyway.
 
-    def _terms(self, command: Command, arguments: dict[str, Any]) -> _Terms | None:
-        """Take the lease's arguments out; give the lease's verbs their parts.
-
-        Returns:
-            None where no lease is asked.
+        Raises:
+            Refused: no grant is for it.
         """
-        verb = command.verb
-        if verb.on_lease:
-            if self.leases is None:
-                raise Refused(RefusalReason.CONTROL, f"{verb.name}: no robot is registered on this peer.")
-            arguments |= {"caller": command.caller, "robot": self.peer_id(), "leases": self.leases}
+        verb, peer = command.verb, self.peer_id()
+        if arguments.get("policy_provider") == MOCK and getattr(self.robot, "runs_policies", False):
+            refusal = mock_refusal()
+            if refusal is not None:
+                raise Refused(RefusalReason.APPROVAL, f"{verb.name} is refused: {refusal}", reason="mock on hardware")
+        if self.approval.standing(verb.name, peer, callers):
             return None
-        lease_id, ttl_s = arguments.pop(LEASE_ID, "") or "", arguments.pop(LEASE_TTL_S, 0.0) or 0.0
-        if ttl_s and not lease_id:
-            raise Refused(RefusalReason.ARGUMENTS, f"{LEASE_TTL_S} needs a {LEASE_ID}: a secret of the caller's own.")
-        return lease_id, None if verb.of_world else arguments.get("robot_name", ""), ttl_s
+        own = {name: value for name, value in command.arguments.items() if name in verb.by_name.keys() - LEASE_NAMES}
+        wanted = verb.name, peer, callers, digest(own)
+        if not self.approval.given(*wanted):
+            raise self._unapproved(verb)
+        return wanted
 
-    def _admit(self, command: Command, terms: _Terms | None, *, hold: bool = True) -> Leave:
-        if terms is None or self.leases is None:
-            return Leave()
-        try:
-            return self.leases.admit(command.verb.name, command.caller, *terms, hold=hold, begun=lambda: command.begun)
-        except NotHolderError as exc:
-            raise Refused(RefusalReason.CONTROL, str(exc), envelope=exc.envelope) from None
+    def _misfit(self, verb: Verb, exc: Exception) -> tuple[Envelope, Refused | None]:
+        """Return the answer to arguments that do not fit; a verb that the robot lacks is refused by that."""
+        lacking = None if self.robot is None else tasks_refused(self.robot, verb, self.peer_id())
+        if lacking is not None:
+            return error(lacking), None
+        refused = Refused(RefusalReason.ARGUMENTS, str(exc))
+        return refused.envelope, refused
+
+    def _give_leases(self, command: Command, arguments: dict[str, Any]) -> None:
+        """Give a verb on the lease its parts."""
+        if self.leases is None:
+            raise Refused(RefusalReason.CONTROL, f"{command.verb.name}: no robot is registered on this peer.")
+        arguments |= {"caller": command.caller, "robot": self.peer_id(), "leases": self.leases}
 
     def _refuse_unoffered(self, verb: Verb) -> None:
         """Refuse a verb that the robot does not offer, for which no grant would help."""

@@ -144,10 +144,13 @@ class Verb:
     lasts_s: float = 0.0
     by_name: Mapping[str, Parameter] = field(init=False, repr=False, compare=False)
     _defaults: Mapping[str, Any] = field(init=False, repr=False, compare=False)
+    share: str = field(init=False, repr=False, compare=False)
+    """The share of a robot's threads that carries it out, by its name in :class:`~.workers.Shares`."""
     leased: bool = field(init=False, repr=False, compare=False)
     """True for a motion of the lease's holder alone; it takes :data:`OF_THE_LEASE`."""
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "share", self._share())
         object.__setattr__(self, "leased", self.kind is Kind.MOTION and not self.while_locked)
         if self.leased and all(each.name != LEASE_ID for each in self.parameters):
             more = [replace(each, default=None) if self.drops_unknown else each for each in OF_THE_LEASE]
@@ -168,6 +171,14 @@ class Verb:
         if self.run is not None:
             return partial(self.run, robot, arguments)
         return partial(for_request(request, getattr(robot, self.method)), **arguments)
+
+    def _share(self) -> str:
+        # Only motions wait for motions.
+        if self.urgent:
+            return "urgent"
+        if self.lasts and not (self.own and self.kind is Kind.READ):
+            return "lasting"
+        return "motion" if self.kind is Kind.MOTION else "own_read" if self.own else "read"
 
     def unfit(self, names: Collection[str]) -> str | None:
         """Return the reason why arguments of these names do not fit, or None."""
