@@ -78,7 +78,9 @@ def joint_reader(device: Any) -> Callable[[], dict[str, float]]:
     source = joint_read_source(device)
     if source is None:
         return dict
-    lock, buses = bus_lock(source), motor_buses(source)
+    lock = bus_lock(source)
+    # A driver that tells its joints itself may have features that cannot be read yet.
+    buses = None if callable(getattr(source, "get_joints", None)) else motor_buses(source)
 
     def read() -> dict[str, float]:
         with lock:
@@ -86,10 +88,11 @@ def joint_reader(device: Any) -> Callable[[], dict[str, float]]:
             answer = own() if callable(own) else None
             if answer is not None and "status" not in answer:
                 return numbers(answer)
-            if not buses:
+            parts = motor_buses(source) if buses is None else buses
+            if not parts:
                 return numbers(source.get_observation())
             joints: dict[str, float] = {}
-            for prefix, bus in buses:
+            for prefix, bus in parts:
                 positions = bus.sync_read("Present_Position")
                 joints |= numbers({f"{prefix}{name}.pos": positions[name] for name in bus.motors})
             return joints

@@ -203,10 +203,7 @@ class Pipeline:
                 refusal = Refused(RefusalReason.CONTROL, str(exc), envelope=exc.envelope)
         except REFUSALS as exc:
             begun = False
-            if arguments is None:
-                result, refusal = self._misfit(verb, exc)
-            else:
-                result = _own_refusal(verb.name, exc)
+            result, refusal = self._refusal_of(verb, exc, checked=arguments is not None)
         except BaseException:
             # A binding's panic is no Exception; the caller is answered all the same, and the thread goes on.
             logger.exception("%s: %s failed.", self.peer_id(), verb.name)
@@ -305,13 +302,18 @@ class Pipeline:
             raise self._unapproved(verb)
         return wanted
 
-    def _misfit(self, verb: Verb, exc: Exception) -> tuple[Envelope, Refused | None]:
-        """Return the answer to arguments that do not fit; a verb that the robot lacks is refused by that."""
-        lacking = None if self.robot is None else tasks_refused(self.robot, verb, self.peer_id())
-        if lacking is not None:
-            return error(lacking), None
-        refused = Refused(RefusalReason.ARGUMENTS, str(exc))
-        return refused.envelope, refused
+    def _refusal_of(self, verb: Verb, exc: Exception, *, checked: bool) -> tuple[Envelope, Refused | None]:
+        """Return the answer to a verb that refused by itself, or whose arguments do not fit."""
+        if isinstance(exc, ValidationError) and not checked:
+            lacking = None if self.robot is None else tasks_refused(self.robot, verb, self.peer_id())
+            if lacking is not None:
+                return error(lacking), None
+            refused = Refused(RefusalReason.ARGUMENTS, str(exc))
+            return refused.envelope, refused
+        envelope = refusal_envelope(verb.name, exc)
+        if isinstance(exc, ValidationError):
+            return RefusalReason.ARGUMENTS.noted(envelope), None
+        return RefusalReason.LOCKOUT.noted(envelope) if envelope.get("locked") is True else envelope, None
 
     def _give_leases(self, command: Command, arguments: dict[str, Any]) -> None:
         """Give a verb on the lease its parts."""
@@ -349,11 +351,3 @@ class Pipeline:
         # Halted since the command arrived: refused before a grant is spent on it.
         if request is not None and request.overtaken and (late := gate.refusal(verb.name, request)) is not None:
             raise MotionRefused(late)
-
-
-def _own_refusal(verb: str, refused: Exception) -> Envelope:
-    """Return the answer to a verb that refused by itself."""
-    envelope = refusal_envelope(verb, refused)
-    if isinstance(refused, ValidationError):
-        return RefusalReason.ARGUMENTS.noted(envelope)
-    return RefusalReason.LOCKOUT.noted(envelope) if envelope.get("locked") is True else envelope
