@@ -17,7 +17,7 @@ from fixtures.waiting import free_port
 
 from benchmarks.table import Row
 from strands_robots.device_connect.backends import LinkConfig, loopback_config
-from strands_robots.safety.controller import Progress
+from strands_robots.safety.answers import Progress
 from strands_robots.safety.identity import ROBOTS, KeyFile, SigningIdentity
 from strands_robots.safety.orders import RobotReport, new_epoch
 from strands_robots.safety.statements import Proof, Purpose, proof_of, signed

@@ -35,6 +35,8 @@ FLOORS: list[set[str]] = [
         "agent_tool",
         "_mesh_switch",
         "zenoh_session",
+        "rate_limits",
+        "threads",
         "certificates",
     },
     {"safety", "audit", "contract", "verb_declaration", "verb_parameters"},

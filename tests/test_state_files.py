@@ -11,8 +11,8 @@ import pytest
 from fixtures.waiting import eventually
 
 from strands_robots import state_files
-from strands_robots.safety import approval, clearance
-from strands_robots.safety.approval import Grants
+from strands_robots.safety import authorization, resume
+from strands_robots.safety.authorization import Grants
 from strands_robots.safety.lockout import OVERFLOW, Lockout, LockoutState
 from strands_robots.safety.persistence import LockoutStore, StoredLockout
 from strands_robots.state_files import StateFileError, adopt, read_private, uptime
@@ -116,14 +116,14 @@ def test_expired_grant_stays_expired_when_the_wall_clock_is_set_back(
 
 def test_grant_of_an_earlier_boot_is_void(grants: Grants, monkeypatch: pytest.MonkeyPatch) -> None:
     grants.grant("execute", "arm-1")
-    monkeypatch.setattr(approval, "boot", lambda: "another boot")
+    monkeypatch.setattr(authorization, "boot", lambda: "another boot")
     assert grants.claim("execute", "arm-1") is None
 
 
 def test_clearance_that_others_may_write_is_not_taken(state_directory: Path) -> None:
     cleared: list[str] = []
-    inbox = clearance.ClearanceInbox(lambda: {"arm-1"}, lambda who, robot_id: cleared.append(robot_id) or "cleared")
-    (order,) = clearance.order_clearance("ann", ["arm-1"])
+    inbox = resume.ClearanceInbox(lambda: {"arm-1"}, lambda who, robot_id: cleared.append(robot_id) or "cleared")
+    (order,) = resume.order_clearance("ann", ["arm-1"])
     order.chmod(0o666)
     inbox.look(0)
     state_directory.chmod(0o777)
@@ -137,8 +137,8 @@ def test_clearance_that_others_may_write_is_not_taken(state_directory: Path) -> 
 
 def test_clearance_of_an_earlier_boot_is_void(state_directory: Path) -> None:
     cleared: list[str] = []
-    inbox = clearance.ClearanceInbox(lambda: {"arm-1"}, lambda who, robot_id: cleared.append(robot_id) or "cleared")
-    (path,) = clearance.order_clearance("ann", ["arm-1"])
+    inbox = resume.ClearanceInbox(lambda: {"arm-1"}, lambda who, robot_id: cleared.append(robot_id) or "cleared")
+    (path,) = resume.order_clearance("ann", ["arm-1"])
     path.write_text(json.dumps({**json.loads(path.read_text()), "boot": "another"}))
     inbox.look(0)
     assert cleared == []

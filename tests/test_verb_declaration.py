@@ -13,8 +13,7 @@ from fixtures.waiting import eventually
 
 from strands_robots import Domain, Permit, verb
 from strands_robots.contract import adapt
-from strands_robots.safety.gate import MotionRefused
-from strands_robots.safety.kept_gates import gate_of
+from strands_robots.safety.gate import MotionRefused, gate_of
 from strands_robots.utils import ValidationError
 from strands_robots.verb_declaration import declared_verbs
 

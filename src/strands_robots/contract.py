@@ -20,11 +20,9 @@ from typing import TYPE_CHECKING, Any, Literal, ParamSpec, Protocol, TypeVar, ru
 from strands_robots import settings
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.identity_map import IdentityMap
-from strands_robots.safety.gate import MotionGate, MotionRefused, MotionRequest
-from strands_robots.safety.halted_verbs import halted_with_verbs
-from strands_robots.safety.kept_gates import gate_of
+from strands_robots.safety.gate import MotionGate, MotionRefused, MotionRequest, VerbCall, gate_of
 from strands_robots.safety.stop_targets import Haltable as Haltable  # noqa: PLC0414 - part of the contract
-from strands_robots.safety.stop_targets import RobotWrapper
+from strands_robots.safety.stop_targets import RobotWrapper, halted_with_verbs
 from strands_robots.safety.stop_targets import body_of as body_of  # noqa: PLC0414 - part of the contract
 from strands_robots.safety.stopping import (
     PendingVerdict,
@@ -35,7 +33,6 @@ from strands_robots.safety.stopping import (
     json_blocks,
     read_verdict,
 )
-from strands_robots.safety.verbs_under_way import VerbCall
 from strands_robots.stop_log import stop_logger
 from strands_robots.utils import ValidationError, shown
 from strands_robots.verb_declaration import declared_verbs

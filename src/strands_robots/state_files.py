@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import secrets
 import stat
 import time
 from pathlib import Path
@@ -76,6 +77,31 @@ def read_private(
     with os.fdopen(descriptor, "rb") as file:
         _require_private_status(path, root, os.fstat(descriptor), forbidden, error)
         return file.read(longest)
+
+
+def write_private(path: Path, content: bytes, *, once: bool = False) -> None:
+    """Write a file of this user alone; it is whole and on the disk when this returns.
+
+    Args:
+        once: leave the file that another process wrote first.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    draft = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
+    descriptor = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+    try:
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        if once:
+            with contextlib.suppress(FileExistsError):
+                os.link(draft, path)
+        else:
+            draft.replace(path)
+    finally:
+        draft.unlink(missing_ok=True)
 
 
 def require_private_file(path: Path, root: Path, *, error: type[StateFileError] = StateFileError) -> int:

@@ -34,8 +34,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, TypeVar, get_type_hints, overload
 
-from strands_robots.safety.gate import MotionRequest, Permit
-from strands_robots.safety.kept_gates import gate_of
+from strands_robots.safety.gate import MotionRequest, Permit, gate_of
 from strands_robots.utils import DURATION_MAX_S, START_S, ValidationError, flag, number, plain_text, shown, text
 from strands_robots.verb_parameters import Domain, Parameter, checked_arguments, is_permit, parameter_of
 

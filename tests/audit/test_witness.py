@@ -13,10 +13,9 @@ from fixtures.audit_files import copy_files, entry, restore_files, signed_journa
 from strands_robots.audit import audit_head, flush_audit, log_safety_event, log_witness, read_audit_log
 from strands_robots.audit.head import Anchor
 from strands_robots.audit.journal import Journal
-from strands_robots.audit.verification import verify
-from strands_robots.audit.witness import WITNESS, compare, stated_head, witnessed
+from strands_robots.audit.verification import WITNESS, compare, stated_head, verify, witnessed
 from strands_robots.safety.controller import SafetyController
-from strands_robots.safety.estop_listener import ESTOP, VERDICT, notification
+from strands_robots.safety.stop_link import ESTOP, VERDICT, notification
 
 HEAD = {"log": "a" * 32, "count": 7, "last": "b" * 64}
 

@@ -7,7 +7,7 @@ from tests.cli.conftest import Run
 
 from strands_robots.audit import audit_head, flush_audit, log_safety_event
 from strands_robots.audit.journal import AuditEntry, Journal
-from strands_robots.audit.witness import WITNESS
+from strands_robots.audit.verification import WITNESS
 
 EPOCH = "0123456789abcdef0123456789abcdef"
 

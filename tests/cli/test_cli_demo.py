@@ -18,8 +18,7 @@ from strands_robots.cli.demo.processes import AgentEvent
 from strands_robots.cli.demo.steps import NEEDED, DemoReport, DriveSteps, SafetySteps, on_plate
 from strands_robots.cli.output import CliError, Screen
 from strands_robots.recording.cameras import jpeg
-from strands_robots.safety.answers import Answer
-from strands_robots.safety.controller import StopReport
+from strands_robots.safety.answers import Answer, StopReport
 from strands_robots.simulation import TABLETOP
 
 EPOCH = "0123456789abcdef0123456789abcdef"

@@ -22,11 +22,16 @@ from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.safety_console import SafetyConsole
 from strands_robots.fleet.watched_robots import WatchedRobots
 from strands_robots.safety import statements
-from strands_robots.safety.answers import Answer
-from strands_robots.safety.consoles import enrolled_consoles
-from strands_robots.safety.controller import StopReport
+from strands_robots.safety.answers import Answer, StopReport
 from strands_robots.safety.ed25519 import keygen
-from strands_robots.safety.identity import ROBOTS, EnrolledKeys, KeyFile, SigningIdentity, fingerprint
+from strands_robots.safety.identity import (
+    ROBOTS,
+    EnrolledKeys,
+    KeyFile,
+    SigningIdentity,
+    enrolled_consoles,
+    fingerprint,
+)
 from strands_robots.safety.statements import Proof, Purpose, signed
 from strands_robots.utils import operator
 

@@ -17,7 +17,7 @@ from strands_robots.device_connect.client import DeviceTimeoutError
 from strands_robots.device_connect.discovery import Peer
 from strands_robots.device_connect.links import network_of
 from strands_robots.envelope import Envelope, error, success
-from strands_robots.safety.approval import Grants
+from strands_robots.safety.authorization import Grants
 from strands_robots.safety.ed25519 import keygen
 from strands_robots.safety.lockout import OVERFLOW, Lockout, LockoutState
 from strands_robots.safety.persistence import LockoutStore, StoredLockout

@@ -21,8 +21,7 @@ from strands_robots.fleet.lockout_report import LockoutReport
 from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.safety_console import SafetyConsole
 from strands_robots.fleet.watched_robots import WatchedRobots
-from strands_robots.safety.answers import Answer
-from strands_robots.safety.controller import Progress
+from strands_robots.safety.answers import Answer, Progress
 from strands_robots.safety.lockout import Lockout
 
 

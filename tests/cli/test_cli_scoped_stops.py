@@ -15,8 +15,7 @@ from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.safety_console import SafetyConsole
 from strands_robots.fleet.stop_button import StopButtons
 from strands_robots.fleet.watched_robots import WatchedRobots
-from strands_robots.safety.answers import Answer
-from strands_robots.safety.controller import StopReport
+from strands_robots.safety.answers import Answer, StopReport
 from strands_robots.safety.identity import EnrolledKeys
 from strands_robots.safety.lockout import Lockout, LockoutState
 from strands_robots.safety.network_key import MESH, NetworkKey

@@ -27,10 +27,9 @@ from strands_robots.envelope import Envelope, error, success
 from strands_robots.errors import UnreachableError
 from strands_robots.fleet.device_connect.network import DeviceConnectNetwork
 from strands_robots.fleet.stop_answers import stop_outcome
-from strands_robots.safety.answers import Answer
-from strands_robots.safety.controller import Progress, StopReport
+from strands_robots.safety.answers import Answer, Progress, StopReport
+from strands_robots.safety.roster import Sending
 from strands_robots.safety.sightings import sightings
-from strands_robots.safety.silence import Sending
 
 
 def answer(name: str, stopped: bool | None = True, ms: float = 3.0, why: str = "") -> Answer:

@@ -17,8 +17,7 @@ from strands_robots.dashboard.fleet_model import FleetModel
 from strands_robots.fleet import stop_button
 from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
 from strands_robots.fleet.networks import Networks
-from strands_robots.safety.answers import Answer
-from strands_robots.safety.controller import Progress, StopReport
+from strands_robots.safety.answers import Answer, Progress, StopReport
 from strands_robots.safety.roster import Roster, RosterRow
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.safety.sightings import Known, sightings

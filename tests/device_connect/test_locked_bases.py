@@ -19,8 +19,7 @@ from strands_robots.drivers.ros.ros_bridge import RosBridgedRobot
 from strands_robots.drivers.ros.rosbridge_robot import RosbridgeRobot
 from strands_robots.ros.gate import CommandGate
 from strands_robots.ros.memory import MemoryLink
-from strands_robots.safety.approval import Approval
-from strands_robots.safety.authorization import Authorization
+from strands_robots.safety.authorization import Approval, Authorization
 from strands_robots.safety.orders import StopOrder
 from strands_robots.safety.plane import SafetyPlane
 

@@ -14,8 +14,7 @@ from strands_robots.device_connect.robot_driver import MobileBaseDeviceDriver
 from strands_robots.drivers.ros.mobile_base import MobileBaseRobot
 from strands_robots.ros.gate import CommandGate
 from strands_robots.ros.memory import MemoryLink
-from strands_robots.safety.approval import Approval
-from strands_robots.safety.authorization import Authorization
+from strands_robots.safety.authorization import Approval, Authorization
 
 SHUT = CommandGate(lambda _: (), lambda: False)
 

@@ -15,8 +15,7 @@ from strands_robots.drivers.ros.ros_bridge import RosBridgedRobot
 from strands_robots.ros.gate import CommandGate
 from strands_robots.ros.link import Goal
 from strands_robots.ros.memory import MemoryLink
-from strands_robots.safety.approval import Approval
-from strands_robots.safety.authorization import Authorization
+from strands_robots.safety.authorization import Approval, Authorization
 
 NAV = "/navigate_to_pose"
 SHUT = CommandGate(lambda _: (), lambda: False)

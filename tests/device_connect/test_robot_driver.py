@@ -21,7 +21,7 @@ from strands_robots.device_connect._compat import rpc
 from strands_robots.device_connect.robot_driver import RobotDeviceDriver
 from strands_robots.device_connect.telemetry import step_limiter
 from strands_robots.envelope import error, success
-from strands_robots.safety.approval import Grants
+from strands_robots.safety.authorization import Grants
 from strands_robots.state_files import state_dir
 from strands_robots.utils import ValidationError
 

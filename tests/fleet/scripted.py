@@ -24,12 +24,12 @@ from strands_robots.fleet.lockout_report import LockoutReport, Resumed
 from strands_robots.fleet.refusals import answered
 from strands_robots.fleet.stop_answers import measured, roster_verdict, unanswered
 from strands_robots.safety import network_key
-from strands_robots.safety.controller import OnProgress
+from strands_robots.safety.answers import OnProgress
 from strands_robots.safety.identity import SigningIdentity
 from strands_robots.safety.lockout import Lockout
 from strands_robots.safety.network_key import NetworkKey
+from strands_robots.safety.roster import Sending
 from strands_robots.safety.scope import EVERY_ROBOT, KnownRobots, Remembers, Scope
-from strands_robots.safety.silence import Sending
 from strands_robots.safety.statements import Purpose
 from strands_robots.safety.statements import signed as signed_by
 from strands_robots.safety.stop_roster import StopOutcome, StopRoster

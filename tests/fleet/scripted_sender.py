@@ -7,10 +7,9 @@ from collections.abc import Collection
 from dataclasses import replace
 from typing import Any
 
-from strands_robots.safety.answers import Answer
-from strands_robots.safety.controller import Progress, StopReport
+from strands_robots.safety.answers import Answer, Progress, StopReport
+from strands_robots.safety.roster import Sending
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
-from strands_robots.safety.silence import Sending
 
 
 class ScriptedSender:

@@ -20,8 +20,7 @@ from strands_robots.fleet.all_stops import estop_all
 from strands_robots.fleet.enrollment import Enrolled
 from strands_robots.fleet.lockout_report import LockoutReport
 from strands_robots.fleet.networks import Networks
-from strands_robots.safety.answers import Answer
-from strands_robots.safety.controller import Progress
+from strands_robots.safety.answers import Answer, Progress
 from strands_robots.safety.identity import ROBOTS, EnrolledKeys, KeyFile
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.roster import Roster, RosterRow
@@ -223,7 +222,7 @@ def test_resume_of_one_robot_asks_all_before_it_names_who_is_not_heard(
     fleet: Fleet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from strands_robots.fleet import all_lockouts as module  # noqa: PLC0415 - this test alone
-    from strands_robots.safety.unheard import Unheard  # noqa: PLC0415 - as above
+    from strands_robots.safety.stop_notes import Unheard  # noqa: PLC0415 - as above
 
     heard: list[set[str]] = []
 
@@ -273,7 +272,7 @@ def test_robots_that_are_not_heard_are_named_before_others_are_freed(
     fleet: Fleet, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     from strands_robots.fleet import all_lockouts as module  # noqa: PLC0415 - this test alone
-    from strands_robots.safety.unheard import Unheard  # noqa: PLC0415 - as above
+    from strands_robots.safety.stop_notes import Unheard  # noqa: PLC0415 - as above
 
     monkeypatch.setattr(module, "unheard_now", lambda *_: Unheard(("arm-7",)))
     with caplog.at_level(logging.WARNING):

@@ -15,7 +15,7 @@ from tests.mesh.peers import Fleet
 from strands_robots import policies
 from strands_robots.mesh.security import ValidationError, validate_command
 from strands_robots.mesh.transport.memory import MemoryTransport
-from strands_robots.safety.approval import Grants
+from strands_robots.safety.authorization import Grants
 from strands_robots.serving.peer_verbs import run_to_end
 from strands_robots.serving.policy_arguments import registered_providers
 from strands_robots.serving.robot_verbs import served

@@ -17,9 +17,9 @@ from tests.mesh.peers import Fleet, received
 from strands_robots.mesh import late_peers, missed, safety
 from strands_robots.mesh.core import Mesh
 from strands_robots.safety import ed25519
-from strands_robots.safety.awake import AWAKE, PAUSE_S
 from strands_robots.safety.missed_stops import LISTEN_S
 from strands_robots.safety.orders import signed_stop
+from strands_robots.safety.process import AWAKE, PAUSE_S
 from strands_robots.safety.scope import Scope
 from strands_robots.safety.statements import Purpose
 

@@ -10,7 +10,7 @@ from tests.mesh.peers import Fleet
 
 from strands_robots.mesh import keys
 from strands_robots.mesh.wire_identity import Identity, Signer, Verifier
-from strands_robots.safety.approval import Grants
+from strands_robots.safety.authorization import Grants
 from strands_robots.state_files import state_dir
 
 WAVE = {"action": "start", "instruction": "wave", "policy_provider": "mock", "duration": 0.5}

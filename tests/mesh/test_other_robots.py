@@ -16,7 +16,7 @@ from strands_robots.drivers.ros.ros_bridge import RosBridgedRobot
 from strands_robots.mesh.core import Mesh
 from strands_robots.ros.link import Goal, OnMessage, Unwatch
 from strands_robots.ros.memory import MemoryLink
-from strands_robots.safety.approval import Grants
+from strands_robots.safety.authorization import Grants
 from strands_robots.state_files import state_dir
 
 NAV = "/navigate_to_pose"

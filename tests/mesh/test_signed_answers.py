@@ -17,7 +17,9 @@ from strands_robots.mesh import topics
 from strands_robots.mesh.safety_adapter import SafetyAdapter
 from strands_robots.safety.identity import ROBOTS, EnrolledKeys, KeyFile, robot_identity
 from strands_robots.safety.orders import new_epoch
-from strands_robots.safety.peer_answers import (
+from strands_robots.safety.persistence import LockoutStore
+from strands_robots.safety.plane import SafetyPlane
+from strands_robots.safety.statements import (
     ANNOUNCED_S,
     LockoutAnnouncer,
     lockout_distrust,
@@ -25,8 +27,6 @@ from strands_robots.safety.peer_answers import (
     stop_distrust,
     with_stop_statement,
 )
-from strands_robots.safety.persistence import LockoutStore
-from strands_robots.safety.plane import SafetyPlane
 
 STOP = {"action": "stop"}
 

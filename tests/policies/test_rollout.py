@@ -15,7 +15,7 @@ from fixtures.waiting import eventually
 from strands_robots.contract import RolloutEvent
 from strands_robots.policies.rollout import Clock, Rollout, RolloutObservers, rollout_options
 from strands_robots.safety.gate import MotionGate
-from strands_robots.safety.turns import SWITCH_S
+from strands_robots.safety.process import SWITCH_S
 from strands_robots.utils import ValidationError
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from strands_robots.safety.answer_slots import SWEPT_ABOVE, AnswerSlots
+from strands_robots.safety.missed_stops import SWEPT_ABOVE, AnswerSlots
 from strands_robots.safety.orders import new_epoch
 
 

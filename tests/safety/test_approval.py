@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from strands_robots.safety.approval import Approval, Grants, Leave, digest
+from strands_robots.safety.authorization import Approval, Grants, Leave, digest
 from strands_robots.utils import ValidationError
 
 

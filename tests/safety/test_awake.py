@@ -12,9 +12,9 @@ from typing import Any
 import pytest
 from fixtures.waiting import eventually
 
-from strands_robots.safety import awake as module
-from strands_robots.safety.awake import BEAT_S, HOLD_S, LONG_HOLD_S, PAUSE_S, AwakeClock
+from strands_robots.safety import process as module
 from strands_robots.safety.gate import MotionGate
+from strands_robots.safety.process import BEAT_S, HOLD_S, LONG_HOLD_S, PAUSE_S, AwakeClock
 from strands_robots.state_files import uptime
 from strands_robots.zenoh_session import LEASE_MS
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from strands_robots.safety.clocks import KEPT_S, SOURCES_MAX, ObservedClocks, RoundTrip
+from strands_robots.safety.orders import KEPT_S, SOURCES_MAX, ObservedClocks, RoundTrip
 
 
 def test_a_round_trip_shows_the_lead_of_the_other_clock_and_the_time_on_the_network() -> None:

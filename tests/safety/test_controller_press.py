@@ -11,10 +11,10 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from fixtures.estop_orders import order_of
 
 from strands_robots.safety import ed25519
+from strands_robots.safety.answers import PRESSES_MAX
 from strands_robots.safety.controller import SafetyController
-from strands_robots.safety.estop_listener import ESTOP, VERDICT, notification
 from strands_robots.safety.orders import StopOrder, StopRules, new_epoch
-from strands_robots.safety.presses import PRESSES_MAX
+from strands_robots.safety.stop_link import ESTOP, VERDICT, notification
 
 
 class PatchyLink:

@@ -10,7 +10,7 @@ import pytest
 
 from strands_robots.safety import controller as controllers
 from strands_robots.safety.controller import SafetyController
-from strands_robots.safety.estop_listener import ESTOP, VERDICT, notification
+from strands_robots.safety.stop_link import ESTOP, VERDICT, notification
 
 
 class DeafLink:

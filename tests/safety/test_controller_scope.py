@@ -17,10 +17,11 @@ from fixtures.waiting import eventually
 from strands_robots.device_connect.safety_controller import envelope
 from strands_robots.envelope import is_error, text_of
 from strands_robots.safety import ed25519
-from strands_robots.safety.controller import Progress, SafetyController
-from strands_robots.safety.estop_listener import ESTOP, VERDICT, notification
+from strands_robots.safety.answers import Progress
+from strands_robots.safety.controller import SafetyController
 from strands_robots.safety.orders import StopOrder, StopRules
 from strands_robots.safety.scope import EVERY_ROBOT, WIDEN_S, KnownRobots, Scope
+from strands_robots.safety.stop_link import ESTOP, VERDICT, notification
 
 
 class Fleet:

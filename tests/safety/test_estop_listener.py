@@ -1,4 +1,4 @@
-"""Queue and failure budget of the e-stop listener."""
+"""Queue of the e-stop listener, and its budget of answers."""
 
 from __future__ import annotations
 
@@ -6,18 +6,8 @@ import threading
 
 import pytest
 
-from strands_robots.safety import estop_listener
-from strands_robots.safety.estop_listener import (
-    BUCKET_CAPACITY,
-    BUCKETS,
-    LATER_EVERY,
-    SOURCES_MAX,
-    VOUCHED_MAX,
-    FailureBudget,
-    FairQueue,
-    LatchAnswers,
-    StopEvent,
-)
+from strands_robots.safety.estop_listener import LatchAnswers
+from strands_robots.safety.stop_link import BUCKET_CAPACITY, BUCKETS, LATER_EVERY, VOUCHED_MAX, FairQueue, StopEvent
 
 
 def drained(events: FairQueue) -> list[StopEvent]:
@@ -64,11 +54,8 @@ def test_check_in_is_served_after_a_stop_and_never_displaces_one() -> None:
 
 
 @pytest.mark.parametrize("vouched", [False, True])
-def test_flood_of_stops_in_one_bucket_starves_nothing_that_is_not_urgent(
-    monkeypatch: pytest.MonkeyPatch, vouched: bool
-) -> None:
-    monkeypatch.setattr(estop_listener, "BUCKETS", 1)
-    events, taken = FairQueue(), list[str]()
+def test_flood_of_stops_in_one_bucket_starves_nothing_that_is_not_urgent(vouched: bool) -> None:
+    events, taken = FairQueue(buckets=1), list[str]()
     names = ("safety-1", "safety-1") if vouched else ("forger", "safety-1")
     if vouched:
         events.vouch("safety-1")
@@ -83,13 +70,9 @@ def test_flood_of_stops_in_one_bucket_starves_nothing_that_is_not_urgent(
     assert taken == ["emergencyStop"] * (LATER_EVERY - 1) + ["safetyCheckIn"]
 
 
-def test_two_names_that_share_a_bucket_of_one_queue_need_not_share_one_of_another(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(estop_listener, "BUCKETS", 2)
-
+def test_two_names_that_share_a_bucket_of_one_queue_need_not_share_one_of_another() -> None:
     def kept() -> int:
-        events = FairQueue()
+        events = FairQueue(buckets=2)
         for _ in range(BUCKET_CAPACITY):
             events.put("emergencyStop", "safety-1", b"")
             events.put("emergencyStop", "safety-2", b"")
@@ -151,38 +134,3 @@ def test_stop_of_a_flood_is_answered_within_a_budget_and_one_that_comes_again_al
     assert answers.allows("arm-1", "true", 10.2)
     assert not answers.allows("arm-2", "true", 10.2), "each robot answers for itself"
     assert answers.allows("arm-1", "another", 11.0)
-
-
-def test_failure_budget_of_a_source_lasts_until_the_next_second() -> None:
-    budget = FailureBudget(per_s=3)
-    for _ in range(3):
-        assert budget.allows("forger", 10.0)
-        budget.record("forger", 10.0)
-    assert not budget.allows("forger", 10.9)
-    assert budget.allows("forger", 11.0)
-    budget.record("forger", 11.0)
-    assert budget.allows("forger", 11.1)
-
-
-def test_failures_of_one_source_cost_no_other() -> None:
-    budget = FailureBudget(per_s=1)
-    budget.record("forger", 10.0)
-    assert not budget.allows("forger", 10.0)
-    assert budget.allows("safety-1", 10.0)
-
-
-def test_failures_under_made_up_names_use_up_the_budget_of_all() -> None:
-    budget = FailureBudget(in_all_per_s=3)
-    for number in range(3):
-        assert budget.allows(f"forger-{number}", 10.0)
-        budget.record(f"forger-{number}", 10.0)
-    assert not budget.allows("forger-4", 10.9)
-    assert budget.allows("forger-4", 11.0)
-
-
-def test_invented_sources_are_bounded_and_the_latest_is_remembered() -> None:
-    budget = FailureBudget(per_s=1, in_all_per_s=11 * SOURCES_MAX)
-    for number in range(10 * SOURCES_MAX):
-        budget.record(f"forger-{number}", 10.0)
-    assert not budget.allows(f"forger-{10 * SOURCES_MAX - 1}", 10.0)
-    assert budget.allows("forger-0", 10.0)

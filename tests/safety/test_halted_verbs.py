@@ -15,8 +15,8 @@ from strands_robots import Permit, verb
 from strands_robots.contract import adapt
 from strands_robots.hardware import HardwareRobot
 from strands_robots.safety.gate import MotionGate, MotionRefused
-from strands_robots.safety.halted_verbs import void_calls
 from strands_robots.safety.stop_executor import stop_executor
+from strands_robots.safety.stop_targets import void_calls
 from strands_robots.safety.stopping import PendingVerdict, StopVerdict
 from strands_robots.utils import ValidationError
 

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from strands_robots.safety import head_witness
-from strands_robots.safety.head_witness import CheckInAnswers, HeadWitness, chosen
+from strands_robots.safety import checkin
+from strands_robots.safety.checkin import CheckInAnswers, HeadWitness, chosen
 
 OWN = "0" * 32
 
@@ -93,7 +93,7 @@ def test_flood_of_invented_audits_is_bounded_and_a_proven_head_is_written_all_th
     controller = witness(clock, written, always=True)
     for number in range(2000):
         controller.receive(f"ghost-{number}", answer(number), by="safety-1")
-    assert len(written) == head_witness.CLAIMS_PER_MIN
+    assert len(written) == checkin.CLAIMS_PER_MIN
     assert controller.receive("arm-1", answer(5000), by="safety-1", proven=True)
     assert written[-1] == ("safety-1", "arm-1", 1, True)
 
@@ -107,7 +107,7 @@ def test_answer_that_holds_no_head_is_nothing() -> None:
 
 def test_process_answers_one_check_in_in_ten_seconds(monkeypatch: Any) -> None:
     clock = Clock()
-    monkeypatch.setattr(head_witness, "audit_head", lambda: answer(1)["audit"])
+    monkeypatch.setattr(checkin, "audit_head", lambda: answer(1)["audit"])
     answers = CheckInAnswers(clock)
     given = []
     for tick in range(100):

@@ -18,25 +18,29 @@ from fixtures.waiting import eventually
 
 from strands_robots.audit import flush_audit, read_audit_log
 from strands_robots.safety import ed25519, missed_stops
-from strands_robots.safety.answer_slots import AnswerSlots
-from strands_robots.safety.clearance import clear_here
 from strands_robots.safety.controller import SafetyController
-from strands_robots.safety.estop_listener import ESTOP, VERDICT, notification
 from strands_robots.safety.lockout import MAX_EPOCHS
 from strands_robots.safety.missed_stops import (
-    ANSWER,
     ANSWER_MAX_BYTES,
     ANSWERS_ENOUGH,
-    QUESTION,
     STOPS_MAX_BYTES,
     Answerer,
+    AnswerSlots,
     answer_fields,
     waiting_s,
 )
 from strands_robots.safety.network_key import DEVICE_CONNECT, NetworkKey
 from strands_robots.safety.orders import StopRules, new_epoch, params_of
-from strands_robots.safety.originals import ORIGINAL_MAX_BYTES, STOPS_MAX, Original, Originals
-from strands_robots.safety.persistence import LockoutStore, ResumedEpochs
+from strands_robots.safety.persistence import (
+    ORIGINAL_MAX_BYTES,
+    STOPS_MAX,
+    LockoutStore,
+    Original,
+    Originals,
+    ResumedEpochs,
+)
+from strands_robots.safety.resume import clear_here
+from strands_robots.safety.stop_link import ANSWER, ESTOP, QUESTION, VERDICT, notification
 from strands_robots.state_files import uptime
 
 Join = Callable[..., BusMachine]

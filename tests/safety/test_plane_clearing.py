@@ -17,7 +17,7 @@ from fixtures.waiting import eventually
 
 from strands_robots.audit import read_audit_log
 from strands_robots.envelope import is_error
-from strands_robots.safety import clearance, ed25519
+from strands_robots.safety import ed25519, resume
 from strands_robots.safety.orders import StopOrder, new_epoch
 from strands_robots.safety.persistence import LockoutStore
 from strands_robots.safety.plane import SafetyPlane
@@ -83,10 +83,10 @@ def test_a_local_clear_frees_names_who_and_survives_a_restart(plane: SafetyPlane
 def test_order_at_the_machine_clears_the_robot_it_names(plane: SafetyPlane, add: Add) -> None:
     robots = {name: add(name) for name in ("arm-1", "arm-2")}
     plane.emergency_stop(order())
-    clearance.order_clearance("ann", ["arm-1"])
+    resume.order_clearance("ann", ["arm-1"])
     eventually(lambda: not robots["arm-1"].refuses())
     assert robots["arm-2"].refuses()
-    eventually(lambda: [each.suffix for each in clearance.clearances().iterdir()] == [".said"])
+    eventually(lambda: [each.suffix for each in resume.clearances().iterdir()] == [".said"])
 
 
 def test_clearing_at_the_machine_reaches_a_running_robot_one_that_is_off_and_says_of_a_third_that_it_is_free(
@@ -96,11 +96,11 @@ def test_clearing_at_the_machine_reaches_a_running_robot_one_that_is_off_and_say
     add("arm-2", key="k2")
     plane.emergency_stop(order())
     plane.robots["arm-2"].close()
-    assert clearance.clear_here("ann", ["arm-1"], wait_s=20) == {"arm-1": "cleared"}
+    assert resume.clear_here("ann", ["arm-1"], wait_s=20) == {"arm-1": "cleared"}
     assert not running.refuses(), "what is told to be cleared is"
     plane.emergency_stop(order())
     # No process takes the orders of the others, which are waited for to the end.
-    outcome = clearance.clear_here("ann", ["arm-2", "arm-3"], wait_s=0.1)
+    outcome = resume.clear_here("ann", ["arm-2", "arm-3"], wait_s=0.1)
     assert outcome == {"arm-2": "cleared on disk", "arm-3": "not locked here"}
     assert running.refuses()
     after = add("arm-2", key="k2")
@@ -114,7 +114,7 @@ class SlowProcess:
 
     def __init__(self) -> None:
         self.doing, self.go_on = threading.Event(), threading.Event()
-        self._inbox = clearance.ClearanceInbox(lambda: ["arm-1"], self._clear)
+        self._inbox = resume.ClearanceInbox(lambda: ["arm-1"], self._clear)
         self._thread = threading.Thread(target=lambda: eventually(self._took, within=60))
 
     def _clear(self, who: str, name: str) -> str:
@@ -137,7 +137,7 @@ class SlowProcess:
 
 def test_cleared_is_answered_once_the_process_has_done_it() -> None:
     answers: list[dict[str, str]] = []
-    asking = threading.Thread(target=lambda: answers.append(clearance.clear_here("ann", ["arm-1"], wait_s=30)))
+    asking = threading.Thread(target=lambda: answers.append(resume.clear_here("ann", ["arm-1"], wait_s=30)))
     with SlowProcess() as process:
         asking.start()
         assert process.doing.wait(20)
@@ -150,26 +150,26 @@ def test_cleared_is_answered_once_the_process_has_done_it() -> None:
 
 def test_order_that_is_not_carried_out_is_not_reported_as_cleared() -> None:
     with SlowProcess():
-        answers = clearance.clear_here("ann", ["arm-1"], wait_s=2.0)
+        answers = resume.clear_here("ann", ["arm-1"], wait_s=2.0)
     assert "has not carried it out" in answers["arm-1"]
-    assert list(clearance.clearances().iterdir()) == []
+    assert list(resume.clearances().iterdir()) == []
 
 
 def test_order_from_another_time_is_void_and_not_reported_as_cleared(
     plane: SafetyPlane, add: Add, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def order_an_hour_ago(who: str, names: list[str]) -> list[Path]:
-        clearance.clearances().mkdir(mode=0o700, parents=True)
-        order = clearance.clearances() / "a.draft"
+        resume.clearances().mkdir(mode=0o700, parents=True)
+        order = resume.clearances() / "a.draft"
         order.write_text(
             json.dumps({"who": who, "robot_id": names[0], "boot": boot(), "t": uptime() - 3600}), encoding="utf-8"
         )
         return [order.replace(order.with_suffix(".json"))]
 
-    monkeypatch.setattr(clearance, "order_clearance", order_an_hour_ago)
+    monkeypatch.setattr(resume, "order_clearance", order_an_hour_ago)
     robot = add()
     plane.emergency_stop(order())
-    assert "nothing was cleared" in clearance.clear_here("ann", ["arm-1"], wait_s=20)["arm-1"]
+    assert "nothing was cleared" in resume.clear_here("ann", ["arm-1"], wait_s=20)["arm-1"]
     assert robot.refuses()
 
 
@@ -178,7 +178,7 @@ def test_running_robot_that_is_not_locked_is_not_reported_as_cleared(plane: Safe
     add("arm-2")
     plane.emergency_stop(order())
     plane.clear_local("bob", ["arm-1"])
-    assert clearance.clear_here("ann", ["arm-1"], wait_s=20) == {"arm-1": "not locked here"}
+    assert resume.clear_here("ann", ["arm-1"], wait_s=20) == {"arm-1": "not locked here"}
 
 
 def test_robot_that_leaves_before_its_order_is_not_reported_as_cleared(
@@ -194,7 +194,7 @@ def test_robot_that_leaves_before_its_order_is_not_reported_as_cleared(
     robot = add("arm-1")
     add("arm-2")
     plane.emergency_stop(order())
-    assert "left its process" in clearance.clear_here("ann", ["arm-1"], wait_s=20)["arm-1"]
+    assert "left its process" in resume.clear_here("ann", ["arm-1"], wait_s=20)["arm-1"]
     assert robot.refuses()
 
 
@@ -208,7 +208,7 @@ def test_robot_whose_clearance_was_not_stored_is_free_and_that_is_reported(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(plane.store, "save", full)
-    answers = clearance.clear_here("ann", ["arm-1"], wait_s=20)["arm-1"]
+    answers = resume.clear_here("ann", ["arm-1"], wait_s=20)["arm-1"]
     assert answers == "cleared, but not kept on the disk: after a restart it may be locked again"
     assert not robot.refuses()
     assert LockoutStore().load("k").state.locked
@@ -216,13 +216,13 @@ def test_robot_whose_clearance_was_not_stored_is_free_and_that_is_reported(
 
 def test_unfinished_orders_are_removed_after_a_minute(plane: SafetyPlane, add: Add) -> None:
     add()
-    directory = clearance.clearances()
+    directory = resume.clearances()
     directory.mkdir(mode=0o700, parents=True)
     old = [directory / name for name in ("a.taken", "b.draft", "c.said")]
     young = directory / "d.taken"
     for path in (*old, young):
         path.touch()
-    long_ago = time.time() - 2 * clearance.VALID_S
+    long_ago = time.time() - 2 * resume.VALID_S
     for path in old:
         os.utime(path, (long_ago, long_ago))
     plane.emergency_stop(order())
@@ -232,7 +232,7 @@ def test_unfinished_orders_are_removed_after_a_minute(plane: SafetyPlane, add: A
 def test_order_directory_that_others_may_write_is_not_read(plane: SafetyPlane, add: Add) -> None:
     robot = add()
     plane.emergency_stop(order())
-    clearance.order_clearance("ann", ["arm-1"])
-    clearance.clearances().chmod(0o777)
+    resume.order_clearance("ann", ["arm-1"])
+    resume.clearances().chmod(0o777)
     time.sleep(0.6)
     assert robot.refuses()

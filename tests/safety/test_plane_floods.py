@@ -14,7 +14,7 @@ from strands_robots.safety import plane as plane_module
 from strands_robots.safety.lockout import MAX_EPOCHS, OVERFLOW
 from strands_robots.safety.orders import RobotReport, StopOrder, new_epoch
 from strands_robots.safety.plane import SafetyPlane
-from strands_robots.safety.stop_count import SOURCES_NAMED, StopCount
+from strands_robots.safety.reporting import SOURCES_NAMED, StopCount
 
 Add = Callable[..., RecordingRobot]
 

@@ -10,17 +10,17 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from fixtures.waiting import eventually
 
+from strands_robots.rate_limits import EventBudget
 from strands_robots.safety import ed25519, standing_roster
-from strands_robots.safety.consoles import console_key
-from strands_robots.safety.estop_listener import ESTOP, VERDICT, FailureBudget, notification
+from strands_robots.safety.identity import console_key
 from strands_robots.safety.network_key import DEVICE_CONNECT, NetworkKey
 from strands_robots.safety.orders import new_epoch, signed_stop
-from strands_robots.safety.roster import Roster, RosterRow
-from strands_robots.safety.roster_inbox import RosterInbox
-from strands_robots.safety.roster_report import (
+from strands_robots.safety.roster import (
     REPORT_MAX_BYTES,
-    STOP_ROSTER,
+    Roster,
+    RosterInbox,
     RosterReport,
+    RosterRow,
     read_report,
     report_fields,
     trusted_controllers,
@@ -28,6 +28,7 @@ from strands_robots.safety.roster_report import (
 from strands_robots.safety.sightings import Known
 from strands_robots.safety.standing_roster import StandingRoster
 from strands_robots.safety.statements import Purpose, signed
+from strands_robots.safety.stop_link import ESTOP, STOP_ROSTER, VERDICT, notification
 
 NETWORK = NetworkKey.of(DEVICE_CONNECT, ["tcp/127.0.0.1:7447"])
 
@@ -128,7 +129,7 @@ def test_forged_stops_are_checked_within_a_budget(monkeypatch: pytest.MonkeyPatc
             return real(source, *rest)
 
         monkeypatch.setattr(standing.roster._rules, "signature_refusal", counted)
-        standing.roster._failures = FailureBudget(per_s=2, in_all_per_s=3)
+        standing.roster._failures = EventBudget(2, 3)
         for n in range(40):
             standing.stop(new_epoch(), f"made-up-{n}")
         eventually(lambda: len(checked) == 3 and not standing.roster._pending)

@@ -8,8 +8,7 @@ from typing import Any
 
 import pytest
 
-from strands_robots.safety.answers import Answer, Answers, Received
-from strands_robots.safety.controller import StopReport
+from strands_robots.safety.answers import Answer, Answers, Received, StopReport
 from strands_robots.safety.identity import ROBOTS, EnrolledKeys, Exemption, KeyFile, of_tenant
 from strands_robots.safety.network_key import DEVICE_CONNECT, MESH, NetworkKey
 from strands_robots.safety.scope import Scope

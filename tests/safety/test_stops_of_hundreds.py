@@ -19,7 +19,7 @@ from fixtures.waiting import eventually
 from strands_robots.safety import controller as controller_module
 from strands_robots.safety import estop_listener, reporting
 from strands_robots.safety.controller import SafetyController
-from strands_robots.safety.estop_listener import VERDICT, EstopListener, notification
+from strands_robots.safety.estop_listener import EstopListener
 from strands_robots.safety.orders import (
     ANSWERED,
     ANSWERED_MAX_BYTES,
@@ -32,6 +32,7 @@ from strands_robots.safety.orders import (
 )
 from strands_robots.safety.plane import Registered, SafetyPlane
 from strands_robots.safety.reporting import Reporter, StopRun
+from strands_robots.safety.stop_link import VERDICT, notification
 from strands_robots.safety.stopping import StopVerdict
 
 Add = Callable[..., RecordingRobot]

@@ -10,8 +10,8 @@ import pytest
 
 from strands_robots.safety import controller as controller_module
 from strands_robots.safety.controller import SafetyController
-from strands_robots.safety.estop_listener import OnEvent, OnState
-from strands_robots.safety.turns import SWITCH_S, LongTurns, PausedCollector, ShortTurns
+from strands_robots.safety.process import SWITCH_S, LongTimeSlices, PausedCollector, ShortTimeSlices
+from strands_robots.safety.stop_link import OnEvent, OnState
 
 
 @pytest.fixture(autouse=True)
@@ -36,7 +36,7 @@ class NoLink:
 
 
 def test_turns_are_short_until_the_last_of_their_users_has_ended() -> None:
-    turns = ShortTurns()
+    turns = ShortTimeSlices()
     first, second = turns.begin(), turns.begin()
     first()
     first()
@@ -47,7 +47,7 @@ def test_turns_are_short_until_the_last_of_their_users_has_ended() -> None:
 
 def test_turns_that_are_shorter_already_stay() -> None:
     sys.setswitchinterval(0.0001)
-    end = ShortTurns().begin()
+    end = ShortTimeSlices().begin()
     assert sys.getswitchinterval() == pytest.approx(0.0001, rel=0.05)
     end()
     assert sys.getswitchinterval() == pytest.approx(0.0001, rel=0.05)
@@ -55,7 +55,7 @@ def test_turns_that_are_shorter_already_stay() -> None:
 
 def test_open_safety_controller_has_short_turns(monkeypatch: pytest.MonkeyPatch) -> None:
     # Whatever ran before in this process may have shortened its turns already.
-    monkeypatch.setattr(controller_module, "shorten_turns", ShortTurns().begin)
+    monkeypatch.setattr(controller_module, "shorten_time_slices", ShortTimeSlices().begin)
     controller = SafetyController("safety-1", NoLink)
     assert sys.getswitchinterval() == pytest.approx(SWITCH_S)
     controller.close()
@@ -64,8 +64,8 @@ def test_open_safety_controller_has_short_turns(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_turns_have_their_own_length_during_a_stop_of_many_and_are_short_again_after_it() -> None:
-    short = ShortTurns()
-    end_short, end_long = short.begin(), LongTurns(short).begin()
+    short = ShortTimeSlices()
+    end_short, end_long = short.begin(), LongTimeSlices(short).begin()
     assert sys.getswitchinterval() == pytest.approx(0.005)
     end_long()
     assert sys.getswitchinterval() == pytest.approx(SWITCH_S)
@@ -74,8 +74,8 @@ def test_turns_have_their_own_length_during_a_stop_of_many_and_are_short_again_a
 
 
 def test_turns_whose_last_user_left_during_a_stop_of_many_stay_as_they_were() -> None:
-    short = ShortTurns()
-    end_short, end_long = short.begin(), LongTurns(short).begin()
+    short = ShortTimeSlices()
+    end_short, end_long = short.begin(), LongTimeSlices(short).begin()
     end_short()
     end_long()
     assert sys.getswitchinterval() == pytest.approx(0.005)

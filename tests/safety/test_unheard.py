@@ -14,7 +14,7 @@ from strands_robots.safety.roster import Roster
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.safety.sighting_file import Note, Served, process_start
 from strands_robots.safety.sightings import sightings, this_moment
-from strands_robots.safety.unheard import unheard_now, unheard_since
+from strands_robots.safety.stop_notes import unheard_now, unheard_since
 
 NETWORK = NetworkKey.of(DEVICE_CONNECT, ["tcp/127.0.0.1:7447"])
 ELSEWHERE = NetworkKey.of(DEVICE_CONNECT, ["tcp/127.0.0.1:7448"])

@@ -18,7 +18,7 @@ from fixtures.waiting import eventually
 from strands_robots.contract import adapt
 from strands_robots.envelope import RefusalReason, Refused, error, success
 from strands_robots.hardware import HardwareRobot
-from strands_robots.safety.approval import Approval, Grants, Leave, digest
+from strands_robots.safety.authorization import Approval, Grants, Leave, digest
 from strands_robots.safety.gate import MotionRequest
 from strands_robots.serving import control
 from strands_robots.serving.peer_verbs import PEER_VERBS

@@ -19,7 +19,7 @@ from strands_robots.hardware import HardwareRobot
 from strands_robots.mesh.children import OneRobot
 from strands_robots.ros.gate import CommandGate
 from strands_robots.ros.memory import MemoryLink
-from strands_robots.safety.approval import Leave
+from strands_robots.safety.authorization import Leave
 from strands_robots.safety.gate import MotionGate
 from strands_robots.serving.offered_verbs import own_verbs
 from strands_robots.serving.peer_verbs import PEER_VERBS

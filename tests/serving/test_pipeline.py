@@ -11,7 +11,7 @@ import pytest
 from fixtures.toy_robots import ToyRobot
 
 from strands_robots.envelope import RefusalReason, Refused, error
-from strands_robots.safety.approval import Approval, Grants
+from strands_robots.safety.authorization import Approval, Grants
 from strands_robots.serving.pipeline import Command, Pipeline, Result
 from strands_robots.serving.robot_verbs import ARM_VERBS
 from strands_robots.serving.verbs import Arguments

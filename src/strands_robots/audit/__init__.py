@@ -26,7 +26,7 @@ from strands_robots import settings
 from strands_robots.audit.head import Anchor, log_id
 from strands_robots.audit.journal import NAME, AuditEntry, Journal, storable
 from strands_robots.audit.lasting import LastingRecords, identity, lasting_journal, rotated_out, verify_both
-from strands_robots.audit.witness import WITNESS, compare, stated_head, witnessed
+from strands_robots.audit.verification import WITNESS, compare, stated_head, witnessed
 from strands_robots.state_files import state_dir
 from strands_robots.stop_log import stop_logger
 from strands_robots.utils import shown

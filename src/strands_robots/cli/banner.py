@@ -12,8 +12,7 @@ from strands_robots import settings
 from strands_robots.cli.output import Screen
 from strands_robots.fleet.callers import SOURCE
 from strands_robots.fleet.link_flags import described
-from strands_robots.safety.approval import listed
-from strands_robots.safety.authorization import motion_refusal
+from strands_robots.safety.authorization import listed, motion_refusal
 from strands_robots.utils import redacted
 
 if TYPE_CHECKING:

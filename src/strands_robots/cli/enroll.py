@@ -13,8 +13,7 @@ from strands_robots.cli.output import CliError, Exit, Screen, label, plain, tabl
 from strands_robots.fleet.all_lockouts import ask_lockouts, by_robot, enroll_all
 from strands_robots.fleet.enrollment import Enrolled, Enrolment
 from strands_robots.safety import ed25519
-from strands_robots.safety.consoles import enrolled_consoles
-from strands_robots.safety.identity import DEFAULT_TENANT, KeyFileError, fingerprint
+from strands_robots.safety.identity import DEFAULT_TENANT, KeyFileError, enrolled_consoles, fingerprint
 from strands_robots.utils import identifier, number, shown
 
 COMPARE = "Compare each with the fingerprint that `strands-robots doctor` shows at the robot's own machine."

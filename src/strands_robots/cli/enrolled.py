@@ -19,7 +19,7 @@ from strands_robots.safety.identity import (
     fingerprint,
 )
 from strands_robots.safety.lockout import utc
-from strands_robots.safety.silence import described
+from strands_robots.safety.roster import described
 from strands_robots.utils import operator, text
 
 REASON_MAX = 200

@@ -13,8 +13,8 @@ import typer
 
 from strands_robots.cli.command import command
 from strands_robots.cli.output import CliError, Exit, Screen
-from strands_robots.safety.consoles import console_key
 from strands_robots.safety.ed25519 import keygen, load_signing_key
+from strands_robots.safety.identity import console_key
 from strands_robots.state_files import state_dir
 
 T = TypeVar("T")

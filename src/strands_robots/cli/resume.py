@@ -15,11 +15,11 @@ from strands_robots.cli.output import CliError, Exit, Screen, label, plain, tabl
 from strands_robots.cli.readiness import state_problem
 from strands_robots.fleet.all_lockouts import ask_lockouts, by_robot, resume_all, unheard_in
 from strands_robots.fleet.lockout_report import LockoutReport
-from strands_robots.safety.approval import GRANT_S, Grants
-from strands_robots.safety.clearance import NOT_LOCKED, clear_here
+from strands_robots.safety.authorization import GRANT_S, Grants
 from strands_robots.safety.lockout import Lockout, utc
 from strands_robots.safety.persistence import LockoutStore, StoredLockout
-from strands_robots.safety.unheard import Unheard, unheard_since
+from strands_robots.safety.resume import NOT_LOCKED, clear_here
+from strands_robots.safety.stop_notes import Unheard, unheard_since
 from strands_robots.state_files import state_dir
 from strands_robots.utils import identifier, number, operator
 

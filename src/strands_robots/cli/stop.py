@@ -35,7 +35,8 @@ from strands_robots.fleet.callers import SOURCE, TOOL
 from strands_robots.fleet.fleet_verdict import FleetVerdict, NetworkVerdict
 from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.stop_answers import combined_verdict, not_reached, roster_verdict, stop_outcome
-from strands_robots.safety.controller import DEADLINE_S, Progress
+from strands_robots.safety.answers import Progress
+from strands_robots.safety.controller import DEADLINE_S
 from strands_robots.safety.stop_roster import StopOutcome
 from strands_robots.serving.stop_arguments import robot_of_world, stop_reason, stop_robot, stop_scope
 from strands_robots.utils import ValidationError, device_id, number

@@ -8,10 +8,8 @@ from typing import Any
 from rich.table import Table
 
 from strands_robots.cli.output import Exit, Screen, label, plain, table
-from strands_robots.safety.answers import Answer
-from strands_robots.safety.controller import Progress, StopReport
-from strands_robots.safety.roster import RosterRow
-from strands_robots.safety.silence import seconds
+from strands_robots.safety.answers import Answer, Progress, StopReport
+from strands_robots.safety.roster import RosterRow, seconds
 from strands_robots.safety.stop_notes import problem_sentence, stop_notes
 from strands_robots.safety.stop_roster import StopOutcome
 

@@ -12,8 +12,8 @@ from strands_robots.dashboard.fleet_model import FleetModel, key_of
 from strands_robots.fleet.all_stops import for_all
 from strands_robots.fleet.fleet_verdict import NetworkVerdict
 from strands_robots.fleet.stop_button import StopButton
-from strands_robots.safety.answers import Answer
-from strands_robots.safety.controller import UNCONFIRMED_S, Progress, StopReport
+from strands_robots.safety.answers import Answer, Progress, StopReport
+from strands_robots.safety.controller import UNCONFIRMED_S
 from strands_robots.safety.orders import new_epoch
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.safety.statements import Proof

@@ -25,8 +25,8 @@ from strands_robots.dashboard.pictures import SMALL, SMALL_HZ, Pictures
 from strands_robots.dashboard.verb_forms import LEFT_OUT
 from strands_robots.envelope import Envelope, error, is_error, jsonable, text_of
 from strands_robots.recording.cameras import OVERVIEW
+from strands_robots.safety.stop_notes import Unheard, unheard_now
 from strands_robots.safety.stopping import grade
-from strands_robots.safety.unheard import Unheard, unheard_now
 from strands_robots.serving.advertised import STOPS
 from strands_robots.utils import ValidationError, plain_text, shown, text
 

@@ -26,13 +26,18 @@ from strands_robots.device_connect.safety_registration import (
     SafetyRegistration,
     stops_of,
 )
-from strands_robots.device_connect.telemetry import READ_DEADLINE_S, Activity, RolloutPump, StateReports, sweep
+from strands_robots.device_connect.telemetry import (
+    READ_DEADLINE_S,
+    Activity,
+    RolloutPump,
+    StateReports,
+    sweep,
+)
 from strands_robots.envelope import Envelope, RefusalReason, Refused, error, jsonable, success
-from strands_robots.safety.approval import Approval
-from strands_robots.safety.authorization import ANONYMOUS, Authorization, caller_name
-from strands_robots.safety.estop_listener import ESTOP
+from strands_robots.safety.authorization import ANONYMOUS, Approval, Authorization, caller_name
 from strands_robots.safety.gate import MotionRequest
 from strands_robots.safety.stop_executor import stop_executor
+from strands_robots.safety.stop_link import ESTOP
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.control import ControlChange
 from strands_robots.serving.offered_verbs import Offers, own_verbs

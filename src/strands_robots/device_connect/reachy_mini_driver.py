@@ -15,8 +15,7 @@ from strands_robots.device_connect._compat import Labels, emit
 from strands_robots.device_connect.base_driver import Activity, RobotDriver
 from strands_robots.drivers.reachy import ReachyDriver
 from strands_robots.drivers.reachy.links import DEFAULT_PREFIX
-from strands_robots.safety.approval import Approval
-from strands_robots.safety.authorization import Authorization
+from strands_robots.safety.authorization import Approval, Authorization
 from strands_robots.serving.reachy_verbs import REACHY_VERBS
 from strands_robots.serving.verbs import Verb
 from strands_robots.utils import flag

@@ -14,8 +14,7 @@ from strands_robots.device_connect._compat import Labels, emit
 from strands_robots.device_connect.base_driver import Activity, RobotDriver, stated_type
 from strands_robots.envelope import fields_of
 from strands_robots.policies.base import plain_numbers
-from strands_robots.safety.approval import Approval
-from strands_robots.safety.authorization import Authorization
+from strands_robots.safety.authorization import Approval, Authorization
 from strands_robots.serving.policy_arguments import profile_list
 from strands_robots.serving.robot_verbs import ARM_VERBS, BASE_VERBS, NAVIGATING_BASE_VERBS
 from strands_robots.serving.verbs import Verb

@@ -10,11 +10,11 @@ from strands_robots.device_connect.backends import LinkConfig
 from strands_robots.device_connect.links import enrolled_robots, network_of, usual_link
 from strands_robots.device_connect.stop_link import stop_link
 from strands_robots.envelope import Envelope, error, success, text_of
-from strands_robots.safety.controller import SafetyController, StopReport
-from strands_robots.safety.estop_listener import notification
+from strands_robots.safety.answers import StopReport
+from strands_robots.safety.controller import SafetyController
 from strands_robots.safety.roster import Roster
-from strands_robots.safety.roster_report import STOP_ROSTER
 from strands_robots.safety.standing_roster import StandingRoster, controllers_identity
+from strands_robots.safety.stop_link import STOP_ROSTER, notification
 from strands_robots.safety.stop_notes import stop_notes
 from strands_robots.safety.stop_roster import StopOutcome, robots_known_at
 

@@ -19,16 +19,17 @@ from strands_robots.device_connect.discovery import parts
 from strands_robots.device_connect.links import network_of
 from strands_robots.device_connect.stop_link import NoStopLink, stop_link
 from strands_robots.envelope import Envelope
-from strands_robots.safety.estop_listener import ESTOP, ListenerRegistration, estop_listener
+from strands_robots.safety.estop_listener import ListenerRegistration, estop_listener
 from strands_robots.safety.gate import MotionGate
 from strands_robots.safety.identity import DEFAULT_TENANT, SigningIdentity, local_name, robot_identity
+from strands_robots.safety.lockout import is_epoch
 from strands_robots.safety.orders import REASON_MAX, StopOrder, epoch_of, params_of
 from strands_robots.safety.persistence import hardware_key, simulation_key
 from strands_robots.safety.plane import Registered, plane
-from strands_robots.safety.resume import is_epoch
 from strands_robots.safety.scope import own_cell
 from strands_robots.safety.sightings import sightings
 from strands_robots.safety.statements import Purpose, signed
+from strands_robots.safety.stop_link import ESTOP, StopEvent
 from strands_robots.serving.workers import Share
 from strands_robots.stop_log import stop_logger
 from strands_robots.utils import RESERVED_DEVICE_IDS, unreserved
@@ -198,9 +199,9 @@ class SafetyRegistration:
     def runtime_estop(self, source: object, params: object, raw: bytes | int | None = None) -> None:
         """Act on an emergency stop of the runtime's handler; return at once."""
         if isinstance(source, str):
-            estop_listener().accept_params(
-                source, params if isinstance(params, Mapping) else {}, "runtime", raw, self._network
-            )
+            network = "" if self._network is None else self._network.text
+            stop = StopEvent(ESTOP, source, raw, time.monotonic(), network)
+            estop_listener().accept(stop, "runtime", params if isinstance(params, Mapping) else {})
 
     def raise_estop(self, params: Mapping[str, Any]) -> None:
         """Lock and halt on this device's own emergency stop; return at once.

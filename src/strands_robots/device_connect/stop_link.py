@@ -17,10 +17,18 @@ from typing import Any
 from device_connect_edge.messaging import MessagingError
 
 from strands_robots.device_connect.backends import LinkConfig
-from strands_robots.safety.estop_listener import CHECK_IN_ANSWER, ESTOP, VERDICT, OnEvent, OnState, StopLink
-from strands_robots.safety.missed_stops import ANSWER, QUESTION
 from strands_robots.safety.orders import PARSED_MAX_BYTES
-from strands_robots.safety.roster_report import STOP_ROSTER
+from strands_robots.safety.stop_link import (
+    ANSWER,
+    CHECK_IN_ANSWER,
+    ESTOP,
+    QUESTION,
+    STOP_ROSTER,
+    VERDICT,
+    OnEvent,
+    OnState,
+    StopLink,
+)
 from strands_robots.stop_log import stop_logger
 from strands_robots.zenoh_session import StopSession
 

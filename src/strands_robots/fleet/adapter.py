@@ -15,7 +15,7 @@ from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope
 if TYPE_CHECKING:
     from strands_robots.fleet.lockout_report import LockoutReport, Resumed
     from strands_robots.fleet.stop_button import StopSender
-    from strands_robots.safety.controller import OnProgress
+    from strands_robots.safety.answers import OnProgress
     from strands_robots.safety.network_key import NetworkKey
     from strands_robots.safety.stop_roster import StopOutcome
     from strands_robots.serving.advertised import AdvertisedVerb

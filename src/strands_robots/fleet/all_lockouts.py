@@ -12,7 +12,7 @@ from strands_robots.fleet.enrollment import Enrolled, Enrolment, enroll, shown_k
 from strands_robots.fleet.lockout_report import LockoutReport, Resumed
 from strands_robots.fleet.networks import Networks
 from strands_robots.safety.identity import KeyFileError, fingerprint
-from strands_robots.safety.unheard import Unheard, unheard_now
+from strands_robots.safety.stop_notes import Unheard, unheard_now
 from strands_robots.utils import plain_text
 
 FAILED = "robots cannot be asked for their lockouts"

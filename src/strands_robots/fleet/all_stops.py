@@ -17,7 +17,7 @@ from strands_robots.fleet.fleet_verdict import FleetVerdict, NetworkVerdict
 from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.side_by_side import on_own_thread, side_by_side
 from strands_robots.fleet.stop_answers import not_reached, roster_verdict
-from strands_robots.safety.controller import Progress
+from strands_robots.safety.answers import Progress
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.orders import new_epoch
 from strands_robots.safety.roster import RosterRow

@@ -12,7 +12,7 @@ from strands_robots.errors import NoSuchRobotError
 from strands_robots.fleet.lockout_report import LockoutReport
 from strands_robots.safety.identity import EnrolledKeys, Exemption, fingerprint, local_name
 from strands_robots.safety.network_key import NetworkKey
-from strands_robots.safety.roster_report import CELL_MAX
+from strands_robots.safety.roster import CELL_MAX
 from strands_robots.safety.sightings import sightings
 from strands_robots.safety.statements import Purpose, distrust, own_key
 from strands_robots.utils import near, operator, shown

@@ -10,11 +10,10 @@ from typing import Any
 
 from strands_robots.envelope import Envelope, error, is_error, success, text_of
 from strands_robots.fleet.side_by_side import side_by_side
-from strands_robots.safety.answers import Answer
-from strands_robots.safety.controller import StopReport
+from strands_robots.safety.answers import Answer, StopReport
 from strands_robots.safety.network_key import NetworkKey
+from strands_robots.safety.roster import Sending
 from strands_robots.safety.sightings import Known
-from strands_robots.safety.silence import Sending
 from strands_robots.safety.stop_notes import stop_notes
 from strands_robots.safety.stop_roster import StopOutcome, StopRoster
 from strands_robots.safety.stopping import explain, grade

@@ -9,15 +9,12 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, Protocol
 
-from strands_robots.safety.controller import OnProgress, Progress, StopReport
+from strands_robots.safety.answers import OnProgress, Press, Progress, StopReport
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.orders import new_epoch
-from strands_robots.safety.presses import Press
-from strands_robots.safety.roster_inbox import OnReport
-from strands_robots.safety.roster_search import RosterSearch
+from strands_robots.safety.roster import OnReport, Sending
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
-from strands_robots.safety.silence import Sending
-from strands_robots.safety.stop_roster import StopOutcome, StopRoster
+from strands_robots.safety.stop_roster import RosterSearch, StopOutcome, StopRoster
 
 KEY_REPEAT_S = 1.0
 """Presses closer than this are one stop: a key held down repeats, and a robot distinguishes at most 64 stops."""

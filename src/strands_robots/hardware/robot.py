@@ -52,10 +52,9 @@ from strands_robots.safety.gate import (
     answered,
     refusal_envelope,
 )
-from strands_robots.safety.halted_verbs import verbs_to_end
 from strands_robots.safety.persistence import hardware_key
 from strands_robots.safety.stop_executor import stop_executor
-from strands_robots.safety.stop_targets import note_motion
+from strands_robots.safety.stop_targets import note_motion, verbs_to_end
 from strands_robots.safety.stopping import PendingVerdict, StopLevel, StopVerdict, checked_level, halts_in_parts
 from strands_robots.stop_log import stop_logger
 from strands_robots.teleop_mixin import TeleopMixin

@@ -8,7 +8,7 @@ from typing import Protocol
 
 from strands_robots.hardware.body import DeviceBody
 from strands_robots.policies.rollout import Rollout, RolloutsEnd
-from strands_robots.safety.halted_verbs import StopOfRobot
+from strands_robots.safety.stop_targets import StopOfRobot
 from strands_robots.safety.stopping import PendingVerdict, StopVerdict
 from strands_robots.stop_log import stop_logger
 

@@ -17,7 +17,7 @@ import numpy as np
 from strands_robots.kinematics.chain import ArmJoint, Chain, Floats
 from strands_robots.kinematics.contacts import CLEARANCE_M, DEEPER_M, ContactCheck, new_contact
 from strands_robots.kinematics.inverse import TipGoal, nearest, solve
-from strands_robots.safety.turns import shorten_turns
+from strands_robots.safety.process import shorten_time_slices
 from strands_robots.utils import ValidationError
 
 TRIES_MAX = 2000
@@ -272,7 +272,7 @@ class Planner:
                 lows[index] = highs[index] = begin[index]
         if not (self.free(begin) and self.free(goal)):
             return None
-        end_short_turns = shorten_turns()
+        end_short_turns = shorten_time_slices()
         try:
             poses = path_around(begin, goal, (lows, highs), self._clear, self._going)
         finally:

@@ -18,7 +18,7 @@ from strands_robots.mesh.throttle import RecentKeys
 from strands_robots.mesh.transport import Sample, TransportError
 from strands_robots.mesh.wire_identity import IdentityError
 from strands_robots.safety.identity import SigningIdentity
-from strands_robots.safety.peer_answers import with_stop_statement
+from strands_robots.safety.statements import with_stop_statement
 from strands_robots.safety.stopping import Outcome, StopVerdict, explain, grade
 from strands_robots.serving.peer_verbs import PEER_VERBS, peer_stop_answer, run_to_end
 from strands_robots.serving.pipeline import Command, Own, Pipeline, Result, busy

@@ -17,8 +17,7 @@ from typing import Any
 
 from strands_robots.mesh import wire
 from strands_robots.safety import ed25519
-from strands_robots.safety.consoles import console_key, kept_consoles, stated_consoles
-from strands_robots.safety.identity import SigningIdentity
+from strands_robots.safety.identity import SigningIdentity, console_key, kept_consoles, stated_consoles
 from strands_robots.utils import MissingExtraError, canonical_json
 
 logger = logging.getLogger(__name__)

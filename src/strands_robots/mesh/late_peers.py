@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from strands_robots.mesh.context import Context
-from strands_robots.safety.peer_answers import enrolled_peers, lockout_distrust
+from strands_robots.safety.statements import enrolled_peers, lockout_distrust
 
 logger = logging.getLogger(__name__)
 

@@ -13,12 +13,13 @@ from strands_robots.mesh.context import Context
 from strands_robots.mesh.safety_adapter import SafetyAdapter
 from strands_robots.mesh.scheduler import repeat
 from strands_robots.mesh.transport import Declaration, Sample, Transport, TransportError, undeclare
-from strands_robots.safety.awake import AWAKE
-from strands_robots.safety.missed_stops import ANSWER, ANSWER_MAX_BYTES, PEER_BACK, QUESTION, MissedStops
+from strands_robots.safety.estop_listener import Member, RobotsPort, Stated
+from strands_robots.safety.missed_stops import ANSWER_MAX_BYTES, PEER_BACK, MissedStops
 from strands_robots.safety.orders import MISSED, NO_REASON, StopOrder, StopRefused, derived_epoch, stated_reason
 from strands_robots.safety.plane import SafetyPlane
-from strands_robots.safety.question_ports import Member, RobotsPort, Stated
+from strands_robots.safety.process import AWAKE
 from strands_robots.safety.statements import Purpose
+from strands_robots.safety.stop_link import ANSWER, QUESTION
 
 LOOK_HZ = 5.0
 """Looks a second for a link that came back."""

@@ -30,16 +30,13 @@ from strands_robots.mesh.scoped_stops import ScopedStop
 from strands_robots.mesh.throttle import RecentKeys
 from strands_robots.mesh.transport import Sample, TransportError
 from strands_robots.safety import ed25519
+from strands_robots.safety.checkin import CheckInAnswers, HeadWitness
 from strands_robots.safety.gate import MotionRequest
-from strands_robots.safety.head_witness import CheckInAnswers, HeadWitness
+from strands_robots.safety.lockout import is_epoch
 from strands_robots.safety.orders import NO_REASON, StopOrder, new_epoch, signed_stop, stated_reason
-from strands_robots.safety.peer_answers import (
-    enrolled_peers,
-    record_heads,
-)
-from strands_robots.safety.resume import REJECTED, configured_keys, is_epoch, sign
+from strands_robots.safety.resume import REJECTED, configured_keys, sign
 from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope, none_known
-from strands_robots.safety.statements import Proof, Purpose, proof_of
+from strands_robots.safety.statements import Proof, Purpose, enrolled_peers, proof_of, record_heads
 from strands_robots.safety.stopping import Outcome, StopVerdict
 from strands_robots.serving.peer_verbs import PEER_VERBS, peer_stop_answer
 from strands_robots.serving.pipeline import Own

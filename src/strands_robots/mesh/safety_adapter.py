@@ -14,12 +14,12 @@ from strands_robots.safety.gate import MotionGate
 from strands_robots.safety.identity import SigningIdentity, robot_identity
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.orders import StopOrder, StopRules
-from strands_robots.safety.peer_answers import LockoutAnnouncer, with_lockout_statement, with_resume_statement
-from strands_robots.safety.plane import Registered, SafetyPlane, Stoppable, plane
+from strands_robots.safety.plane import Registered, SafetyPlane, plane
 from strands_robots.safety.resume import REJECTED
 from strands_robots.safety.scope import EVERY_ROBOT, SCOPE, Scope
 from strands_robots.safety.sightings import DuplicateDeviceError, sightings
-from strands_robots.safety.statements import Purpose
+from strands_robots.safety.statements import LockoutAnnouncer, Purpose, with_lockout_statement, with_resume_statement
+from strands_robots.safety.stop_targets import Stoppable
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.stop_log import stop_logger
 

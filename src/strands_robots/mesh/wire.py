@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 from strands_robots.bounded_json import OutOfBoundsError, parsed
 from strands_robots.errors import StrandsRobotsError
-from strands_robots.safety.resume import is_epoch
+from strands_robots.safety.lockout import is_epoch
 from strands_robots.utils import ValidationError, identifier, peer_id, shown
 
 FRESH_S = 60.0

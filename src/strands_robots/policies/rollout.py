@@ -31,8 +31,8 @@ from strands_robots.policies.base import (
     numbers,
 )
 from strands_robots.safety.gate import Permit, PermitVoidError
+from strands_robots.safety.process import shorten_time_slices
 from strands_robots.safety.stopping import READ_EVERY_S, PendingVerdict, StopVerdict, halt_each
-from strands_robots.safety.turns import shorten_turns
 from strands_robots.stop_log import stop_logger
 from strands_robots.utils import ValidationError, number, text, whole
 from strands_robots.utils import duration as checked_duration
@@ -334,7 +334,7 @@ class Rollout:
         self._started_at = self._clock.now()
         state: State = "stopped"
         # A policy that computes in this process must not keep the interpreter from the control loop.
-        end_short_turns = shorten_turns()
+        end_short_turns = shorten_time_slices()
         try:
             with self._body.running():
                 try:

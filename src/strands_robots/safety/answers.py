@@ -1,4 +1,4 @@
-"""Answers to one emergency stop, graded by the robot's own signature.
+"""Answers to one emergency stop, graded by the robot's own signature; its report.
 
 A robot whose key is enrolled answers for itself: what is not signed with that key is only claimed, and what is signed
 with another one is an alarm. *Not stopped* outranks *stopped*, whichever arrives first.
@@ -6,11 +6,14 @@ with another one is an alarm. *Not stopped* outranks *stopped*, whichever arrive
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import threading
+import time
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from strands_robots.safety.clocks import RoundTrip, seconds_of
+from strands_robots.safety.orders import RoundTrip, seconds_of
+from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.safety.statements import Proof, Purpose, proof_of
 
 ANSWERS_MAX = 4096
@@ -181,3 +184,104 @@ def _run(params: Mapping[str, Any]) -> str:
 def _why(params: Mapping[str, Any]) -> str:
     reasons = [params.get("not_stopped"), params.get("unknown")]
     return "; ".join(f"{name}: {why}" for each in reasons if isinstance(each, Mapping) for name, why in each.items())
+
+
+@dataclass(frozen=True, slots=True)
+class StopReport:
+    """Outcome of one emergency stop, by robot.
+
+    ``stopped``, ``not_stopped``, ``refused`` and ``claimed`` map a robot to its answer: a robot is *claimed* to have
+    stopped when its signature was needed and is missing. ``silent`` are the expected ones that gave no answer, and
+    ``alarms`` those in whose name a wrong key answered, with the reason. ``link``: the stop left this machine at least
+    once. ``elapsed_ms`` is the time from the press until the last answer or the deadline, ``left_ms`` until the stop
+    first left this machine. ``scope`` are the robots that the press was for; ``widened``: none of them was there, and
+    every robot was stopped.
+    """
+
+    estop_id: str
+    stopped: Mapping[str, Answer]
+    not_stopped: Mapping[str, Answer]
+    refused: Mapping[str, Answer]
+    silent: tuple[str, ...]
+    link: bool
+    elapsed_ms: float
+    left_ms: float = 0.0
+    claimed: Mapping[str, Answer] = field(default_factory=dict)
+    alarms: Mapping[str, str] = field(default_factory=dict)
+    scope: Scope = EVERY_ROBOT
+    widened: bool = False
+
+    @property
+    def widening(self) -> str:
+        """Reason why a stop of some robots became one of all, or ""."""
+        return f"no {self.scope.meant} answered or is known here, so every robot was stopped" if self.widened else ""
+
+    @property
+    def answered(self) -> Mapping[str, Answer]:
+        """The answer of each robot that gave one."""
+        return {**self.stopped, **self.not_stopped, **self.refused, **self.claimed}
+
+    @property
+    def alarmed(self) -> tuple[str, ...]:
+        """The robots with an alarm, and without an answer of their own."""
+        return tuple(sorted(self.alarms.keys() - self.stopped.keys() - self.not_stopped.keys() - self.refused.keys()))
+
+    @property
+    def unanswered(self) -> tuple[str, ...]:
+        """The robots for which a stop goes on: they have to answer, and have not."""
+        return (*self.silent, *self.alarmed, *(name for name, each in self.claimed.items() if each.enrolled))
+
+    @property
+    def ok(self) -> bool:
+        """True when every robot is known to be still.
+
+        No answer at all is not ok, nor one of no robot in its scope.
+        """
+        missing = self.not_stopped or self.refused or self.silent or self.claimed or self.alarmed or self.widened
+        return bool(self.stopped) and not missing
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """State of a running stop, given to ``on_progress``; times as in the report."""
+
+    estop_id: str
+    answered: Mapping[str, Answer]
+    unconfirmed: tuple[str, ...]
+    link_up: bool
+    elapsed_ms: float
+    left_ms: float = 0.0
+    alarms: Mapping[str, str] = field(default_factory=dict)
+    scope: Scope = EVERY_ROBOT
+    widened: bool = False
+
+
+OnProgress = Callable[[Progress], None]
+
+
+PRESSES_MAX = 64
+"""Presses remembered, so that a stop that goes on under its id keeps the time of its press."""
+
+
+@dataclass(frozen=True, slots=True)
+class Press:
+    """The moment of a press, in monotonic and in wall-clock seconds."""
+
+    at: float
+    wall: float
+
+
+class Presses:
+    """The latest presses by the ids of their stops; thread-safe."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._presses: dict[str, Press] = {}
+
+    def note(self, estop_id: str) -> Press:
+        """Record the press of a stop, once; every later call returns the same moment."""
+        with self._lock:
+            press = self._presses.setdefault(estop_id, Press(time.monotonic(), time.time()))
+            while len(self._presses) > PRESSES_MAX:
+                del self._presses[next(iter(self._presses))]
+        return press

@@ -10,33 +10,40 @@ import secrets
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 from strands_robots.audit import log_witness
-from strands_robots.safety.answers import ANSWERS_MAX, Answer, Answers, Received
-from strands_robots.safety.estop_listener import (
-    CHECK_IN,
-    CHECK_IN_ANSWER,
-    ESTOP,
-    VERDICT,
-    FailureBudget,
-    OnEvent,
-    RenewableLink,
-    ReportingLink,
-    StopLink,
-    notification,
+from strands_robots.rate_limits import EventBudget
+from strands_robots.safety import ed25519
+from strands_robots.safety.answers import (
+    ANSWERS_MAX,
+    Answers,
+    OnProgress,
+    Press,
+    Presses,
+    Progress,
+    Received,
+    StopReport,
 )
-from strands_robots.safety.head_witness import HeadWitness
-from strands_robots.safety.identity import KeyFileError
-from strands_robots.safety.missed_stops import ANSWER, QUESTION, MissedStops
+from strands_robots.safety.checkin import HEADS_PER_S, HeadWitness
+from strands_robots.safety.identity import (
+    KeyFileError,
+    SigningIdentity,
+)
+from strands_robots.safety.missed_stops import MissedStops, MissedStopsPort
 from strands_robots.safety.network_key import NetworkKey
-from strands_robots.safety.orders import REASON_MAX, answered_field, new_epoch, params_of, signed_stop
-from strands_robots.safety.presses import Press, Presses
-from strands_robots.safety.question_ports import ControllerPort
-from strands_robots.safety.roster_inbox import OnReport, RosterInbox
-from strands_robots.safety.roster_report import STOP_ROSTER
+from strands_robots.safety.orders import (
+    REASON_MAX,
+    answered_field,
+    new_epoch,
+    params_of,
+    signed_stop,
+)
+from strands_robots.safety.persistence import ORIGINAL_MAX_BYTES, STOPS_MAX, Original, Originals
+from strands_robots.safety.process import shorten_time_slices
+from strands_robots.safety.roster import OnReport, RosterInbox, Sending
 from strands_robots.safety.scope import (
     EVERY_ROBOT,
     WIDEN_S,
@@ -46,9 +53,22 @@ from strands_robots.safety.scope import (
     none_known,
     report_widened,
 )
-from strands_robots.safety.silence import Sending
 from strands_robots.safety.statements import Proof, Purpose, proof_of
-from strands_robots.safety.turns import shorten_turns
+from strands_robots.safety.stop_link import (
+    ANSWER,
+    CHECK_IN,
+    CHECK_IN_ANSWER,
+    ESTOP,
+    QUESTION,
+    STOP_ROSTER,
+    VERDICT,
+    OnEvent,
+    RenewableLink,
+    ReportingLink,
+    StopLink,
+    notification,
+)
+from strands_robots.state_files import uptime
 from strands_robots.stop_log import stop_logger
 from strands_robots.utils import ValidationError, device_id, duration, number, shown
 
@@ -78,79 +98,6 @@ SETTLE_S = 1.0
 DEADLINE_S = 3.0
 INBOX_PER_ROBOT = 16
 """Answers of one robot that wait to be graded; a robot answers again at each repetition."""
-
-
-@dataclass(frozen=True, slots=True)
-class StopReport:
-    """Outcome of one emergency stop, by robot.
-
-    ``stopped``, ``not_stopped``, ``refused`` and ``claimed`` map a robot to its answer: a robot is *claimed* to have
-    stopped when its signature was needed and is missing. ``silent`` are the expected ones that gave no answer, and
-    ``alarms`` those in whose name a wrong key answered, with the reason. ``link``: the stop left this machine at least
-    once. ``elapsed_ms`` is the time from the press until the last answer or the deadline, ``left_ms`` until the stop
-    first left this machine. ``scope`` are the robots that the press was for; ``widened``: none of them was there, and
-    every robot was stopped.
-    """
-
-    estop_id: str
-    stopped: Mapping[str, Answer]
-    not_stopped: Mapping[str, Answer]
-    refused: Mapping[str, Answer]
-    silent: tuple[str, ...]
-    link: bool
-    elapsed_ms: float
-    left_ms: float = 0.0
-    claimed: Mapping[str, Answer] = field(default_factory=dict)
-    alarms: Mapping[str, str] = field(default_factory=dict)
-    scope: Scope = EVERY_ROBOT
-    widened: bool = False
-
-    @property
-    def widening(self) -> str:
-        """Reason why a stop of some robots became one of all, or ""."""
-        return f"no {self.scope.meant} answered or is known here, so every robot was stopped" if self.widened else ""
-
-    @property
-    def answered(self) -> Mapping[str, Answer]:
-        """The answer of each robot that gave one."""
-        return {**self.stopped, **self.not_stopped, **self.refused, **self.claimed}
-
-    @property
-    def alarmed(self) -> tuple[str, ...]:
-        """The robots with an alarm, and without an answer of their own."""
-        return tuple(sorted(self.alarms.keys() - self.stopped.keys() - self.not_stopped.keys() - self.refused.keys()))
-
-    @property
-    def unanswered(self) -> tuple[str, ...]:
-        """The robots for which a stop goes on: they have to answer, and have not."""
-        return (*self.silent, *self.alarmed, *(name for name, each in self.claimed.items() if each.enrolled))
-
-    @property
-    def ok(self) -> bool:
-        """True when every robot is known to be still.
-
-        No answer at all is not ok, nor one of no robot in its scope.
-        """
-        missing = self.not_stopped or self.refused or self.silent or self.claimed or self.alarmed or self.widened
-        return bool(self.stopped) and not missing
-
-
-@dataclass(frozen=True, slots=True)
-class Progress:
-    """State of a running stop, given to ``on_progress``; times as in the report."""
-
-    estop_id: str
-    answered: Mapping[str, Answer]
-    unconfirmed: tuple[str, ...]
-    link_up: bool
-    elapsed_ms: float
-    left_ms: float = 0.0
-    alarms: Mapping[str, str] = field(default_factory=dict)
-    scope: Scope = EVERY_ROBOT
-    widened: bool = False
-
-
-OnProgress = Callable[[Progress], None]
 
 
 class SafetyController:
@@ -195,11 +142,11 @@ class SafetyController:
         self._closing = threading.Event()
         self._check_in: threading.Thread | None = None
         self._unanswered_s = 0.0
-        self._witness, self._heads = HeadWitness(always=True), FailureBudget()
+        self._witness, self._heads = HeadWitness(always=True), EventBudget(HEADS_PER_S)
         self._reports = RosterInbox()
         self._others: OnEvent | None = None
         self._link, self._linked = make_link(), False
-        self._end_short_turns = shorten_turns()
+        self._end_short_slices = shorten_time_slices()
         self._sent = ControllerPort(self.controller_id, signing_key, lambda: self._keys, self._publish)
         self._missed = MissedStops(self._sent)
         events = (VERDICT, CHECK_IN_ANSWER, QUESTION, ANSWER, STOP_ROSTER, *((ESTOP,) if stands else ()))
@@ -354,7 +301,7 @@ class SafetyController:
         self._link.close()
         self._reports.end()
         self._missed.close()
-        self._end_short_turns()
+        self._end_short_slices()
 
     def _send(self, run: _Running) -> None:
         """Send the stop, issued now and pressed at its press."""
@@ -489,10 +436,8 @@ class SafetyController:
 
     def _witness_head(self, source: str, params: Any) -> None:
         """Write down the head in an answer to a check-in; a flood is left out."""
-        now = time.monotonic()
-        if not isinstance(params, dict) or not self._heads.allows("", now):
+        if not isinstance(params, dict) or not self._heads.take("", time.monotonic()):
             return
-        self._heads.record("", now)
         proof = proof_of(Purpose.CHECK_IN_ANSWER, source, params, self._keys.get(source))
         if proof is not Proof.WRONG:
             self._witness.receive(source, params, by=self.controller_id, proven=proof is Proof.SIGNED)
@@ -606,3 +551,57 @@ class _Running:
         return Progress(
             self.estop_id, answers, open_, link_up, elapsed_ms, self.left_ms, alarms, self.scope, self.widened
         )
+
+
+class ControllerPort(MissedStopsPort):
+    """A safety controller, which answers with the stops that it sent.
+
+    A stop is told until each robot that must answer it has; one without such robots for as long as there is the
+    controller.
+
+    Args:
+        key: the private key that signs its stops, if any.
+        enrolled: returns the public keys of robots by name.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        key: Any,
+        enrolled: Callable[[], Mapping[str, bytes]],
+        publish: Callable[[str, str, Mapping[str, Any]], bool],
+    ) -> None:
+        self._name, self._enrolled, self._publish = name, enrolled, publish
+        self._identity = None if key is None else SigningIdentity(name, ed25519.public_half(key), key)
+        self._originals = Originals()
+        self._open: dict[str, None] = {}
+
+    def sent(self, estop_id: str, payload: bytes) -> None:
+        """Note a stop that leaves; return at once."""
+        if len(payload) <= ORIGINAL_MAX_BYTES:
+            self._open[estop_id] = None
+            self._originals.add(Original(estop_id, self._name, payload, "", uptime()))
+            while len(self._open) > STOPS_MAX:
+                self._open.pop(next(iter(self._open)), None)
+
+    def answered(self, estop_id: str) -> None:
+        """Note that every robot that must answer this stop has."""
+        self._open.pop(estop_id, None)
+
+    def publish(self, event: str, source: str, fields: Mapping[str, Any]) -> bool:
+        return self._publish(event, source, fields)
+
+    def signer(self) -> tuple[str, SigningIdentity | None]:
+        return self._name, self._identity
+
+    def originals(self) -> Sequence[Original]:
+        epochs = frozenset(tuple(self._open))
+        self._originals.keep(epochs)
+        return self._originals.of(epochs)
+
+    def knows_key(self, source: str, key: bytes) -> bool:
+        own = self._identity is not None and self._identity.public == key
+        return own or self._enrolled().get(source) == key
+
+    def hold(self, seconds: float) -> None:
+        """It moves nothing."""

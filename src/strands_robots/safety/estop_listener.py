@@ -8,46 +8,55 @@ the stop executor: two hand-offs.
 from __future__ import annotations
 
 import functools
-import json
-import secrets
 import threading
 import time
-import uuid
-from collections import deque
-from collections.abc import Callable, Collection, Hashable, Mapping
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 from strands_robots.audit import audit_head, own_log_id, queue_safety_event
-from strands_robots.safety.awake import AWAKE
-from strands_robots.safety.checkin import CheckInRules
-from strands_robots.safety.head_witness import CheckInAnswers, HeadWitness
-from strands_robots.safety.identity import SigningIdentity
-from strands_robots.safety.missed_stops import ANSWER, QUESTION, MissedStops
+from strands_robots.rate_limits import EventBudget
+from strands_robots.safety.checkin import HEADS_PER_S, CheckInAnswers, CheckInRules, HeadWitness
+from strands_robots.safety.identity import (
+    DEFAULT_TENANT,
+    KnownKeys,
+    SigningIdentity,
+)
+from strands_robots.safety.missed_stops import MissedStops, MissedStopsPort
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.orders import (
     LISTENER,
+    MISSED,
     PARSED_MAX_BYTES,
     RobotReport,
     StopOrder,
     StopRefused,
     StopRules,
-    params_of,
 )
+from strands_robots.safety.persistence import Original
 from strands_robots.safety.plane import SafetyPlane, plane
-from strands_robots.safety.question_ports import Member, RobotsPort
+from strands_robots.safety.process import AWAKE, shorten_time_slices
 from strands_robots.safety.sighting_file import own_run
 from strands_robots.safety.statements import Purpose, signed
-from strands_robots.safety.turns import shorten_turns
+from strands_robots.safety.stop_link import (
+    ANSWER,
+    CHECK_IN,
+    CHECK_IN_ANSWER,
+    ESTOP,
+    EVENTS,
+    JSON_RPC,
+    QUESTION,
+    VERDICT,
+    FairQueue,
+    StopCodec,
+    StopEvent,
+    StopLink,
+    notification,
+)
 from strands_robots.stop_log import stop_logger
 from strands_robots.utils import shown
 
 logger = stop_logger(__name__)
-
-ESTOP = "emergencyStop"
-VERDICT = "emergencyStopVerdict"
-CHECK_IN = "safetyCheckIn"
-CHECK_IN_ANSWER = "safetyCheckInAnswer"
-EVENTS = (ESTOP, CHECK_IN, CHECK_IN_ANSWER, QUESTION, ANSWER)
 
 ANSWER_AGAIN_S = 0.01
 """Seconds between two answers of a robot to the same stop."""
@@ -58,225 +67,18 @@ ANSWER_AGAIN_EACH_S = 0.002
 ANSWER_AGAIN_MAX_S = 0.25
 
 REFUSAL_INTERVAL_S = 10.0
-SOURCES_MAX = 256
-"""Sources remembered; past it the oldest is forgotten or all new ones share an entry, so that names take no memory."""
+"""Seconds in which the refusals of one source are recorded once, and the others counted."""
 
-BUCKETS = 64
-BUCKET_CAPACITY = 16
-LATER_EVERY = 8
-"""Of so many events that are taken from a full bucket one is not urgent, so that a flood of stops starves none."""
+REMEMBERED_MAX = 256
 
-VOUCHED_MAX = 16
-"""Sources with a share of their own in the queue: the first that signed validly."""
+FAILURES_PER_S, FAILURES_IN_ALL_PER_S = 20, 100
+"""Failed signature checks of a source, and of all, in a second."""
 
 REFUSED_PAUSE_S = 0.0005
 """Seconds that the listener rests after a refused stop of a source that has not signed validly."""
 
 LATCH_ANSWERS_PER_S = 200
 LATCH_ANSWERS_REMEMBERED = 4096
-
-OnEvent = Callable[[str, str, bytes | int], None]
-"""Called with event, source and bytes on a thread of the link; it must return at once and may not raise.
-
-In place of more than :data:`~.orders.PARSED_MAX_BYTES` a link gives their number.
-"""
-
-OnState = Callable[[bool], None]
-"""Called with the link's state, True for up, on a thread of the link, at each change.
-
-Also with True while it is up, when a connection is new or a peer that was lost is back.
-"""
-
-
-class StopLink(Protocol):
-    """A connection that carries stops and nothing else, supplied by a network.
-
-    No method blocks on the network, and none raises for the connection's state.
-    """
-
-    @property
-    def up(self) -> bool:
-        """True while a peer can be reached."""
-
-    def open(self, events: Collection[str], on_event: OnEvent, on_state: OnState) -> None:
-        """Subscribe to these events of the tenant; return before the link is up."""
-
-    def publish(self, source: str, event: str, payload: bytes) -> bool:
-        """Send as ``source`` now; False, without a later try, when the link is down."""
-
-    def close(self) -> None:
-        """Close the connection and end the link's thread. Safe to call twice."""
-
-
-@runtime_checkable
-class RenewableLink(Protocol):
-    """A link that can be made anew while it is used."""
-
-    def renew(self) -> None:
-        """Open a connection in place of the present one; return at once."""
-
-
-@runtime_checkable
-class ReportingLink(Protocol):
-    """A link of a network that tells a sender what it refuses."""
-
-    @property
-    def denied(self) -> str:
-        """The broker's refusal of a stop of this connection, or ""."""
-
-
-def notification(event: str, params: Mapping[str, Any], event_id: str = "") -> bytes:
-    """Encode an event as a JSON-RPC 2.0 notification with ``event_id`` and ``ts``."""
-    stamp = {"event_id": event_id or uuid.uuid4().hex, "ts": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())}
-    return json.dumps({"jsonrpc": "2.0", "method": event, "params": {**params, **stamp}}).encode()
-
-
-class StopEvent(NamedTuple):
-    """Event from a link: name, source, bytes, monotonic s at receipt, network."""
-
-    event: str
-    source: str
-    payload: bytes | int
-    at: float
-    network: str = ""
-
-
-class _Bucket:
-    """Events of the sources that share it: stops, and what is not urgent.
-
-    Only the listener's thread takes; appending is atomic.
-    """
-
-    __slots__ = ("_later", "_taken", "_urgent")
-
-    def __init__(self) -> None:
-        self._urgent: deque[StopEvent] = deque(maxlen=BUCKET_CAPACITY)
-        self._later: deque[StopEvent] = deque(maxlen=BUCKET_CAPACITY // 2)
-        self._taken = 0
-
-    def put(self, event: StopEvent, urgent: bool) -> None:
-        """Add an event: in place of the oldest stop, or where there is room."""
-        if urgent:
-            self._urgent.append(event)
-        elif len(self._later) < BUCKET_CAPACITY // 2:
-            self._later.append(event)
-
-    def take(self) -> StopEvent | None:
-        """Remove the newest stop, or in its turn the oldest of the others."""
-        if not (self._urgent or self._later):
-            return None
-        self._taken += 1
-        if self._later and (not self._urgent or self._taken % LATER_EVERY == 0):
-            return self._later.popleft()
-        return self._urgent.pop()
-
-
-class FairQueue:
-    """Bounded queue of the listener: fair between sources, newest first.
-
-    A flood of forged stops must not delay a true one. Sources share a fixed number of buckets by a keyed hash; buckets
-    are served in turn, one event each, the newest stop first. What overflows a bucket is its oldest stop; a controller
-    repeats its stop, so a true one arrives again. A source that was vouched for has a bucket of its own, and every
-    second turn is of such a one: names that are made up share the other turns. No method but :meth:`get` blocks.
-    """
-
-    def __init__(self) -> None:
-        self._salt = secrets.token_hex(8)
-        self._buckets = [_Bucket() for _ in range(BUCKETS)]
-        self._vouched: dict[str, _Bucket] = {}
-        self._turns: tuple[_Bucket, ...] = ()
-        self._waiting = threading.Event()
-        self._turn = self._vouched_turn = 0
-        self._crowd_next = False
-        self._closed = False
-
-    def vouch(self, source: str) -> None:
-        """Give a source that signed validly a bucket of its own."""
-        if source not in self._vouched and len(self._vouched) < VOUCHED_MAX:
-            bucket = _Bucket()
-            self._turns = (*self._turns, bucket)
-            self._vouched[source] = bucket
-
-    def vouched_for(self, source: str) -> bool:
-        """Return True when this source has a bucket of its own."""
-        return source in self._vouched
-
-    def put(self, event: str, source: str, payload: bytes | int, *, urgent: bool = True, network: str = "") -> None:
-        """Add an event; of those that are not urgent, a full bucket drops the new."""
-        received = StopEvent(event, source, payload, time.monotonic(), network)
-        bucket = self._vouched.get(source)
-        if bucket is None:
-            # Within one text: the hash of a pair keeps the same names together whatever the salt.
-            bucket = self._buckets[hash(self._salt + source) % len(self._buckets)]
-        # Adding to a bucket and setting an event are atomic; no lock is shared with the listener's thread.
-        bucket.put(received, urgent)
-        # While it is set, the listener's next look is still to come: most messages of a flood need not wake it.
-        if not self._waiting.is_set():
-            self._waiting.set()
-
-    def get(self) -> StopEvent | None:
-        """Return the next event, waiting for one; None once closed and empty."""
-        while True:
-            self._crowd_next = not self._crowd_next
-            for take in (self._of_crowd, self._of_vouched) if self._crowd_next else (self._of_vouched, self._of_crowd):
-                event = take()
-                if event is not None:
-                    return event
-            if self._closed:
-                return None
-            self._waiting.wait()
-            self._waiting.clear()
-            # What was put between the look and the clearing is found by the next look; what comes later sets it.
-
-    def _of_crowd(self) -> StopEvent | None:
-        for _ in self._buckets:
-            self._turn = (self._turn + 1) % len(self._buckets)
-            event = self._buckets[self._turn].take()
-            if event is not None:
-                return event
-        return None
-
-    def _of_vouched(self) -> StopEvent | None:
-        turns = self._turns
-        for _ in turns:
-            self._vouched_turn = (self._vouched_turn + 1) % len(turns)
-            event = turns[self._vouched_turn].take()
-            if event is not None:
-                return event
-        return None
-
-    def close(self) -> None:
-        """Let :meth:`get` return None when nothing is left."""
-        self._closed = True
-        self._waiting.set()
-
-
-class FailureBudget:
-    """Failed signature checks of each source and of all in a second.
-
-    Without the sum, a flood under made-up names would have each of them checked.
-    """
-
-    def __init__(self, per_s: int = 20, in_all_per_s: int = 100) -> None:
-        self._per_s, self._in_all_per_s = per_s, in_all_per_s
-        self._failures: dict[str, tuple[float, int]] = {}
-        self._in_all = (float("-inf"), 0)
-
-    def allows(self, source: str, now: float) -> bool:
-        """Return True while one more message of ``source`` may be checked."""
-        since, count = self._failures.get(source, (now, 0))
-        if count >= self._per_s and now - since < 1.0:
-            return False
-        since, count = self._in_all
-        return count < self._in_all_per_s or now - since >= 1.0
-
-    def record(self, source: str, now: float) -> None:
-        """Count a failure of ``source``."""
-        since, count = self._failures.pop(source, (now, 0))
-        self._failures[source] = (since, count + 1) if now - since < 1.0 else (now, 1)
-        _bound(self._failures)
-        since, count = self._in_all
-        self._in_all = (since, count + 1) if now - since < 1.0 else (now, 1)
 
 
 class LatchAnswers:
@@ -287,16 +89,12 @@ class LatchAnswers:
     """
 
     def __init__(self, per_s: int = LATCH_ANSWERS_PER_S) -> None:
-        self._per_s = per_s
-        self._since, self._count = float("-inf"), 0
+        self._budget = EventBudget(per_s)
         self._unanswered: dict[tuple[str, str], None] = {}
 
     def allows(self, robot_id: str, epoch: str, now: float) -> bool:
         """Return True when this stop is answered now, else remember it."""
-        if now - self._since >= 1.0:
-            self._since, self._count = now, 0
-        if self._count < self._per_s:
-            self._count += 1
+        if self._budget.take("", now):
             return True
         key = (robot_id, epoch)
         if key in self._unanswered:
@@ -307,33 +105,125 @@ class LatchAnswers:
         return False
 
 
-class RefusalLog:
-    """Count of refused messages; each source is reported once in ten seconds."""
+@dataclass(frozen=True, slots=True)
+class Member:
+    """A robot of this process on one network.
 
-    def __init__(self) -> None:
-        self._sources: dict[str, list[float]] = {}
+    Attributes:
+        robot_id: its id in this process.
+        name: its name on the network.
+        identity: returns what signs for it.
+        was_here: it was served from this machine in the ten minutes before its start.
+    """
 
-    def due(self, source: str) -> bool:
-        """Return True when this refusal should be recorded; else count it."""
-        entry = self._entry(source)
-        if time.monotonic() >= entry[0]:
+    robot_id: str
+    name: str
+    identity: Callable[[], SigningIdentity | None]
+    was_here: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Stated:
+    """A missed stop as an answer has it: its bytes, its age in s and who answered."""
+
+    payload: bytes
+    age_s: float
+    answerer: str
+
+
+class RobotsPort(MissedStopsPort):
+    """The robots of a process on one network.
+
+    Args:
+        network: no missed stop crosses it; None where nothing is asked and answered.
+        members: returns those that are served there now.
+        publish: sends fields as an event of a name on that network.
+        on_report: answers a stop, as for one that came directly.
+        codec: reads the stops of that network.
+    """
+
+    def __init__(
+        self,
+        of: SafetyPlane,
+        rules: StopRules,
+        network: NetworkKey | None,
+        *,
+        members: Callable[[], Sequence[Member]],
+        publish: Callable[[str, str, Mapping[str, Any]], bool],
+        on_report: Callable[[RobotReport], None],
+        codec: StopCodec = JSON_RPC,
+    ) -> None:
+        self._plane, self._rules, self._network = of, rules, "" if network is None else network.text
+        self._codec = codec
+        self._members, self._publish, self._on_report = members, publish, on_report
+        self._keys = KnownKeys(DEFAULT_TENANT if network is None else network.tenant, rules.keys)
+
+    def was_here(self) -> bool:
+        robots = self._plane.robots
+        back = [robots.get(each.robot_id) for each in self._members() if each.was_here]
+        # A state directory that was reset since is that of a newcomer.
+        returned = [each.robot_id for each in back if each is not None and each.returned()]
+        return bool(returned)
+
+    def locked(self) -> bool:
+        return all(each.locked for each in self._plane.robots.values())
+
+    def devices(self) -> Sequence[str]:
+        return [each.name for each in self._members()]
+
+    def publish(self, event: str, source: str, fields: Mapping[str, Any]) -> bool:
+        return self._publish(event, source, fields)
+
+    def signer(self) -> tuple[str, SigningIdentity | None]:
+        members = self._members()
+        # A robot that is locked answers for its process.
+        locked = self._plane.lockouts()
+        for each in sorted(members, key=lambda each: each.robot_id not in locked)[:1]:
+            return each.name, each.identity()
+        return "", None
+
+    def originals(self) -> Sequence[Original]:
+        return self._plane.originals(self._network) if self._network else ()
+
+    def learn(self, source: str, payload: bytes, age_s: float, answerer: str) -> bool:
+        if not self._rules.signed and not self._rules.open:
+            # Who says that an allowed source stopped is not that source.
+            return False
+        if self._rules.source_refusal(source) is not None:
+            return False
+        codec = self._codec
+        fields = codec.fields(payload)
+        epoch = codec.epoch(source, fields)
+        if not epoch:
+            return False
+        stop = StopEvent(ESTOP, source, payload, time.monotonic(), self._network, codec)
+        return self.lock(
+            epoch,
+            lambda: codec.order(self._rules, stop, fields, MISSED, age_s),
+            Stated(payload, age_s, answerer),
+        )
+
+    def lock(self, epoch: str, decide: Callable[[], StopOrder | StopRefused | None], stated: Stated) -> bool:
+        """Lock by a missed stop unless all know it; False when it does not count."""
+        if all(each.latch.knows(epoch) for each in self._plane.robots.values()):
+            self._plane.stated_again(self._network, epoch, stated.payload, stated.age_s)
             return True
-        entry[1] += 1
-        return False
+        order = decide()
+        if not isinstance(order, StopOrder):
+            return False
+        run = self._plane.begin(order, self._on_report)
+        for robot_id in run.robot_ids if run is not None else ():
+            logger.warning("%s is locked by emergency stop %s, which it had missed.", robot_id, epoch)
+            sender, answerer = order.source[:256], stated.answerer[:256]
+            facts = {"epoch": epoch, "source": sender, "answerer": answerer, "age_s": round(stated.age_s, 3)}
+            queue_safety_event("missed_stop_learnt", robot_id, facts)
+        return True
 
-    def record(self, refused: StopRefused, event: str) -> None:
-        """Log and audit a refusal, unless one of this source was recorded a moment ago."""
-        if not self.due(refused.source):
-            return
-        entry = self._entry(refused.source)
-        more, entry[:] = int(entry[1]), [time.monotonic() + REFUSAL_INTERVAL_S, 0.0]
-        logger.warning("%s of %s does not count: %s.", event, shown(refused.source), refused.why)
-        facts = {"event": event, "source": refused.source[:256], "why": refused.why, "more_since": more}
-        queue_safety_event("estop_refused", "stop-lane", facts)
+    def knows_key(self, source: str, key: bytes) -> bool:
+        return self._keys.knows(source, key)
 
-    def _entry(self, source: str) -> list[float]:
-        name = source if source in self._sources or len(self._sources) < SOURCES_MAX else ""
-        return self._sources.setdefault(name, [float("-inf"), 0.0])
+    def hold(self, seconds: float) -> None:
+        self._plane.hold(seconds)
 
 
 class ListenerRegistration:
@@ -349,8 +239,11 @@ class ListenerRegistration:
         *,
         network: NetworkKey | None,
         was_here: bool,
+        codec: StopCodec,
+        asks: bool,
     ) -> None:
         self.robot_id = robot_id
+        self.codec, self.asks = codec, asks
         self.network = network
         self.was_here = was_here
         self.identity = identity
@@ -367,6 +260,14 @@ class ListenerRegistration:
         self._listener.unregister(self)
 
 
+class OpenLink(NamedTuple):
+    """An open link: its network, its codec, and the missed stops of its devices."""
+
+    network: str
+    codec: StopCodec
+    missed: MissedStops
+
+
 class EstopListener:
     """Receives every ``emergencyStop`` of the tenant and has the plane act on it.
 
@@ -380,19 +281,19 @@ class EstopListener:
         self._make_rules = rules
         self._registering = threading.Lock()
         self._registrations: tuple[ListenerRegistration, ...] = ()
-        self._open: dict[Hashable, MissedStops] = {}
-        self._refusals = RefusalLog()
-        self._budget = FailureBudget()
+        self._open: dict[Hashable, OpenLink] = {}
+        self._refusals = EventBudget(1, window_s=REFUSAL_INTERVAL_S, pooled=True)
+        self._budget = EventBudget(FAILURES_PER_S, FAILURES_IN_ALL_PER_S)
         self._latch_answers = LatchAnswers()
         self._rules = StopRules(allow=(), keys=())
         self._check_ins = CheckInRules(self._rules)
-        self._witness, self._check_in_answers, self._heads = HeadWitness(), CheckInAnswers(), FailureBudget()
+        self._witness, self._check_in_answers, self._heads = HeadWitness(), CheckInAnswers(), EventBudget(HEADS_PER_S)
         self._answered: dict[tuple[str, str], float] = {}
         self._redundant: dict[tuple[str, str], None] = {}
         self._repeated: dict[Hashable, bytes] = {}
         self._queue: FairQueue | None = None
         self._thread: threading.Thread | None = None
-        self._end_short_turns: Callable[[], None] = lambda: None
+        self._end_short_slices: Callable[[], None] = lambda: None
         self._end_watch: Callable[[], None] = lambda: None
 
     @property
@@ -410,12 +311,16 @@ class EstopListener:
         opened: bool = True,
         network: NetworkKey | None = None,
         was_here: bool = False,
+        codec: StopCodec = JSON_RPC,
+        asks: bool = True,
     ) -> ListenerRegistration:
         """Serve a robot over the link of ``key``; ``make`` the link if it is new.
 
         Args:
             network: of the link; missed stops are asked for and answered within it alone, and not without one.
             was_here: the robot was served from this machine in the ten minutes before.
+            codec: of the link's network; that of the first device counts for the link.
+            asks: False for what moves nothing, which asks for no missed stops and has no verdict to send.
             identity: returns what signs the robot's verdicts; None leaves them unsigned.
             opened: False to have a new link opened by :meth:`ListenerRegistration.open` only.
         """
@@ -424,7 +329,9 @@ class EstopListener:
                 self._start()
             link = next((each.link for each in self._registrations if each.key == key), None)
             made = make() if link is None else link
-            registration = ListenerRegistration(self, robot_id, key, made, identity, network=network, was_here=was_here)
+            registration = ListenerRegistration(
+                self, robot_id, key, made, identity, network=network, was_here=was_here, codec=codec, asks=asks
+            )
             self._registrations = (*self._registrations, registration)
         if opened:
             registration.open()
@@ -434,10 +341,12 @@ class EstopListener:
         """Open the link of a registration, unless it is open."""
         with self._registering:
             if registration in self._registrations and registration.key in self._open:
-                self._open[registration.key].started()
+                self._open[registration.key].missed.started()
             elif registration in self._registrations:
-                missed = self._open[registration.key] = self._missed_stops(registration)
-                receive = functools.partial(self.receive, network=_text(registration.network), missed=missed)
+                missed = self._missed_stops(registration)
+                link = OpenLink(_text(registration.network), registration.codec, missed)
+                self._open[registration.key] = link
+                receive = functools.partial(self.receive, link=link)
                 registration.link.open(EVENTS, receive, lambda up: missed.link_up() if up else missed.link_down())
 
     def unregister(self, registration: ListenerRegistration) -> None:
@@ -447,17 +356,17 @@ class EstopListener:
                 return
             self._registrations = tuple(each for each in self._registrations if each is not registration)
             last_of_link = all(each.key != registration.key for each in self._registrations)
-            missed = self._open.pop(registration.key, None) if last_of_link else None
+            opened = self._open.pop(registration.key, None) if last_of_link else None
             events, thread = (self._queue, self._thread) if not self._registrations else (None, None)
             if events is not None:
                 self._queue = self._thread = None
         if last_of_link:
             registration.link.close()
-        if missed is not None:
-            missed.close()
+        if opened is not None:
+            opened.missed.close()
         if events is not None:
             self._end_watch()
-            self._end_short_turns()
+            self._end_short_slices()
             events.close()
         if thread is not None and thread is not threading.current_thread():
             thread.join(2.0)
@@ -469,78 +378,98 @@ class EstopListener:
 
     def awake(self) -> None:
         """Ask which stops were missed, after a time in which the process did not run."""
-        for missed in tuple(self._open.values()):
-            missed.ask("the process did not run for a while")
+        for link in tuple(self._open.values()):
+            link.missed.ask("the process did not run for a while")
 
-    def accept_params(
-        self,
-        source: str,
-        params: Mapping[str, Any],
-        path: str,
-        raw: bytes | int | None = None,
-        network: NetworkKey | None = None,
-    ) -> None:
-        """Act on a parsed emergency stop of another path; return at once.
+    def accept(self, stop: StopEvent, path: str, fields: Mapping[str, Any] | None = None) -> None:
+        """Act on an emergency stop of any network; return at once.
 
-        A source whose signatures keep failing is not checked again here for up to a second: its stops arrive at the
-        listener's own link as well.
+        The listener's thread calls it for what its links received. A network that receives stops over a further
+        connection calls it there: a source whose signatures keep failing is not checked again on that path for up to a
+        second, because its stops arrive at the listener's own link as well.
 
         Args:
-            source: who stops, as declared.
-            params: its parameters, as far as it has any.
             path: how it arrived.
-            raw: the message, or its number of bytes where it was too long to be read.
-            network: where it arrived.
+            fields: of its payload, where they were read already.
         """
-        if self._plane.under_way(params.get("estop_id")):
+        codec, source = stop.codec, stop.source
+        stated = codec.fields(stop.payload) if fields is None else fields
+        if self._plane.under_way(stated.get("estop_id")):
             return
-        if self._rules.signed and not self._budget.allows(source, time.monotonic()):
+        events = self._queue if path == LISTENER else None
+        if events is None and codec.vouches(self._rules) and not self._budget.allows(source, time.monotonic()):
             return
-        order = self._rules.order(source, params, path, raw, network=_text(network))
-        if isinstance(order, StopRefused):
-            self._budget.record(source, time.monotonic())
-            self._refusals.record(order, ESTOP)
-        else:
-            self._plane.begin(order, self._answer)
+        order = codec.order(self._rules, stop, stated, path)
+        if isinstance(order, StopOrder):
+            on_report = self._answer if codec.answers else _no_answer
+            codec.begun(order, stated, self._plane.begin(order, on_report))
+            if events is not None and codec.vouches(self._rules):
+                events.vouch(source)
+        elif order is not None:
+            if not codec.refused(order):
+                self._record_refusal(order, stop.event)
+            if events is None:
+                self._budget.count(source, time.monotonic())
+            elif not events.vouched_for(source):
+                # In a flood the link's thread needs the interpreter to receive what comes behind it.
+                time.sleep(REFUSED_PAUSE_S)
 
     def stop_here(self, order: StopOrder) -> None:
         """Act on a stop that a device of this process raises; return at once."""
         self._plane.begin(order, self._answer)
 
     def receive(
-        self, event: str, source: str, payload: bytes | int, network: str = "", missed: MissedStops | None = None
+        self,
+        event: str,
+        source: str,
+        payload: bytes | int,
+        link: OpenLink | None = None,
     ) -> None:
         """Take an event from a link's thread; returns at once."""
-        if missed is not None and event in (QUESTION, ANSWER):
-            missed.receive(event, source, payload)
+        if link is not None and event in (QUESTION, ANSWER):
+            link.missed.receive(event, source, payload)
             return
+        network, codec = ("", JSON_RPC) if link is None else (link.network, link.codec)
         events = self._queue
         if events is None:
             return
         if not isinstance(payload, int) and len(payload) > PARSED_MAX_BYTES:
             payload = len(payload)
         if event == CHECK_IN_ANSWER:
-            # Robots send these; so many a second, which a flood of them does not exceed.
-            now = time.monotonic()
-            if self._heads.allows("", now):
-                self._heads.record("", now)
+            if self._heads.take("", time.monotonic()):
                 events.put(event, source, payload, urgent=False)
             return
-        why = self._rules.source_refusal(source)
-        if why is None:
-            events.put(event, source, payload, urgent=event == ESTOP, network=network)
-        elif self._refusals.due(source):
-            events.put(event, source, payload, urgent=False)
+        if not codec.names_source or self._rules.source_refusal(source) is None:
+            events.put(event, source, payload, urgent=event == ESTOP, network=network, codec=codec)
+        elif self._refusal_due(source):
+            events.put(event, source, payload, urgent=False, codec=codec)
+
+    def _refusal_due(self, source: str) -> bool:
+        """Return True when a refusal of this source should be recorded; else count it."""
+        now = time.monotonic()
+        due = self._refusals.allows(source, now)
+        if not due:
+            self._refusals.count(source, now)
+        return due
+
+    def _record_refusal(self, refused: StopRefused, event: str) -> None:
+        """Log and audit a refusal, unless one of this source was recorded a moment ago."""
+        if not self._refusal_due(refused.source):
+            return
+        more = self._refusals.count(refused.source, time.monotonic())
+        logger.warning("%s of %s does not count: %s.", event, shown(refused.source), refused.why)
+        facts = {"event": event, "source": refused.source[:256], "why": refused.why, "more_since": more}
+        queue_safety_event("estop_refused", "stop-lane", facts)
 
     def _missed_stops(self, registration: ListenerRegistration) -> MissedStops:
-        key, link = registration.key, registration.link
+        key, link, codec = registration.key, registration.link, registration.codec
 
         def members() -> list[Member]:
-            here = [each for each in self._registrations if each.key == key and each.network is not None]
+            here = [each for each in self._registrations if each.key == key and each.asks and each.network is not None]
             return [Member(each.robot_id, self._wire_id(each.robot_id), each.identity, each.was_here) for each in here]
 
         def publish(event: str, source: str, fields: Mapping[str, Any]) -> bool:
-            return link.publish(source, event, notification(event, fields))
+            return link.publish(source, event, codec.encode(event, fields))
 
         port = RobotsPort(
             self._plane,
@@ -549,15 +478,16 @@ class EstopListener:
             members=members,
             publish=publish,
             on_report=self._answer,
+            codec=codec,
         )
-        return MissedStops(port)
+        return MissedStops(port, codec.fields)
 
     def _start(self) -> None:
         self._rules = self._make_rules()
         self._rules.require_keys()
         self._check_ins = CheckInRules(self._rules)
         audit_head(), own_log_id(), own_run()  # read from the disk now, so that no stop waits for it
-        self._end_short_turns = shorten_turns()
+        self._end_short_slices = shorten_time_slices()
         self._end_watch = AWAKE.watch(self.awake)
         self._queue = FairQueue()
         self._thread = threading.Thread(target=self._run, args=(self._queue,), name="estop-listener", daemon=True)
@@ -568,44 +498,32 @@ class EstopListener:
             try:
                 if received.event == CHECK_IN_ANSWER:
                     for first in self._registrations[:1]:
-                        self._witness.receive(received.source, params_of(received.payload), by=first.robot_id)
+                        fields = received.codec.fields(received.payload)
+                        self._witness.receive(received.source, fields, by=first.robot_id)
                     continue
                 if received.event == CHECK_IN:
                     if self._check_in(received) and self._rules.signed:
                         events.vouch(received.source)
                     continue
-                params = params_of(received.payload)
-                if self._plane.under_way(params.get("estop_id")):
-                    continue
-                order = self._rules.order(
-                    received.source, params, LISTENER, received.payload, received.at, network=received.network
-                )
-                if isinstance(order, StopRefused):
-                    self._refusals.record(order, received.event)
-                    if not events.vouched_for(received.source):
-                        # In a flood the link's thread needs the interpreter to receive what comes behind it.
-                        time.sleep(REFUSED_PAUSE_S)
-                else:
-                    self._plane.begin(order, self._answer)
-                    if self._rules.signed:
-                        events.vouch(received.source)
+                self.accept(received, LISTENER)
             except Exception:
                 logger.critical("The e-stop listener failed on an event of %s.", shown(received.source), exc_info=True)
 
     def _check_in(self, received: StopEvent) -> bool:
         """Record a check-in; False when it does not count."""
-        source, params = received.source, params_of(received.payload)
+        source, params = received.source, received.codec.fields(received.payload)
         why = self._check_ins.refusal(source, params)
         if why is not None:
-            self._refusals.record(StopRefused(source, why), received.event)
+            self._record_refusal(StopRefused(source, why), received.event)
             return False
         self._plane.checkin.record(source, received.at)
         self._rules.compare_clock(source, params, received.at)
-        for first in self._registrations[:1]:  # the robots of a process share one audit
+        # The robots of a process share one audit.
+        for first in [each for each in self._registrations if each.codec.answers][:1]:
             name = self._wire_id(first.robot_id)
             answer = self._check_in_answers.answer(name, params.get("estop_id"), first.identity())
             if answer is not None:
-                first.link.publish(name, CHECK_IN_ANSWER, notification(CHECK_IN_ANSWER, answer))
+                first.link.publish(name, CHECK_IN_ANSWER, first.codec.encode(CHECK_IN_ANSWER, answer))
         return True
 
     def _wire_id(self, robot_id: str) -> str:
@@ -634,7 +552,7 @@ class EstopListener:
         self._answered[key] = now
         _bound(self._answered)
         for each in self._registrations:
-            if each.robot_id == report.robot_id:
+            if each.robot_id == report.robot_id and each.codec.answers:
                 device_id = self._wire_id(report.robot_id)
                 each.link.publish(device_id, VERDICT, self._verdict(report, device_id, each.identity()))
 
@@ -661,8 +579,12 @@ def _text(network: NetworkKey | None) -> str:
     return "" if network is None else network.text
 
 
+def _no_answer(report: RobotReport) -> None:
+    """Its network asks each robot for its verdict."""
+
+
 def _bound(remembered: dict[Any, Any]) -> None:
-    while len(remembered) > SOURCES_MAX:
+    while len(remembered) > REMEMBERED_MAX:
         del remembered[next(iter(remembered))]
 
 

@@ -14,15 +14,24 @@ import json
 import os
 import secrets
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
+from strands_robots import settings
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety import ed25519
 from strands_robots.safety.network_key import NetworkKey
-from strands_robots.state_files import OPEN, StateFileError, make_private, read_private, require_private, state_dir
+from strands_robots.state_files import (
+    OPEN,
+    StateFileError,
+    make_private,
+    read_private,
+    require_private,
+    state_dir,
+    write_private,
+)
 from strands_robots.stop_log import stop_logger
 from strands_robots.utils import field_values, identifier
 
@@ -133,7 +142,7 @@ class KeyFile:
         known = self.load()
         if known is None:
             _make_folder(self.path.parent, self._root)
-            _write_once(self.path, ed25519.encode(secrets.token_bytes(SEED_BYTES)).encode() + b"\n")
+            write_private(self.path, ed25519.encode(secrets.token_bytes(SEED_BYTES)).encode() + b"\n", once=True)
             known = self.load()
         if known is None:
             raise KeyFileError(f"{self.path} was removed while it was made.")
@@ -375,7 +384,7 @@ class EnrolledKeys:
         content = json.dumps({"v": VERSION, "saved": time.time(), "robots": records}, indent=1).encode()
         if len(content) >= FILE_MAX_BYTES:
             raise KeyFileError(f"{self.path} would be too long: forget robots first.")
-        _draft(self.path, content).replace(self.path)
+        write_private(self.path, content)
 
 
 def _robot(record: Mapping[str, Any]) -> EnrolledRobot | None:
@@ -437,21 +446,65 @@ def _make_folder(folder: Path, root: Path) -> None:
     require_private(folder, root, error=KeyFileError)
 
 
-def _draft(path: Path, content: bytes) -> Path:
-    draft = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
-    descriptor = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
-    with os.fdopen(descriptor, "wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    return draft
+PUBLIC_KEYS = "STRANDS_MESH_CONSOLE_PUBLIC_KEYS"
 
 
-def _write_once(path: Path, content: bytes) -> None:
-    """Write a file whole, unless another process wrote it first."""
-    draft = _draft(path, content)
+def console_key() -> KeyFile:
+    """Return the file with the key of this user's consoles on this machine."""
+    return KeyFile("consoles", "console")
+
+
+def enrolled_consoles() -> EnrolledKeys:
+    """Return the file with the public keys of consoles on other machines."""
+    return EnrolledKeys(state_dir() / "consoles")
+
+
+def stated_consoles() -> frozenset[bytes]:
+    """Return the public keys that the environment names."""
+    return frozenset(ed25519.public_keys(settings.items(PUBLIC_KEYS), PUBLIC_KEYS))
+
+
+def kept_consoles() -> frozenset[bytes]:
+    """Return the own public key, if there is one, and the enrolled ones.
+
+    Raises:
+        KeyFileError, OSError: a key file cannot be used.
+    """
+    own = console_key().load()
+    return frozenset({*enrolled_consoles().load().values(), *([own.public] if own is not None else [])})
+
+
+KEYS_AGAIN_S = 10.0
+"""Seconds after which the keys of this machine and the enrolled ones are read again."""
+
+KEYS_MAX = 512
+
+
+class KnownKeys:
+    """Keys of this machine's robots, of enrolled ones, and of those who may stop."""
+
+    def __init__(self, tenant: str = DEFAULT_TENANT, stop_keys: Sequence[bytes] = ()) -> None:
+        self._tenant, self._stop_keys = tenant, frozenset(stop_keys)
+        self._known: dict[str, bytes | None] = {}
+        self._enrolled: Mapping[str, bytes] = {}
+        self._read = float("-inf")
+
+    def knows(self, name: str, key: bytes) -> bool:
+        """Return True where ``key`` is that of ``name``, or may stop robots."""
+        if key in self._stop_keys:
+            return True
+        if time.monotonic() - self._read > KEYS_AGAIN_S:
+            self._read, self._known, self._enrolled = time.monotonic(), {}, _enrolled()
+        own = local_name(self._tenant, name)
+        if self._enrolled.get(own) == key:
+            return True
+        if own not in self._known and len(self._known) < KEYS_MAX:
+            self._known[own] = key_here(own)
+        return self._known.get(own) == key
+
+
+def _enrolled() -> Mapping[str, bytes]:
     try:
-        with contextlib.suppress(FileExistsError):
-            os.link(draft, path)
-    finally:
-        draft.unlink()
+        return EnrolledKeys().load()
+    except (StrandsRobotsError, OSError):
+        return {}

@@ -8,6 +8,7 @@ signed resume can name and only an operator at the machine clears.
 from __future__ import annotations
 
 import math
+import re
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
@@ -45,6 +46,14 @@ Span = tuple[float, float]
 
 ANY_TIME: Span = (LONG_AGO, math.inf)
 """Times of the stops that an overflow stands for, where none is known."""
+
+
+_HEX32 = re.compile(r"[0-9a-f]{32}\Z")
+
+
+def is_epoch(value: object) -> bool:
+    """True for 32 lower-case hex digits."""
+    return isinstance(value, str) and bool(_HEX32.match(value))
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,8 +130,14 @@ class LockoutState:
 class LockoutLatch:
     """Lockout of one robot in a running process, with the stops it has seen.
 
-    Readers take no lock: the state is one reference that is replaced whole. Writers share a lock that no I/O and
-    no robot call is ever made under.
+    Readers take no lock: each attribute is one reference that is replaced whole. Writers are the methods, which share
+    a lock that no I/O and no robot call is ever made under.
+
+    Attributes:
+        state: the lockouts now.
+        resumed: epochs that it was resumed from, oldest first.
+        cleared: spans of floods that it was cleared of.
+        crowd: first and last moment of the stops that the overflow stands for.
     """
 
     def __init__(
@@ -137,18 +152,13 @@ class LockoutLatch:
         crowd: Span = ANY_TIME,
     ) -> None:
         self.robot_id = robot_id
-        self._state = state or LockoutState()
-        self._seen: dict[str, None] = dict.fromkeys([*seen, *self._state.resumable])
-        self._resumed = dict.fromkeys(resumed)
+        self.state = state or LockoutState()
+        self._seen: dict[str, None] = dict.fromkeys([*seen, *self.state.resumable])
+        self.resumed = dict.fromkeys(resumed)
         # What comes from now on is noted, so that no later stop counts among those of an unknown time.
-        self._cleared, self._crowd = cleared, (crowd[0], min(crowd[1], uptime()))
+        self.cleared, self.crowd = cleared, (crowd[0], min(crowd[1], uptime()))
         self._clock = clock
         self._writing = threading.Lock()
-
-    @property
-    def state(self) -> LockoutState:
-        """The lockouts now."""
-        return self._state
 
     @property
     def seen(self) -> tuple[str, ...]:
@@ -156,37 +166,22 @@ class LockoutLatch:
         with self._writing:
             return tuple(self._seen)
 
-    @property
-    def resumed(self) -> Mapping[str, None]:
-        """Epochs that it was resumed from, oldest first; replaced when one is new."""
-        return self._resumed
-
-    @property
-    def cleared(self) -> tuple[Span, ...]:
-        """Spans of floods that it was cleared of; replaced when one is new."""
-        return self._cleared
-
-    @property
-    def crowd(self) -> Span:
-        """First and last moment of the stops that the overflow stands for."""
-        return self._crowd
-
     def crowd_on(self, received: float) -> None:
         """Count a stop that was received then among those of the overflow."""
-        since, until = self._crowd
-        self._crowd = since, max(until, received + SKEW_S)
+        since, until = self.crowd
+        self.crowd = since, max(until, received + SKEW_S)
 
     def cleared_of(self, received: float) -> bool:
         """Return True for a stop of this moment that may be one it was cleared of."""
-        return any(since <= received <= until for since, until in self._cleared)
+        return any(since <= received <= until for since, until in self.cleared)
 
     def knows(self, epoch: str) -> bool:
         """Return True for a stop that no longer engages."""
-        return epoch in self._seen or epoch in self._resumed
+        return epoch in self._seen or epoch in self.resumed
 
     def refusal(self, verb: str) -> Envelope | None:
         """Return the refusal of ``verb`` while locked, or None while free."""
-        state = self._state
+        state = self.state
         # Asked before every motion: the sentence is made for a refusal only.
         free = not state.lockouts and state.overflow is None
         return None if free else refusal(state, self.robot_id, verb)
@@ -194,13 +189,13 @@ class LockoutLatch:
     def engage(self, epoch: str, source: str, reason: str, scope: Scope = EVERY_ROBOT) -> bool:
         """Lock under ``epoch``; False, without a change, when it was seen before."""
         with self._writing:
-            if self.knows(epoch):
+            if epoch in self._seen or epoch in self.resumed:
                 return False
             self._seen[epoch] = None
-            crowded = self._state.overflow is not None
-            self._state = self._state.engage(Lockout(epoch, source, reason, self._clock(), scope))
-            if self._state.overflow is not None and not crowded:
-                self._crowd = uptime() - SKEW_S, uptime() + SKEW_S
+            crowded = self.state.overflow is not None
+            self.state = self.state.engage(Lockout(epoch, source, reason, self._clock(), scope))
+            if self.state.overflow is not None and not crowded:
+                self.crowd = uptime() - SKEW_S, uptime() + SKEW_S
             self._forget()
             return True
 
@@ -211,24 +206,24 @@ class LockoutLatch:
             state: with them.
             crowd: first and last moment of the stops that its overflow stands for.
         """
-        own = self._crowd if self._state.overflow is not None else crowd
+        own = self.crowd if self.state.overflow is not None else crowd
         for each in state.all:
             self.engage(each.epoch, each.source, each.reason, each.scope)
         if state.overflow is not None:
             with self._writing:
-                self._crowd = min(own[0], crowd[0]), max(own[1], crowd[1])
+                self.crowd = min(own[0], crowd[0]), max(own[1], crowd[1])
 
     def resume(self, epoch: str) -> None:
         """Clear ``epoch`` after its resume was verified."""
         with self._writing:
-            self._state = self._state.resume(epoch)
+            self.state = self.state.resume(epoch)
             self._add_resumed([epoch])
 
     def clear(self) -> tuple[Lockout, ...]:
         """Clear every lockout, for an operator at this machine; return them."""
         with self._writing:
-            self._cleared = with_cleared(self._cleared, self._state, self._crowd)
-            cleared, self._state = self._state.all, LockoutState()
+            self.cleared = with_cleared(self.cleared, self.state, self.crowd)
+            cleared, self.state = self.state.all, LockoutState()
             self._add_resumed(self._seen)
             return cleared
 
@@ -236,15 +231,15 @@ class LockoutLatch:
         """Never lock by these again, as after their resume."""
         with self._writing:
             self._add_resumed(epochs)
-            self._cleared = (*cleared, *self._cleared)[-CLEARED_MAX:] if cleared else self._cleared
+            self.cleared = (*cleared, *self.cleared)[-CLEARED_MAX:] if cleared else self.cleared
 
     def _add_resumed(self, epochs: Iterable[str]) -> None:
-        self._resumed = with_resumed(self._resumed, epochs)
+        self.resumed = with_resumed(self.resumed, epochs)
 
     def _forget(self) -> None:
         if len(self._seen) <= SEEN_MAX + MAX_EPOCHS:
             return
-        active = set(self._state.resumable)
+        active = set(self.state.resumable)
         oldest = next(epoch for epoch in self._seen if epoch not in active)
         del self._seen[oldest]
 

@@ -8,34 +8,34 @@ Everything here happens on a thread of its own; a link's thread only hands over.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import math
+import os
 import random
 import secrets
-import threading
 import time
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from pathlib import Path
+from typing import Any
 
 from strands_robots.audit import queue_safety_event
 from strands_robots.safety import ed25519
-from strands_robots.safety.answer_slots import AnswerSlots
-from strands_robots.safety.clocks import seconds_of
 from strands_robots.safety.identity import SigningIdentity
-from strands_robots.safety.orders import params_of
-from strands_robots.safety.originals import ORIGINAL_MAX_BYTES, STOPS_MAX, Original, newest_within
-from strands_robots.safety.resume import is_epoch
+from strands_robots.safety.lockout import is_epoch
+from strands_robots.safety.orders import seconds_of
+from strands_robots.safety.persistence import ORIGINAL_MAX_BYTES, STOPS_MAX, Original, newest_within
 from strands_robots.safety.statements import Purpose, own_key, signed
-from strands_robots.state_files import uptime
+from strands_robots.safety.stop_link import ANSWER, JSON_RPC, QUESTION, FairQueue
+from strands_robots.state_files import StateFileError, make_private, require_private, state_dir, uptime
 from strands_robots.stop_log import stop_logger
+from strands_robots.threads import WokenThread
 from strands_robots.utils import shown
 
 logger = stop_logger(__name__)
-
-QUESTION = "missedStops"
-ANSWER = "missedStopsAnswer"
 
 STARTED, BACK = "the process started", "its link is back"
 PEER_BACK = "a peer is linked again, while others stayed"
@@ -103,27 +103,33 @@ JUDGED_MAX = 4096
 AUDIT_EVERY_S = 10.0
 
 
-class MissedStopsPort(Protocol):
-    """A process as asker and answerer on one network.
+class MissedStopsPort(ABC):
+    """A process as asker and answerer on one network; one without robots only answers.
 
-    A network supplies it. No method blocks on the network, and none raises for its state.
+    No method blocks on the network, and none raises for its state.
     """
 
     def was_here(self) -> bool:
         """Return True where a robot was served from here before its start."""
+        return False
 
     def locked(self) -> bool:
         """Return True while every robot of the process is locked."""
+        return False
 
     def devices(self) -> Sequence[str]:
         """Return the names of the robots that ask; none, and nothing is asked."""
+        return ()
 
+    @abstractmethod
     def publish(self, event: str, source: str, fields: Mapping[str, Any]) -> bool:
         """Send a question or an answer as ``source``; False when the link is down."""
 
+    @abstractmethod
     def signer(self) -> tuple[str, SigningIdentity | None]:
         """Return the name that answers and what signs, None where there is no key."""
 
+    @abstractmethod
     def originals(self) -> Sequence[Original]:
         """Return the stops to answer with, as of now."""
 
@@ -133,45 +139,15 @@ class MissedStopsPort(Protocol):
         Args:
             age_s: seconds since it was first received, as ``answerer`` says.
         """
+        return False
 
+    @abstractmethod
     def knows_key(self, source: str, key: bytes) -> bool:
         """Return True where ``key`` is known to be that of ``source``."""
 
+    @abstractmethod
     def hold(self, seconds: float) -> None:
         """Hold the motions of the robots for so long; return at once."""
-
-
-class AnswerQueue:
-    """Bounded answers that wait to be read: few for each share of the sources.
-
-    Adding is atomic and takes no lock; one thread takes.
-    """
-
-    def __init__(self) -> None:
-        self._salt = secrets.token_hex(8)
-        self._buckets: list[deque[tuple[str, bytes]]] = [deque(maxlen=BUCKET_CAPACITY) for _ in range(BUCKETS)]
-        self._turn = 0
-        self.dropped = False
-
-    def put(self, source: str, payload: bytes) -> None:
-        """Add an answer, in place of the oldest one of its bucket if that is full."""
-        bucket = self._buckets[hash(self._salt + source) % BUCKETS]
-        self.dropped = self.dropped or len(bucket) == BUCKET_CAPACITY
-        bucket.append((source, payload))
-
-    def take(self) -> tuple[str, bytes] | None:
-        """Return the newest answer of the next bucket in turn."""
-        for _ in self._buckets:
-            self._turn = (self._turn + 1) % BUCKETS
-            if self._buckets[self._turn]:
-                return self._buckets[self._turn].pop()
-        return None
-
-    def clear(self) -> None:
-        """Forget what waits."""
-        for bucket in self._buckets:
-            bucket.clear()
-        self.dropped = False
 
 
 class Asker:
@@ -360,7 +336,7 @@ class MissedStops:
     def __init__(
         self,
         port: MissedStopsPort,
-        parse: Callable[[bytes | int], Mapping[str, Any]] = params_of,
+        parse: Callable[[bytes | int | None], Mapping[str, Any]] = JSON_RPC.fields,
         clock: Callable[[], float] = time.monotonic,
         chance: Callable[[], float] = random.random,
     ) -> None:
@@ -369,16 +345,14 @@ class MissedStops:
         self._asker, self._answerer = Asker(), Answerer(chance)
         self._reasons: deque[str] = deque(maxlen=8)
         self._questions: deque[tuple[str, bytes]] = deque(maxlen=QUESTIONS_MAX)
-        self._answers = AnswerQueue()
+        self._answers = FairQueue(BUCKETS, BUCKET_CAPACITY)
         # The smallest age that a stop was judged with; -inf: no age makes it count.
         self._judged: dict[bytes, float] = {}
         self._own = ""
         self._linked, self._up = False, False
         self._back, self._pace = False, HoldPace()
         self._audited = float("-inf")
-        self._waiting, self._starting = threading.Event(), threading.Lock()
-        self._closed = False
-        self._thread: threading.Thread | None = None
+        self._worker = WokenThread("missed-stops", self._step_safely, self._due_in)
 
     def ask(self, reason: str) -> None:
         """Hold the motions and ask; return at once.
@@ -388,7 +362,7 @@ class MissedStops:
         """
         self._port.hold(UNITE_S)
         self._reasons.append(reason)
-        self._wake()
+        self._worker.wake()
 
     def back(self, reason: str = BACK) -> None:
         """Ask because of a link; return at once.
@@ -396,7 +370,7 @@ class MissedStops:
         Where the reason is :data:`BACK`, motions hold as the question leaves, as often as :class:`HoldPace` allows.
         """
         self._reasons.append(reason)
-        self._wake()
+        self._worker.wake()
 
     def link_up(self) -> None:
         """Ask because the link is back, or at its first time :meth:`started`.
@@ -417,7 +391,7 @@ class MissedStops:
     def started(self) -> None:
         """Ask because a robot is served from now on, unless it is a newcomer."""
         self._reasons.append(STARTED)
-        self._wake()
+        self._worker.wake()
 
     def receive(self, event: str, source: str, payload: bytes | int) -> None:
         """Take a question or an answer from a link's thread; return at once."""
@@ -426,42 +400,27 @@ class MissedStops:
         if event == QUESTION:
             if len(self._questions) < QUESTIONS_MAX and not self._answerer.full:
                 self._questions.append((source, payload))
-                self._wake()
+                self._worker.wake()
         elif self._asker.listens(self._clock()) or self._answerer.waits or self._questions:
-            self._answers.put(source, payload)
-            self._wake()
+            self._answers.put(ANSWER, source, payload)
+            self._worker.wake()
 
     def close(self) -> None:
         """End the thread. Safe to call twice."""
-        with self._starting:
-            self._closed, thread = True, self._thread
-        self._waiting.set()
-        if thread is not None and thread is not threading.current_thread():
-            thread.join(2.0)
+        self._worker.close()
 
-    def _wake(self) -> None:
-        if self._thread is None:
-            with self._starting:
-                if self._thread is None and not self._closed:
-                    self._thread = threading.Thread(target=self._run, name="missed-stops", daemon=True)
-                    self._thread.start()
-        if not self._waiting.is_set():
-            self._waiting.set()
+    def _due_in(self) -> float:
+        return min(self._asker.due, self._answerer.due) - self._clock()
 
-    def _run(self) -> None:
-        while not self._closed:
-            due = min(self._asker.due, self._answerer.due) - self._clock()
-            if due > 0:
-                self._waiting.wait(None if due == float("inf") else due)
-            self._waiting.clear()
-            try:
-                self.step()
-            except Exception:
-                logger.critical("A question for missed stops failed.", exc_info=True)
-                # What could not be answered is not due for ever; our own question is tried again.
-                self._questions.clear()
-                self._answerer.take((), self._clock())
-                time.sleep(RETRY_S)
+    def _step_safely(self) -> None:
+        try:
+            self.step()
+        except Exception:
+            logger.critical("A question for missed stops failed.", exc_info=True)
+            # What could not be answered is not due for ever; our own question is tried again.
+            self._questions.clear()
+            self._answerer.take((), self._clock())
+            time.sleep(RETRY_S)
 
     def step(self) -> None:
         """Do what is due now; the thread does so whenever something is."""
@@ -488,7 +447,7 @@ class MissedStops:
     def _ask(self) -> None:
         now = self._clock()
         back, self._back = self._back, False
-        self._asker.settle(now, dropped=self._answers.dropped)
+        self._asker.settle(now, dropped=self._answers.displaced)
         devices = self._port.devices() if self._asker.due <= now else ()
         if not devices:
             self._asker.not_asked()
@@ -515,7 +474,7 @@ class MissedStops:
 
     def _take_answers(self) -> None:
         while (answer := self._answers.take()) is not None:
-            source, fields = answer[0], self._parse(answer[1])
+            source, fields = answer.source, self._parse(answer.payload)
             rows = rows_of(fields)
             if self._answerer.waits:
                 self._note_given(source, fields, rows)
@@ -573,3 +532,66 @@ class MissedStops:
             self._audited = now
             epochs = [each.epoch for each in rest]
             queue_safety_event("missed_stops_answered", name, {"epochs": epochs, "more": fields["more"]})
+
+
+SLOTS = 3
+OLD_S = 5.0
+"""Age in s from which a slot is removed: its question was answered or is asked anew, under another id."""
+
+SWEPT_ABOVE = 64
+"""Slots in the directory from which old ones are looked for."""
+
+
+class AnswerSlots:
+    """Slots of a question, by which the processes of one machine share its answers.
+
+    On a machine with hundreds of processes an answer is heard by all of them only after as many have given one. So a
+    process first takes one of three slots of a question: a file in ``answers`` that only its first maker makes.
+
+    Args:
+        state: in place of the state directory.
+    """
+
+    def __init__(self, state: Path | None = None) -> None:
+        self._state = state
+
+    def take(self, nonces: Sequence[str], epochs: Iterable[str]) -> list[str]:
+        """Take a free slot of each of these questions; return those that had one.
+
+        All, where the directory cannot be used: answers too many are better than none.
+
+        Args:
+            nonces: ids of questions, 32 hex digits.
+            epochs: of the stops that would be answered; processes with other stops do not share a slot.
+        """
+        root = self._state or state_dir()
+        folder = root / "answers"
+        stops = hashlib.sha256(",".join(sorted(epochs)).encode("utf-8", "replace")).hexdigest()[:8]
+        try:
+            if not folder.exists():
+                make_private(folder)
+            require_private(folder, root)
+            taken = frozenset(each.name for each in folder.iterdir())
+            if len(taken) > SWEPT_ABOVE:
+                _sweep(folder)
+            return [nonce for nonce in nonces if _made(folder, f"{nonce}-{stops}", taken)]
+        except (OSError, StateFileError) as exc:
+            logger.warning("The processes of this machine cannot share their answers: %s", exc)
+            return list(nonces)
+
+
+def _made(folder: Path, name: str, taken: frozenset[str]) -> bool:
+    for number in range(SLOTS):
+        if f"{name}-{number}" in taken:
+            continue
+        with contextlib.suppress(FileExistsError):
+            os.close(os.open(folder / f"{name}-{number}", os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600))
+            return True
+    return False
+
+
+def _sweep(folder: Path) -> None:
+    for path in folder.iterdir():
+        with contextlib.suppress(OSError):  # another process removed it
+            if abs(time.time() - path.lstat().st_mtime) > OLD_S:
+                path.unlink()

@@ -14,13 +14,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from strands_robots import settings
-from strands_robots.bounded_json import SMALL_BYTES, json_object
+from strands_robots.bounded_json import SMALL_BYTES, parsed
 from strands_robots.safety import ed25519
 from strands_robots.safety.authorization import caller_name, entries, estop_refusal, matcher
-from strands_robots.safety.clocks import ObservedClocks, seconds_of
-from strands_robots.safety.lockout import OVERFLOW
-from strands_robots.safety.originals import ORIGINAL_MAX_BYTES
-from strands_robots.safety.resume import is_epoch
+from strands_robots.safety.lockout import OVERFLOW, is_epoch
+from strands_robots.safety.persistence import ORIGINAL_MAX_BYTES
 from strands_robots.safety.scope import EVERY_ROBOT, SCOPE, SCOPE_SIGNATURE, Scope
 from strands_robots.safety.statements import Purpose, covered
 from strands_robots.safety.stopping import StopVerdict
@@ -315,12 +313,9 @@ class StopRules:
 
     def source_refusal(self, source: str) -> str | None:
         """Return the reason why this source may not stop, or None; costs next to nothing."""
-        if self._may_stop(source):
+        if caller_name(source) is not None and (not self._allow or self._fits(source) is not None):
             return None
         return estop_refusal(source, self._allow)
-
-    def _may_stop(self, source: str) -> bool:
-        return caller_name(source) is not None and (not self._allow or self._fits(source) is not None)
 
     def order(
         self,
@@ -338,7 +333,9 @@ class StopRules:
         ``raw`` are the bytes that they were read from, or their number where there are too many to be read. A message
         without an id, read or not, has a fresh epoch, and its repetitions within UNREAD_AGAIN_S have the same.
         """
-        why = self.source_refusal(source) or self.signature_refusal(source, params, Purpose.EMERGENCY_STOP)
+        why = self.source_refusal(source)
+        if why is None and self._keys:
+            why = self.signature_refusal(source, params, Purpose.EMERGENCY_STOP)
         if why is not None:
             return StopRefused(source, why)
         received = time.monotonic() if received is None else received
@@ -348,9 +345,11 @@ class StopRules:
         received_at, issued = self._clock() - (time.monotonic() - received), seconds_of(params.get("t"))
         compared = issued is not None and path != MISSED
         ahead = self._clocks.note(source, received_at - issued, received) if compared and issued is not None else None
-        stated = raw is not None and len(raw) <= ORIGINAL_MAX_BYTES and stated_epoch(source, params) != ""
+        epoch = stated_epoch(source, params)
+        passed_on = raw is not None and len(raw) <= ORIGINAL_MAX_BYTES and epoch != ""
         return StopOrder(
-            self._epoch(source, params, received),
+            # The bytes of a stop without an id of its own may be those of every press.
+            epoch or self._unread_epoch(source, received),
             source,
             stated_reason(params),
             path,
@@ -360,19 +359,12 @@ class StopRules:
             pressed=seconds_of(params.get("pressed_at")),
             received_at=received_at,
             clock_ahead_s=ahead,
-            answered=_names(params.get(ANSWERED)),
+            answered=_names(params[ANSWERED]) if ANSWERED in params else frozenset(),
             scope=self.scope(source, params) if SCOPE in params else EVERY_ROBOT,
-            original=raw if stated else None,
+            original=raw if passed_on else None,
             network=network,
             age_s=age_s,
         )
-
-    def _epoch(self, source: str, params: Mapping[str, Any], received: float) -> str:
-        """Return the epoch of a stop; without an id of its own that of its moment.
-
-        The bytes of such a stop may be those of every press.
-        """
-        return stated_epoch(source, params) or self._unread_epoch(source, received)
 
     def _unread_epoch(self, source: str, received: float) -> str:
         """Return the epoch of a stop without an id, the same for repetitions."""
@@ -427,7 +419,11 @@ def params_of(payload: bytes | int) -> dict[str, Any]:
     Args:
         payload: the message, or its number of bytes where there are too many to be read.
     """
-    params = {} if isinstance(payload, int) else json_object(payload, PARSED_MAX_BYTES).get("params")
+    try:
+        message = None if isinstance(payload, int) else parsed(payload, PARSED_MAX_BYTES)
+    except ValueError:
+        return {}
+    params = message.get("params") if isinstance(message, dict) else None
     return params if isinstance(params, dict) else {}
 
 
@@ -445,6 +441,73 @@ def answered_field(names: Iterable[str]) -> dict[str, list[str]]:
             length += more
             named.append(name)
     return {ANSWERED: named} if named else {}
+
+
+SOURCES_MAX = 64
+KEPT_S = 600.0
+"""A comparison older than this gives way to a newer one: clocks drift, and are set."""
+
+
+@dataclass(frozen=True, slots=True)
+class RoundTrip:
+    """One question and its answer, by which NTP compares clocks.
+
+    All times are wall-clock seconds (RFC 5905, section 8).
+
+    Attributes:
+        sent: of the question, by this clock.
+        received_there: of the question, by the other clock.
+        answered_there: of the answer's sending, by the other clock.
+        received: of the answer, by this clock.
+    """
+
+    sent: float
+    received_there: float
+    answered_there: float
+    received: float
+
+    @property
+    def ahead_s(self) -> float:
+        """Lead of the other clock in s, exact to half of :attr:`on_network_s`."""
+        return ((self.received_there - self.sent) + (self.answered_there - self.received)) / 2
+
+    @property
+    def on_network_s(self) -> float:
+        """Seconds that question and answer were on the network."""
+        return (self.received - self.sent) - (self.answered_there - self.received_there)
+
+
+class ObservedClocks:
+    """Lead of this clock over each sender's, from its messages alone.
+
+    The message that took least time on the network shows the difference best, so the smallest one counts. It includes
+    the least time that a message takes, milliseconds on a network of machines.
+    """
+
+    def __init__(self) -> None:
+        self._smallest: dict[str, tuple[float, float]] = {}
+
+    def note(self, source: str, difference_s: float, now: float) -> float | None:
+        """Record one message; return what the messages before it showed, or None.
+
+        Args:
+            source: the sender, whose name was checked.
+            difference_s: this clock at its receipt less the sender's at its sending.
+            now: monotonic seconds.
+        """
+        known = self._smallest.get(source)
+        if known is None or difference_s < known[0] or now - known[1] > KEPT_S:
+            self._smallest[source] = (difference_s, now)
+            while len(self._smallest) > SOURCES_MAX:
+                self._smallest.pop(next(iter(self._smallest)), None)
+        return None if known is None else known[0]
+
+
+def seconds_of(t: object) -> float | None:
+    """Return a time of a message: a finite number that a float holds, else None."""
+    if isinstance(t, bool) or not isinstance(t, int | float) or not abs(t) < 1e18:
+        return None
+    return float(t)
 
 
 def _names(value: object) -> frozenset[str]:

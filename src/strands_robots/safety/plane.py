@@ -9,26 +9,32 @@ import time
 from collections.abc import Collection, Iterable, Mapping
 from concurrent.futures import Future
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any
 
 from strands_robots import settings
 from strands_robots.audit import queue_safety_event
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.safety.checkin import CheckIn
-from strands_robots.safety.clearance import CLEARED, LEFT, NOT_KEPT, NOT_LOCKED, ClearanceInbox
 from strands_robots.safety.gate import MotionGate
 from strands_robots.safety.lockout import Lockout, LockoutLatch
 from strands_robots.safety.orders import LISTENER, MISSED, RobotReport, StopOrder, new_epoch
-from strands_robots.safety.originals import Original, Originals
-from strands_robots.safety.persistence import LockoutStore, ResumedEpochs, StoredLockout
-from strands_robots.safety.reporting import UNPACED, OnReport, Reporter, StopRun
-from strands_robots.safety.resume import REJECTED, Admitted, ResumeVerifier
+from strands_robots.safety.persistence import LockoutStore, Original, Originals, ResumedEpochs, StoredLockout
+from strands_robots.safety.process import undisturbed
+from strands_robots.safety.reporting import UNPACED, OnReport, Reporter, StopCount, StopRun
+from strands_robots.safety.resume import (
+    CLEARED,
+    LEFT,
+    NOT_KEPT,
+    NOT_LOCKED,
+    REJECTED,
+    Admitted,
+    ClearanceInbox,
+    ResumeVerifier,
+)
 from strands_robots.safety.sightings import sightings
-from strands_robots.safety.stop_count import StopCount
 from strands_robots.safety.stop_executor import StopExecutor, stop_executor
-from strands_robots.safety.stop_targets import Haltable, body_of, holds_several, note_motion
+from strands_robots.safety.stop_targets import Stoppable, body_of, holds_several, note_motion
 from strands_robots.safety.stopping import StopVerdict
-from strands_robots.safety.turns import undisturbed
 from strands_robots.state_files import uptime
 from strands_robots.stop_log import stop_logger
 from strands_robots.utils import ValidationError, identifier, shown
@@ -47,12 +53,6 @@ KEEP_AGAIN_S = 1.0
 
 ISSUER_EXCESS = 64
 """Different stops of one source after which the audit says so, once; they still stop."""
-
-
-class Stoppable(Haltable, Protocol):
-    """A robot that the plane can stop: one with a gate and a halt."""
-
-    gate: MotionGate
 
 
 READY_MAX = 4
@@ -184,13 +184,16 @@ class Registered:
         A stop is known, or one of a flood that locks nothing more: the latest halt answers for it. A missed one may be
         from before its time.
         """
+        latch = self.latch
+        lock = functools.partial(latch.engage, order.epoch, order.source, order.reason, order.scope)
+        if order.path != MISSED and latch.state.overflow is None:
+            return lock()
         received = uptime() - order.age_s - (time.monotonic() - order.received)
         if order.path == MISSED and not self._missed(received):
             return False
-        lock = functools.partial(self.latch.engage, order.epoch, order.source, order.reason, order.scope)
-        if not self.crowded:
+        if latch.state.overflow is None:
             return lock()
-        self.latch.crowd_on(received)
+        latch.crowd_on(received)
         if order.received - self._halted_at < HALT_AGAIN_S or not lock():
             return False
         self._halted_at = order.received
@@ -271,7 +274,7 @@ class SafetyPlane:
         self._issued: dict[str, int] = {}
         self._counted = StopCount(TOLD_EVERY_S)
         self._originals = Originals()
-        self._clearance = ClearanceInbox(self.robot_ids, self._clear_one)
+        self._clearance = ClearanceInbox(lambda: self._robots, self._clear_one)
         self.checkin = CheckIn(settings.number("STRANDS_CHECKIN_TIMEOUT_S"))
 
     @property
@@ -283,10 +286,6 @@ class SafetyPlane:
     def robots(self) -> dict[str, Registered]:
         """The robots held now, by id; never changed, only replaced."""
         return self._robots
-
-    def robot_ids(self) -> frozenset[str]:
-        """The ids of the robots held now."""
-        return frozenset(self._robots)
 
     def register(
         self, robot_id: str, robot: Stoppable, *, key: str | None = None, wire_id: str = "", cell: str = ""
@@ -433,6 +432,7 @@ class SafetyPlane:
                     within=run.deadline_s,
                     since=order.received,
                     answered=functools.partial(reporter.answer, run, entry.robot_id),
+                    voided=True,
                 )
             self._note_original(order)
             reporter.begin(run)

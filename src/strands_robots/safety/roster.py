@@ -1,4 +1,4 @@
-"""Roster of a network: the robots that must answer a stop.
+"""Roster of a network: the robots that must answer a stop, and why one is silent.
 
 Exit code rule: where no robot is enrolled for the network, every row counts. Where some are, rows that are ENROLLED,
 SERVED or SIGNED count; names that were only HEARD are told and do not alter the exit code, so made-up names cannot.
@@ -6,17 +6,36 @@ SERVED or SIGNED count; names that were only HEARD are told and do not alter the
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+import threading
+import time
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
 
 from strands_robots.errors import StrandsRobotsError
-from strands_robots.safety.identity import EnrolledKeys, EnrolledRobot, Exemption, of_tenant
-from strands_robots.safety.network_key import NetworkKey
+from strands_robots.safety.identity import (
+    EnrolledKeys,
+    EnrolledRobot,
+    Exemption,
+    KeyFileError,
+    kept_consoles,
+    of_tenant,
+    stated_consoles,
+)
+from strands_robots.safety.lockout import is_epoch
+from strands_robots.safety.network_key import MESH, NetworkKey
+from strands_robots.safety.orders import estop_keys, params_of
 from strands_robots.safety.scope import Scope
 from strands_robots.safety.sighting_file import CROWDED
 from strands_robots.safety.sightings import Known, Sighting, Sightings, sightings, this_moment
+from strands_robots.safety.statements import Purpose, own_key
+from strands_robots.safety.stop_link import STOP_ROSTER, FairQueue
 from strands_robots.state_files import uptime
-from strands_robots.utils import field_values
+from strands_robots.stop_log import stop_logger
+from strands_robots.utils import ValidationError, field_values, identifier
+
+logger = stop_logger(__name__)
 
 REPORTED_MAX = 64
 
@@ -255,8 +274,12 @@ class Roster:
         return replace(joined, rows=in_order(rows.values()), exempt=exempt, enrolled=enrolled)
 
     def counts(self, row: RosterRow) -> bool:
-        """True when the exit code depends on this row."""
-        return row.stoppable is not False and (not self.enrolled or row.known is not Known.HEARD)
+        """Return True when the exit code depends on this row.
+
+        That a device has no stop is said by its presence, which is not signed: it exempts no robot that has shown a
+        key.
+        """
+        return row.known is not Known.HEARD or (row.stoppable is not False and not self.enrolled)
 
     @property
     def must_answer(self) -> tuple[RosterRow, ...]:
@@ -299,3 +322,235 @@ def bounded(rows: Sequence[RosterRow], most: int = REPORTED_MAX) -> tuple[tuple[
     """Return the first ``most`` rows in order, and the number of the others."""
     kept = in_order(rows)[:most]
     return kept, len(rows) - len(kept)
+
+
+UNTOLD = "Zenoh does not tell a sender whether access rules drop a stop."
+"""Said beside silent robots where the network cannot name that reason."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sending:
+    """Facts of the sending of a stop.
+
+    Attributes:
+        left: it left this machine.
+        signed: with ``--key``.
+        denied: what the broker said to refuse it, or "".
+        tells: the network tells a sender what it refuses.
+    """
+
+    left: bool = True
+    signed: bool = False
+    denied: str = ""
+    tells: bool = False
+
+
+def reason_of(
+    row: RosterRow, sending: Sending, *, found: bool, elsewhere: Mapping[str, tuple[NetworkKey, float]]
+) -> str:
+    """Return why a robot of the roster may be silent: only what is known.
+
+    Args:
+        row: the robot.
+        sending: how the stop was sent.
+        found: it was heard on this network since the press.
+        elsewhere: the network where a robot of this name was heard last, and seconds since.
+    """
+    if not sending.left:
+        return "the stop did not leave this machine: the link is down"
+    if sending.denied:
+        return f"the broker refuses this sender's stops: {sending.denied}"
+    if row.alive is not None:
+        return _process(row)
+    if row.signed_only and not sending.signed:
+        return "it acts on signed stops alone: estop --key FILE"
+    if row.departed:
+        return "it said that it leaves the network; that was not signed"
+    if found or (row.age_s is not None and row.age_s < 0):
+        return "it is on this network and does not answer"
+    where, ago = elsewhere.get(row.name, (None, 0.0))
+    if where is not None and (row.age_s is None or ago < row.age_s):
+        return f"it was heard {seconds(ago)} ago on another network: {described(where)}"
+    if row.reported_by:
+        return f"this machine has not heard it; {row.reported_by} has, and misses it too"
+    if row.age_s is None:
+        return "no route to it: it was not heard in the last ten minutes"
+    return f"no route to it: it was last heard {seconds(row.age_s)} before"
+
+
+def described(network: NetworkKey) -> str:
+    """Return a network in words."""
+    where = ", ".join(network.where[:2])
+    return f"the native mesh at {where}" if network.kind == MESH else f"tenant {network.tenant} at {where}"
+
+
+def seconds(age_s: float) -> str:
+    """Return an age for a sentence, such as ``42 s``."""
+    return f"{age_s:.0f} s" if age_s < 600 else f"{age_s / 60:.0f} min"
+
+
+def cannot_answer(row: RosterRow) -> bool:
+    """Return True where its process on this machine has ended, or is stopped."""
+    return row.alive is not None and (not row.alive or process_state(row.pid) in ("Z", "X", "T", "t"))
+
+
+def _process(row: RosterRow) -> str:
+    state = process_state(row.pid) if row.alive and row.pid else ""
+    if not row.alive or state in ("Z", "X"):
+        return "its process on this machine has ended"
+    if state in ("T", "t"):
+        how = "SIGSTOP" if state == "T" else "a debugger"
+        return f"its process {row.pid} on this machine is stopped ({how})"
+    return f"its process {row.pid} on this machine is there and does not answer"
+
+
+def process_state(pid: int | None) -> str:
+    """Return the letter of a process's state in /proc, such as T, or ""."""
+    try:
+        status = Path(f"/proc/{pid}/stat").read_bytes()
+    except OSError:
+        return ""
+    return status.rpartition(b")")[2].split()[:1][0].decode("ascii", "replace") if b")" in status else ""
+
+
+REPORT_MAX_BYTES = 16 * 2**10
+"""Longest message; a longer one is not read."""
+
+CELL_MAX = 64
+MORE_MAX = 1_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class RosterReport:
+    """Robots that a standing controller misses after one stop.
+
+    Attributes:
+        source: the controller, as it calls itself.
+        rows: that it misses; at most 64.
+        more: number of those that it misses besides.
+        trusted: a key that is known here signed it.
+    """
+
+    source: str
+    estop_id: str
+    rows: tuple[RosterRow, ...]
+    more: int
+    trusted: bool
+
+
+def report_fields(estop_id: str, missing: Sequence[RosterRow]) -> dict[str, Any]:
+    """Return the fields of a report, the surest and longest heard robots first."""
+    rows, more = bounded(missing)
+    named = [
+        {"name": row.name, "how": row.known.name.lower(), **({"cell": row.cell[:CELL_MAX]} if row.cell else {})}
+        for row in rows
+    ]
+    return {"estop_id": estop_id, "missing": named, "more": more}
+
+
+def read_report(source: str, fields: Mapping[str, Any], trusted: Collection[bytes]) -> RosterReport | None:
+    """Read the fields of a report; None for what is none.
+
+    Args:
+        source: as the topic names it.
+        trusted: public keys of which one must have signed a report that counts.
+    """
+    estop_id, missing, more = fields.get("estop_id"), fields.get("missing"), fields.get("more")
+    if not is_epoch(estop_id) or not isinstance(missing, list):
+        return None
+    read = [_row(each) for each in missing[:REPORTED_MAX]]
+    rows = {row.name: row for row in read if row is not None}
+    beyond = more if isinstance(more, int) and not isinstance(more, bool) and 0 <= more <= MORE_MAX else 0
+    key = own_key(Purpose.STOP_ROSTER, source, fields)
+    return RosterReport(source, str(estop_id), tuple(rows.values()), beyond, key is not None and key in trusted)
+
+
+def trusted_controllers() -> frozenset[bytes]:
+    """Return the public keys whose reports count; it reads the disk."""
+    keys = {*estop_keys(), *stated_consoles()}
+    try:
+        keys |= kept_consoles()
+    except (KeyFileError, OSError) as exc:
+        logger.critical("The keys of consoles cannot be used, so their reports do not count: %s", exc)
+    return frozenset(keys)
+
+
+def _row(stated: object) -> RosterRow | None:
+    """Return a robot of a report, or None; what it says of itself is not believed."""
+    if not isinstance(stated, Mapping):
+        return None
+    how, cell = stated.get("how"), stated.get("cell")
+    try:
+        name = identifier("name", stated.get("name"))
+    except ValidationError:
+        return None
+    known = Known.__members__.get(how.upper(), Known.HEARD) if isinstance(how, str) and len(how) < 16 else Known.HEARD
+    fits = isinstance(cell, str) and len(cell) <= CELL_MAX and cell.isprintable()
+    return RosterRow(name, known, cell=str(cell) if fits else "")
+
+
+UNPROVEN_PAUSE_S = 0.005
+"""Pause after a report of a source that no known key has signed, so that a flood of them costs little."""
+
+OnReport = Callable[[RosterReport], object]
+
+
+class RosterInbox:
+    """Reads reports on a thread of its own, while a stop waits for answers.
+
+    A source whose report was signed with a known key has every second turn, so that a flood under made-up names keeps
+    no such report away for long.
+
+    Args:
+        read: returns the fields of a message; empty for what is none.
+    """
+
+    def __init__(self, read: Callable[[bytes], Mapping[str, Any]] = params_of) -> None:
+        self._read = read
+        self._lock = threading.Lock()
+        self._stops: dict[str, OnReport] = {}
+        self._queue = FairQueue()
+        self._started = False
+
+    def open(self, estop_id: str, on_report: OnReport) -> None:
+        """Give reports about this stop to ``on_report``, on the thread of the inbox."""
+        with self._lock:
+            self._stops[estop_id] = on_report
+
+    def close(self, estop_id: str) -> None:
+        """Take no more reports about this stop."""
+        with self._lock:
+            self._stops.pop(estop_id, None)
+
+    def put(self, source: str, payload: bytes | int) -> None:
+        """Take a message that a stop waits for, unless it is too long; returns at once."""
+        if isinstance(payload, int) or len(payload) > REPORT_MAX_BYTES or not self._stops:
+            return
+        self._queue.put(STOP_ROSTER, source, payload, urgent=False)
+        if not self._started:
+            with self._lock:
+                started, self._started = self._started, True
+            if not started:
+                threading.Thread(target=self._run, name="roster reports", daemon=True).start()
+
+    def end(self) -> None:
+        """End the thread."""
+        self._queue.close()
+
+    def _run(self) -> None:
+        trusted = trusted_controllers()
+        while (event := self._queue.get()) is not None:
+            if not self._stops:
+                trusted = frozenset()
+                continue
+            trusted = trusted or trusted_controllers()
+            fields = self._read(event.payload) if isinstance(event.payload, bytes) else {}
+            report = read_report(event.source, fields, trusted)
+            with self._lock:
+                on_report = None if report is None else self._stops.get(report.estop_id)
+            if report is None or not report.trusted:
+                time.sleep(UNPROVEN_PAUSE_S)
+            else:
+                self._queue.vouch(event.source)
+            if report is not None and on_report is not None:
+                on_report(report)

@@ -197,19 +197,6 @@ class Note:
     stoppable: bool | None = None
     departed: bool = False
 
-    def merged(self, later: Note) -> Note:
-        """Return this note with what a later one adds, by the rules of the file."""
-        told = (self.cell, later.cell)
-        cell = self.cell if later.cell is None else later.cell if self.cell in (None, later.cell) else ""
-        stops = [each for each in (self.stoppable, later.stoppable) if each is not None]
-        return replace(
-            later,
-            signed=later.signed or self.signed,
-            cell=None if told == (None, None) else cell,
-            signed_only=self.signed_only if later.signed_only is None else later.signed_only,
-            stoppable=any(stops) if stops else None,
-        )
-
 
 @dataclass(frozen=True, slots=True)
 class Served:

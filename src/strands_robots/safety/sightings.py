@@ -9,9 +9,12 @@ what could be read.
 from __future__ import annotations
 
 import atexit
+import fcntl
+import hashlib
 import os
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -36,14 +39,14 @@ from strands_robots.safety.sighting_file import (
     process_start,
     this_moment,
 )
-from strands_robots.safety.start_locks import StartLocks
 from strands_robots.safety.statements import STATED_WITHIN_S, Purpose, own_key
-from strands_robots.state_files import state_dir
+from strands_robots.state_files import make_private, state_dir
 from strands_robots.stop_log import stop_logger
+
+logger = stop_logger(__name__)
 
 __all__ = ["RECENT_S", "Known", "Moment", "Sighting", "Sightings", "flush_sightings", "sightings", "this_moment"]
 
-logger = stop_logger(__name__)
 
 T = TypeVar("T")
 
@@ -116,7 +119,7 @@ class Sightings:
         self._noted: dict[tuple[NetworkKey, str], tuple[float, Facts]] = {}
         self._tidied = float("-inf")
         self._crowded = False
-        self._notes: dict[tuple[NetworkKey, str], Note] = {}
+        self._notes: deque[Note] = deque(maxlen=2 * ROWS_MAX)
         self._answers: list[_Answer] = []
         self._own: dict[tuple[NetworkKey, str], Served] = {}
         self._changed: dict[tuple[NetworkKey, str], Served] = {}
@@ -164,8 +167,7 @@ class Sightings:
         with self._lock:
             if not self._admitted(key, now, stated if facts == (None, None, None) else facts):
                 return
-            waiting = self._notes.get(key)
-            self._notes[key] = heard if waiting is None else waiting.merged(heard)
+            self._notes.append(heard)
             self._start()
 
     def note_answer(
@@ -377,7 +379,8 @@ class Sightings:
     def _write_batch(self) -> str:
         """Write what is queued, and queue it again where that fails; return the problem."""
         with self._lock:
-            notes, self._notes = self._notes, {}
+            notes = list(self._notes)
+            self._notes.clear()
             answers, self._answers = self._answers, []
             served, self._changed = self._changed, {}
             self._writing = True
@@ -392,7 +395,7 @@ class Sightings:
 
     def _written(
         self,
-        notes: dict[tuple[NetworkKey, str], Note],
+        notes: list[Note],
         answers: list[_Answer],
         served: dict[tuple[NetworkKey, str], Served],
         problem: str,
@@ -400,9 +403,7 @@ class Sightings:
         """Note the outcome of a write."""
         with self._lock:
             if problem:
-                for key, later in self._notes.items():
-                    notes[key] = notes[key].merged(later) if key in notes else later
-                self._notes = notes
+                self._notes = deque([*notes, *self._notes], self._notes.maxlen)
                 self._changed = {**served, **self._changed}
                 self._answers = (answers + self._answers)[:ANSWERS_MAX]
             if problem and problem != self.problem:
@@ -414,14 +415,14 @@ class Sightings:
 
     def _write(
         self,
-        notes: Mapping[tuple[NetworkKey, str], Note],
+        notes: Iterable[Note],
         answers: Iterable[_Answer],
         served: Mapping[tuple[NetworkKey, str], Served],
     ) -> str:
         """Write one batch; return the problem, or ""."""
         signed = [(each, key) for each in answers if (key := _key_of(each)) is not None]
         counted = self._counted(signed)
-        all_notes = [*notes.values(), *(Note(each.network, each.name, each.at, each.at) for each, _ in counted)]
+        all_notes = [*notes, *(Note(each.network, each.name, each.at, each.at) for each, _ in counted)]
         crowded, self._crowded = self._crowded, False
         try:
             self.file.write(all_notes, list(served.values()), self._clock(), crowded=crowded)
@@ -536,3 +537,54 @@ def _of(directory: Path) -> Sightings:
 def sightings() -> Sightings:
     """Return the sightings of the state directory."""
     return _of(state_dir())
+
+
+class StartLocks:
+    """Locks by which processes begin to serve a robot one after another.
+
+    They are of one state directory; any thread may call. A process holds the lock of a robot from its last look at who
+    serves it until its own row is on disk, so that of two which begin at once the later one sees the earlier. Locks
+    are bytes of one empty file; the system frees those of a process that dies.
+    """
+
+    def __init__(self, directory: Path) -> None:
+        self._path = directory / "starting.lock"
+        self._lock = threading.Lock()
+        self._held: dict[tuple[NetworkKey, str], int] = {}
+        self._descriptor: int | None = None
+
+    def take(self, network: NetworkKey, name: str) -> bool:
+        """Take the lock of a robot, at once; False while another process holds it.
+
+        Robots of one name and tenant share a lock, whatever their network.
+
+        Raises:
+            OSError: the file cannot be locked.
+        """
+        place = int.from_bytes(hashlib.sha256(f"{network.tenant} {name}".encode()).digest()[:7], "big")
+        with self._lock:
+            if self._descriptor is None:
+                make_private(self._path.parent)
+                flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
+                self._descriptor = os.open(self._path, flags, 0o600)
+            try:
+                fcntl.lockf(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, place)
+            except BlockingIOError:
+                self._close_unused()
+                return False
+            self._held[network, name] = place
+            return True
+
+    def free(self, network: NetworkKey, name: str) -> None:
+        """Give the lock of a robot back, where this process holds it."""
+        with self._lock:
+            place = self._held.pop((network, name), None)
+            if self._descriptor is not None and place is not None and place not in self._held.values():
+                fcntl.lockf(self._descriptor, fcntl.LOCK_UN, 1, place)
+                self._close_unused()
+
+    def _close_unused(self) -> None:
+        # Closing any descriptor of the file frees every lock of this process.
+        if self._descriptor is not None and not self._held:
+            os.close(self._descriptor)
+            self._descriptor = None

@@ -2,27 +2,27 @@
 
 from __future__ import annotations
 
+import math
 import random
-import threading
 import time
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from strands_robots.errors import StrandsRobotsError
+from strands_robots.rate_limits import EventBudget
 from strands_robots.safety import ed25519
 from strands_robots.safety.answers import ANSWERS_MAX, Answers, Received
-from strands_robots.safety.consoles import console_key
-from strands_robots.safety.estop_listener import ESTOP, FailureBudget
-from strands_robots.safety.identity import SigningIdentity
+from strands_robots.safety.estop_listener import FAILURES_IN_ALL_PER_S, FAILURES_PER_S
+from strands_robots.safety.identity import SigningIdentity, console_key
 from strands_robots.safety.orders import StopRules, params_of, stated_epoch
-from strands_robots.safety.roster import Roster, RosterRow
-from strands_robots.safety.roster_report import report_fields
+from strands_robots.safety.roster import Roster, RosterRow, report_fields
 from strands_robots.safety.scope import EVERY_ROBOT, SCOPE, Scope
 from strands_robots.safety.sightings import Known
 from strands_robots.safety.statements import Purpose, signed
-from strands_robots.safety.stop_roster import counts
+from strands_robots.safety.stop_link import ESTOP
 from strands_robots.stop_log import stop_logger
+from strands_robots.threads import WokenThread
 
 logger = stop_logger(__name__)
 
@@ -104,13 +104,12 @@ class StandingRoster:
         self._bytes = 0
         self._followed: dict[str, _Followed] = {}
         self._done: dict[tuple[str, Scope], None] = {}
-        self._wake, self._closed = threading.Event(), False
+        self._worker = WokenThread("standing roster", self._step, self._due_in)
         self._rules = StopRules(allow=())
-        self._failures, self._signers_failures = FailureBudget(), FailureBudget()
+        self._failures = EventBudget(FAILURES_PER_S, FAILURES_IN_ALL_PER_S)
+        self._signers_failures = EventBudget(FAILURES_PER_S, FAILURES_IN_ALL_PER_S)
         self._signers: dict[str, None] = {}
         self._names: frozenset[str] = frozenset()
-        self._thread = threading.Thread(target=self._run, name="standing roster", daemon=True)
-        self._thread.start()
 
     def hear(self, event: str, source: str, payload: bytes | int) -> None:
         """Take a stop of another controller, or a robot's answer; returns at once."""
@@ -123,8 +122,7 @@ class StandingRoster:
                     # Any of them: the names of a flood do not keep the true one out.
                     pending.pop(random.choice(tuple(pending)), None)
                 pending[source] = payload
-            if not self._wake.is_set():
-                self._wake.set()
+            self._worker.wake()
         elif (self._pending or self._followed) and len(payload) <= VERDICT_MAX_BYTES:
             kept = self._answers.get(source, ())
             if (kept or len(self._answers) < ANSWERS_MAX) and self._bytes + len(payload) <= VERDICTS_MAX_BYTES:
@@ -133,24 +131,22 @@ class StandingRoster:
 
     def close(self) -> None:
         """End the thread."""
-        self._closed = True
-        self._wake.set()
-        self._thread.join(2.0)
+        self._worker.close()
 
-    def _run(self) -> None:
-        while not self._closed:
-            due = min((each.due[0] for each in self._followed.values()), default=None)
-            self._wake.wait(None if due is None else max(0.0, due - time.monotonic()))
-            self._wake.clear()
-            try:
-                self._take_stops()
-                self._report_due()
-            except Exception:
-                # Whatever a message or a disk does, the next stop is followed again.
-                logger.critical("The stops of other controllers are not followed.", exc_info=True)
-                self._followed.clear()
-            # Repetitions of a stop come every few milliseconds.
-            time.sleep(PAUSE_S)
+    def _due_in(self) -> float:
+        due = min((each.due[0] for each in self._followed.values()), default=math.inf)
+        return due - time.monotonic()
+
+    def _step(self) -> None:
+        try:
+            self._take_stops()
+            self._report_due()
+        except Exception:
+            # Whatever a message or a disk does, the next stop is followed again.
+            logger.critical("The stops of other controllers are not followed.", exc_info=True)
+            self._followed.clear()
+        # Repetitions of a stop come every few milliseconds.
+        time.sleep(PAUSE_S)
 
     def _take_stops(self) -> None:
         pending, self._pending = self._pending, {}
@@ -169,12 +165,12 @@ class StandingRoster:
             if self._rules.signed and not budget.allows(source, now):
                 continue
             if self._rules.signature_refusal(source, params, Purpose.EMERGENCY_STOP) is not None:
-                budget.record(source, now)
+                budget.count(source, now)
                 continue
             scope = self._rules.scope(source, params) if SCOPE in params else EVERY_ROBOT
             mark = (estop_id, scope)
             if mark in self._done or (last is not None and (last.estop_id, last.scope) == mark):
-                budget.record(source, now)  # replayed with another scope
+                budget.count(source, now)  # replayed with another scope
                 continue
             if self._rules.signed:
                 self._signers[source] = None
@@ -223,7 +219,7 @@ class StandingRoster:
             self._answers, self._bytes = {}, 0
 
     def _missing(self, followed: _Followed, roster: Roster, keys: Mapping[str, bytes]) -> list[RosterRow]:
-        rows = {row.name: row for row in roster.rows if row.stoppable is not False or counts(roster, row)}
+        rows = {row.name: row for row in roster.rows if row.stoppable is not False or roster.counts(row)}
         marked = {row.name for row in roster.exempt}
         rows |= {name: RosterRow(name, Known.HEARD) for name in self._also() if name not in rows and name not in marked}
         scope = followed.scope

@@ -23,22 +23,25 @@ from concurrent.futures import Future
 from typing import cast
 
 from strands_robots import settings
-from strands_robots.safety.halted_verbs import HaltedVerbs, void_calls
-from strands_robots.safety.ready_threads import ReadyThreads
 from strands_robots.safety.stop_targets import (
+    Answered,
     Haltable,
+    HaltedVerbs,
     HaltsInParts,
+    PendingStops,
+    SubmittedStop,
     Target,
+    TargetSlot,
     body_of,
     has_parts,
-    is_direct,
     note_motion,
     revoke_permits,
     target_key,
+    void_calls,
 )
 from strands_robots.safety.stopping import PendingVerdict, StopVerdict
-from strands_robots.safety.submitted_stops import Answered, PendingStops, SubmittedStop, TargetSlot
 from strands_robots.stop_log import stop_logger
+from strands_robots.threads import ReadyThreads
 
 logger = stop_logger(__name__)
 
@@ -151,6 +154,7 @@ class StopExecutor:
         within: float | None = None,
         since: float | None = None,
         answered: Answered | None = None,
+        voided: bool = False,
     ) -> Future[StopVerdict]:
         """Void the target's permits, order its halt and return at once.
 
@@ -160,6 +164,7 @@ class StopExecutor:
             within: seconds to halt; ``STRANDS_HALT_DEADLINE_S`` by default.
             since: the moment from which they count, in monotonic seconds; now by default.
             answered: called with the verdict of the future, and again with that of a halt that returns too late for it.
+            voided: the caller has had it note what moves and voided its permits, and none is given since.
 
         Returns:
             A future of the graded verdict. It is set at the latest when the time is over, and never to an exception.
@@ -167,13 +172,15 @@ class StopExecutor:
         limit = settings.number("STRANDS_HALT_DEADLINE_S") if within is None else within
         slot = self._slot(target, name)
         stop = SubmittedStop(slot, target, name, reason, limit, time.monotonic() if since is None else since, answered)
-        stop.direct = is_direct(target)
+        stop.parts = has_parts(target)
+        stop.direct = stop.parts and hasattr(type(target), "unanswered")
         stop.future.set_running_or_notify_cancel()
         if answered is not None:
             stop.future.add_done_callback(lambda future: answered(future.result()))
-        note_motion(target)
+        if not voided:
+            note_motion(target)
         stop.verbs = void_calls(target)
-        if stop.direct or slot.halts.running is not None:
+        if not voided and (stop.direct or slot.halts.running is not None):
             # The halt of any other target voids permits itself, after it has seen what moves, unless it has to wait.
             revoke_permits(target)
         if slot in getattr(self._here, "serving", ()):
@@ -249,8 +256,8 @@ class StopExecutor:
             verbs = HaltedVerbs(target, [call for each in stops for call in each.verbs], [each.asker for each in stops])
             try:
                 # Nested, an overridden halt has called the one of its class.
-                if has_parts(target) or (nested and isinstance(target, HaltsInParts)):
-                    answer = target.halt_here(reason, deadline)
+                if stops[0].parts or (nested and isinstance(target, HaltsInParts)):
+                    answer = cast(HaltsInParts, target).halt_here(reason, deadline)
                 elif target is not None:
                     answer = cast(Haltable, target).halt(reason)
             except BaseException as exc:  # noqa: BLE001 - a stop that raises is a robot that may be moving

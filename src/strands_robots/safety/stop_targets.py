@@ -1,13 +1,18 @@
-"""Targets of a stop, as the stop executor sees them."""
+"""Targets of a stop: robots, their own verbs, and the stops that wait for them."""
 
 from __future__ import annotations
 
-from collections.abc import Hashable
-from dataclasses import fields
-from typing import Any, Protocol, TypeGuard, cast, runtime_checkable
+import queue
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Collection, Hashable, Iterable
+from concurrent.futures import Future, InvalidStateError
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Protocol, cast, runtime_checkable
 
-from strands_robots.safety.gate import MotionGate
-from strands_robots.safety.stopping import PendingVerdict, StopVerdict
+from strands_robots.safety.gate import MotionGate, VerbCall, VerbsUnderWay, kept_gate
+from strands_robots.safety.stopping import ForeignAnswer, PendingVerdict, StopVerdict, graded, read_verdict
 from strands_robots.stop_log import stop_logger
 
 logger = stop_logger(__name__)
@@ -19,6 +24,12 @@ class Haltable(Protocol):
 
     def halt(self, reason: str = "") -> StopVerdict:
         """Stop everything that moves this robot; returns within the halt deadline."""
+
+
+class Stoppable(Haltable, Protocol):
+    """A robot that the plane can stop: one with a gate and a halt."""
+
+    gate: MotionGate
 
 
 class RobotWrapper:
@@ -103,16 +114,11 @@ def revoke_permits(target: object) -> None:
         gate.revoke()
 
 
-def has_parts(target: object) -> TypeGuard[HaltsInParts]:
+def has_parts(target: object) -> bool:
     """Return whether the executor calls the parts of its halt."""
     kind = type(target)
     halt = getattr(kind, "halt", None)
     return hasattr(kind, "halt_here") and (halt is None or getattr(halt, "halts_in_parts", False))
-
-
-def is_direct(target: object) -> TypeGuard[DirectTarget]:
-    """Return whether it answers for itself while its halt blocks."""
-    return has_parts(target) and hasattr(type(target), "unanswered")
 
 
 def target_key(target: Target) -> Hashable:
@@ -124,3 +130,350 @@ def target_key(target: Target) -> Hashable:
     # By the identity of its parts, which may be robots without a hash, and by the value of a name.
     parts = (getattr(body, each.name) for each in fields(cast(Any, body)))
     return (type(body), *(part if isinstance(part, str) else id(part) for part in parts))
+
+
+class VerbsAfterHalt(PendingVerdict):
+    """Verdict of a halt, with the own verbs that ran when it came.
+
+    Args:
+        answer: of the halt, which has returned.
+        calls: ran before the halt; their permits are void.
+        until: monotonic s at which a verb that has not returned did not stop.
+    """
+
+    def __init__(self, answer: StopVerdict | PendingVerdict, calls: tuple[VerbCall, ...], until: float) -> None:
+        rest = answer if isinstance(answer, PendingVerdict) else None
+        super().__init__(until)
+        self._rest, self._calls = rest, calls
+        self._verdict = answer if isinstance(answer, StopVerdict) else None
+
+    def known(self) -> StopVerdict | None:
+        if self._rest is not None and self._verdict is None:
+            self._verdict = self._rest.known()
+        return None if self._verdict is None or self._running() else self._with_verbs(self._verdict)
+
+    def read(self) -> object:
+        # One reading serves all stops of a robot, also one whose own verdict still waits for it.
+        return None if self._rest is None else self._rest.read()
+
+    def judged(self, reading: object, *, last: bool) -> StopVerdict | None:
+        if self._rest is not None and self._verdict is None:
+            last_of_rest = last or time.monotonic() >= self._rest.until
+            self._verdict = self._rest.judged(reading, last=last_of_rest)
+        if self._verdict is None or (self._running() and not last):
+            return None
+        return self._with_verbs(self._verdict)
+
+    def unread(self, why: str) -> StopVerdict:
+        if self._verdict is not None:
+            return self._with_verbs(self._verdict)
+        return self._with_verbs(StopVerdict() if self._rest is None else self._rest.unread(why))
+
+    def _running(self) -> bool:
+        return any(not each.ended for each in self._calls)
+
+    def _with_verbs(self, verdict: StopVerdict) -> StopVerdict:
+        names = {each.name: True for each in self._calls}
+        names |= {each.name: False for each in self._calls if not each.ended}
+        returned = [name for name, ended in names.items() if ended and name not in verdict.halted]
+        why = "it has not returned, and may go on to move the robot"
+        unreturned = {name: why for name, ended in names.items() if not ended}
+        return replace(verdict, halted=(*verdict.halted, *returned), not_stopped={**verdict.not_stopped, **unreturned})
+
+
+class StopOfRobot:
+    """A stop that is no robot itself: of a part of one, or with more than a halt."""
+
+    def stopped_robot(self) -> object:
+        """Return the robot whose own verbs it stops. Must not block."""
+        raise NotImplementedError
+
+
+def under_way_of(target: object) -> VerbsUnderWay | None:
+    """Return the own verbs of what is stopped; None where it has no gate of ours.
+
+    No code of the robot's own is run: it may hang, and a stop follows.
+    """
+    # By its type: isinstance may ask a robot for its __class__.
+    robot = cast(StopOfRobot, target).stopped_robot() if issubclass(type(target), StopOfRobot) else target
+    try:
+        gate = object.__getattribute__(robot, "__dict__").get("gate")
+    except AttributeError:
+        gate = None
+    known = cast(MotionGate, gate) if issubclass(type(gate), MotionGate) else kept_gate(robot)
+    return None if known is None else known.under_way
+
+
+def void_calls(target: object) -> tuple[VerbCall, ...]:
+    """Void the permits of the own verbs that run on ``target``; return their calls."""
+    under_way = under_way_of(target)
+    calls = under_way.calls if under_way else ()
+    for each in calls:
+        each.void()
+    return calls
+
+
+class _Here(threading.local):
+    """Halts under way on this thread, the outermost first."""
+
+    def __init__(self) -> None:
+        self.halts: list[HaltedVerbs] = []
+
+
+_here = _Here()
+
+
+class HaltedVerbs:
+    """The own verbs of a target that is about to be halted on this thread.
+
+    A halt inside that waits for verbs itself leaves that to this one.
+
+    Args:
+        target: of the halt; permits of its verbs are void from now on.
+        before: calls that ran when the halt was asked for.
+        asked_by: threads that asked for the halt; a verb that halts its own robot is not waited for.
+    """
+
+    def __init__(self, target: object, before: Iterable[VerbCall] = (), asked_by: Collection[int] = ()) -> None:
+        self._under_way = under_way_of(target)
+        self._calls = dict.fromkeys((*before, *void_calls(target)))
+        # Several stops have one answer, and whoever does not run the verb has to be told of it.
+        self._itself = next(iter(asked_by)) if len(set(asked_by)) == 1 else None
+        _here.halts.append(self)
+
+    def asked(self, call: VerbCall) -> bool:
+        """Return True for a verb that asks for the halt itself."""
+        return call.thread == self._itself
+
+    def after(self, answer: object, name: str, until: float) -> object:
+        """Return the answer to the halt, not settled while a verb has not returned.
+
+        Args:
+            answer: of the halt, or what it raised.
+            name: what the verdict calls a target whose halt names nothing.
+            until: monotonic s at which a verb that has not returned did not stop.
+        """
+        _here.halts.remove(self)
+        if self._under_way:
+            # One that began while the halt came saw a valid permit, which is void now.
+            self._calls.update(dict.fromkeys(each for each in self._under_way.calls if not each.valid()))
+        calls = tuple(each for each in self._calls if not self.asked(each))
+        if not calls or _here.halts:
+            return answer
+        given = answer if isinstance(answer, StopVerdict | PendingVerdict) else ForeignAnswer(answer, name)
+        return VerbsAfterHalt(given, calls, until)
+
+
+def verbs_to_end(under_way: VerbsUnderWay) -> Callable[[], bool]:
+    """Return whether verbs run that a halt under way on this thread has to wait for.
+
+    An inner halt waits for none: the outermost does.
+    """
+    if len(_here.halts) != 1:
+        return lambda: False
+    halted = _here.halts[0]
+    return lambda: any(not each.valid() and not halted.asked(each) for each in under_way.calls)
+
+
+def halted_with_verbs(robot: object, halt: Callable[[], StopVerdict | PendingVerdict], deadline: float) -> StopVerdict:
+    """Halt a robot on this thread; the verdict waits for its own verbs.
+
+    Args:
+        robot: whose verbs may run.
+        halt: returns its answer.
+        deadline: monotonic s at which a verb that has not returned did not stop.
+    """
+    verbs = HaltedVerbs(robot, asked_by=(threading.get_ident(),))
+    answer: StopVerdict | PendingVerdict | None = None
+    try:
+        answer = halt()
+    finally:
+        given = verbs.after(answer, "", deadline)
+    return read_verdict(given if isinstance(given, PendingVerdict) else answer)
+
+
+WAITING_MAX = 4096
+"""Stops of one target that wait for its next halt. Beyond it the oldest is answered by its deadline alone."""
+
+Answered = Callable[[StopVerdict], None]
+
+
+@dataclass(eq=False, slots=True)
+class SubmittedStop:
+    """One submitted stop. Times are monotonic seconds.
+
+    Attributes:
+        within: seconds to halt, which count from ``since``.
+        answered: called with a verdict that comes too late for the future.
+        parts: the executor calls the parts of its halt.
+        direct: it answers for itself while its halt blocks.
+        verbs: own verbs of the target that ran when it was submitted.
+        asker: the thread that submitted it.
+        pending: what is still to be read for the verdict; None until the halt has returned.
+        begun: the moment at which its halt, or later its reading, began.
+    """
+
+    slot: TargetSlot | None
+    target: Target | None
+    name: str
+    reason: str
+    within: float
+    since: float
+    answered: Answered | None
+    parts: bool = False
+    direct: bool = False
+    verbs: tuple[VerbCall, ...] = ()
+    asker: int = field(default_factory=threading.get_ident)
+    extended: bool = False
+    pending: PendingVerdict | None = None
+    begun: float | None = None
+    submitted: float = field(default_factory=time.monotonic)
+    future: Future[StopVerdict] = field(default_factory=Future)
+    answering: threading.Lock = field(default_factory=threading.Lock)
+
+    def moment(self, part: float) -> float:
+        """Return the moment at which ``part`` of the time to halt has passed."""
+        return self.since + part * self.within
+
+    def halted(self, answer: object) -> bool:
+        """Take the answer of the halt; False where the verdict has still to be read."""
+        if isinstance(answer, StopVerdict):
+            self.resolve(answer)
+            return True
+        self.begun = None
+        self.pending = answer if isinstance(answer, PendingVerdict) else ForeignAnswer(answer, self.name)
+        return False
+
+    def resolve(self, verdict: StopVerdict) -> None:
+        """Hand out the verdict, marked if it is late."""
+        late = self.answered
+        # Watched until the deadline, an answered stop must not keep its robot alive.
+        self.slot = self.target = self.answered = self.pending = None
+        if not self._set(verdict) and late is not None:
+            try:
+                late(verdict)
+            except Exception:
+                logger.exception("A late verdict on %s was not taken.", self.name)
+
+    def pending_stops(self) -> PendingStops | None:
+        """Return where it waits or is carried out; None once it is resolved."""
+        slot = self.slot
+        if slot is None:
+            return None
+        return slot.halts if self.pending is None else slot.readings
+
+    def extend(self) -> float | None:
+        """Return the later deadline of a stop that waited behind another one.
+
+        None where it has had it, or did not wait.
+        """
+        line = self.pending_stops()
+        running = None if line is None else line.running
+        if self.direct or self.extended or not running or self.future.done():
+            return None
+        self.extended = True
+        if self.begun is not None:
+            return self.begun + self.within
+        return None if any(each.future.done() for each in running) else self.moment(2.0)
+
+    def expire(self) -> bool:
+        """Answer for the target that did not; False where it has answered."""
+        target, pending = self.target, self.pending
+        if target is None or self.future.done():
+            return False
+        why = f"no answer in {self.within:g} s"
+        verdict = StopVerdict(not_stopped={self.name: why})
+        try:
+            if pending is not None:
+                verdict = pending.unread(why)
+            elif self.direct:
+                verdict = graded(cast(DirectTarget, target).unanswered(why), self.name)
+        except Exception:
+            logger.exception("%s could not say what it does while its halt blocks.", self.name)
+        return self._set(verdict)
+
+    def _set(self, verdict: StopVerdict) -> bool:
+        elapsed_ms = (time.monotonic() - self.submitted) * 1000
+        # The callbacks of the first answer have returned before a late one is handed out.
+        with self.answering:
+            try:
+                self.future.set_result(replace(verdict, elapsed_ms=elapsed_ms))
+            except InvalidStateError:
+                return False
+            return True
+
+
+class PendingStops:
+    """Stops of one target that wait for the same work, and those that are worked on.
+
+    One thread works at a time. One that blocks beyond a deadline is given up, and the next goes on with what waits.
+    """
+
+    def __init__(self) -> None:
+        self.waiting: deque[SubmittedStop] = deque(maxlen=WAITING_MAX)
+        self.running: list[SubmittedStop] | None = None
+        self.stuck = 0
+        self._changing = threading.Lock()
+
+    def next(self, done: list[SubmittedStop] | None = None) -> list[SubmittedStop] | None:
+        """Take all that wait, or None.
+
+        Args:
+            done: what the calling thread took before.
+        """
+        with self._changing:
+            running = self.running
+            if done is None and running is not None:
+                return None
+            if running is not done:
+                # It was given up as stuck and is back; what could have no further thread goes on with it.
+                self.stuck -= 1
+                if running is not None:
+                    if not _overdue(running):
+                        return None
+                    self.stuck += 1
+            taken = []
+            while self.waiting:
+                taken.append(self.waiting.popleft())
+                taken[-1].begun = time.monotonic()
+            self.running = taken or None
+            return self.running
+
+    def more(self, running: list[SubmittedStop]) -> list[SubmittedStop] | None:
+        """Add what has come meanwhile to ``running``; None if that was given up."""
+        with self._changing:
+            if self.running is not running:
+                return None
+            taken = []
+            while self.waiting:
+                taken.append(self.waiting.popleft())
+                taken[-1].begun = time.monotonic()
+            running.extend(taken)
+            return taken
+
+    def give_up(self, stuck: list[SubmittedStop]) -> bool:
+        """Abandon the thread that works on ``stuck``; False if it has returned."""
+        with self._changing:
+            if self.running is not stuck:
+                return False
+            self.running = None
+            self.stuck += 1
+            return True
+
+
+class TargetSlot:
+    """Stops of one target, and the queue of the thread that is woken for them.
+
+    It does not refer to the target; only its stops do.
+    """
+
+    def __init__(self, name: str, wake: queue.SimpleQueue[TargetSlot | None]) -> None:
+        self.name = name
+        self.wake = wake
+        self.halts, self.readings = PendingStops(), PendingStops()
+        self.owners = 0
+        self.thread: threading.Thread | None = None
+
+
+def _overdue(running: list[SubmittedStop]) -> bool:
+    return any(each.future.done() for each in running)

@@ -26,12 +26,11 @@ from typing import Any, Protocol, cast
 
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.errors import StrandsRobotsError
-from strands_robots.safety.approval import Leave
-from strands_robots.safety.authorization import ANONYMOUS, caller_name
+from strands_robots.safety.authorization import ANONYMOUS, Leave, caller_name
 from strands_robots.safety.lease_signatures import outdated, reserve_epochs, unproven
+from strands_robots.safety.process import undisturbed
 from strands_robots.safety.resume import configured_keys
 from strands_robots.safety.stopping import StopVerdict
-from strands_robots.safety.turns import undisturbed
 from strands_robots.serving.workers import UNBOUNDED, BoundedCall
 from strands_robots.stop_log import stop_logger
 

@@ -12,7 +12,7 @@ from typing import Any, Protocol, cast
 from strands_robots.contract import Robot, WorldRobot, body_of, holds_robots, robots_in, task_runs
 from strands_robots.envelope import Envelope, is_error, success
 from strands_robots.identity_map import IdentityMap
-from strands_robots.safety.approval import Leave
+from strands_robots.safety.authorization import Leave
 from strands_robots.safety.stop_executor import stop_executor
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.control import (

@@ -21,7 +21,7 @@ from weakref import WeakKeyDictionary
 from strands_robots.contract import Robot, body_of
 from strands_robots.envelope import Envelope, RefusalReason, Refused, error, is_error
 from strands_robots.identity_map import IdentityMap
-from strands_robots.safety.approval import Approval, Leave, digest
+from strands_robots.safety.authorization import Approval, Leave, digest
 from strands_robots.safety.gate import REFUSALS, MotionGate, MotionRefused, MotionRequest, refusal_envelope
 from strands_robots.serving.control import NotHolderError
 from strands_robots.serving.control_leases import ControlLeases, leases_of

@@ -12,8 +12,8 @@ from functools import partial
 from strands_robots import settings
 from strands_robots.contract import Haltable, WorldRobot
 from strands_robots.envelope import Envelope
-from strands_robots.safety.halted_verbs import StopOfRobot
 from strands_robots.safety.stop_executor import StopExecutor, stop_executor
+from strands_robots.safety.stop_targets import StopOfRobot
 from strands_robots.safety.stopping import (
     PendingVerdict,
     StopVerdict,

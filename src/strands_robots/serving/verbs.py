@@ -14,7 +14,7 @@ from typing import Any
 
 from strands_robots.contract import for_request
 from strands_robots.safety.gate import MotionRequest
-from strands_robots.safety.resume import is_epoch
+from strands_robots.safety.lockout import is_epoch
 from strands_robots.utils import DURATION_MAX_S, ValidationError, duration, identifier, number, shown, text, whole
 from strands_robots.verb_parameters import JSON_TYPES, REQUIRED, Check, Parameter, checked_arguments
 

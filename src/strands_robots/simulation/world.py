@@ -32,8 +32,7 @@ from strands_robots.policies.rollout import (
     unfollowed,
 )
 from strands_robots.safety.gate import MotionGate, MotionRequest, Permit, Waiting, answered
-from strands_robots.safety.halted_verbs import halted_with_verbs, verbs_to_end
-from strands_robots.safety.stop_targets import note_motion
+from strands_robots.safety.stop_targets import halted_with_verbs, note_motion, verbs_to_end
 from strands_robots.safety.stopping import PendingVerdict, StopLevel, StopVerdict, halts_in_parts, read_verdict
 from strands_robots.simulation.body import PICTURE, RobotBody, targets_of
 from strands_robots.simulation.model import compile_stage, in_floor, sunk_sentence

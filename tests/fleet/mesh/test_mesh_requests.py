@@ -18,7 +18,7 @@ from strands_robots.fleet.adapter import CLOSED
 from strands_robots.fleet.mesh.network import MeshNetwork
 from strands_robots.fleet.mesh.requests import IN_FLIGHT
 from strands_robots.mesh import Mesh
-from strands_robots.safety.approval import Grants, digest
+from strands_robots.safety.authorization import Grants, digest
 from strands_robots.state_files import state_dir
 
 

@@ -61,11 +61,11 @@ PARSERS = {
     "mesh/transport/access.py": OWN_FILE,
     "mesh/wire.py": BOUNDED,
     "ros/rosbridge_session.py": BOUNDED,
-    "safety/approval.py": OWN_FILE,
-    "safety/clearance.py": OWN_FILE,
+    "safety/authorization.py": OWN_FILE,
     "safety/identity.py": OWN_FILE,
     "safety/orders.py": BOUNDED,
     "safety/persistence.py": OWN_FILE,
+    "safety/resume.py": OWN_FILE,
 }
 """Each module that parses JSON, and whose text it is. The decoders of foreign text are in fixtures/decoders.py."""
 

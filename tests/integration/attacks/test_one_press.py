@@ -19,9 +19,9 @@ from strands_robots.device_connect.backends import LinkConfig
 from strands_robots.device_connect.safety_controller import safety_controller
 from strands_robots.device_connect.stop_link import stop_link
 from strands_robots.safety import ed25519
-from strands_robots.safety.controller import StopReport
-from strands_robots.safety.estop_listener import CHECK_IN, ESTOP, notification
+from strands_robots.safety.answers import StopReport
 from strands_robots.safety.orders import StopRules, new_epoch
+from strands_robots.safety.stop_link import CHECK_IN, ESTOP, notification
 
 TIMES = 10
 

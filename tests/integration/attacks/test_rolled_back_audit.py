@@ -16,7 +16,7 @@ from fixtures.stop_controller import controller
 from fixtures.waiting import eventually
 from tests.integration.mesh.networks import network
 
-from strands_robots.audit.witness import WITNESS
+from strands_robots.audit.verification import WITNESS
 from strands_robots.device_connect.backends import LinkConfig
 
 SECRET = {"STRANDS_MESH_AUDIT_PSK": "the secret of this machine's audit"}

@@ -19,8 +19,8 @@ from fixtures.tcp_proxy import TcpProxy
 from fixtures.waiting import eventually, free_port
 
 from strands_robots.device_connect.backends import LinkConfig, loopback_config, open_client
-from strands_robots.safety.estop_listener import notification
 from strands_robots.safety.sightings import Sightings
+from strands_robots.safety.stop_link import notification
 
 pytestmark = pytest.mark.timeout(600)
 

@@ -19,7 +19,8 @@ from strands_robots.device_connect.backends import LinkConfig
 from strands_robots.device_connect.safety_controller import envelope, safety_controller
 from strands_robots.envelope import is_error
 from strands_robots.safety import ed25519
-from strands_robots.safety.controller import Progress, SafetyController
+from strands_robots.safety.answers import Progress
+from strands_robots.safety.controller import SafetyController
 from strands_robots.safety.orders import StopRules
 from strands_robots.utils import ValidationError
 

@@ -33,10 +33,11 @@ from strands_robots.device_connect.stop_link import stop_link
 from strands_robots.envelope import Envelope
 from strands_robots.safety import ed25519
 from strands_robots.safety.controller import SafetyController
-from strands_robots.safety.estop_listener import ESTOP, estop_listener, notification
+from strands_robots.safety.estop_listener import estop_listener
 from strands_robots.safety.orders import new_epoch
 from strands_robots.safety.plane import plane
 from strands_robots.safety.resume import sign
+from strands_robots.safety.stop_link import ESTOP, notification
 
 MOVE = {"instruction": "wave", "duration": 300.0}
 

@@ -21,9 +21,10 @@ from strands_robots.device_connect.backends import LinkConfig, loopback_config
 from strands_robots.device_connect.backends import zenoh as zenoh_backend
 from strands_robots.device_connect.stop_link import stop_link
 from strands_robots.safety import ed25519
-from strands_robots.safety.estop_listener import CHECK_IN, ESTOP, REFUSAL_INTERVAL_S, VERDICT, StopLink, notification
+from strands_robots.safety.estop_listener import REFUSAL_INTERVAL_S
 from strands_robots.safety.orders import StopRules, new_epoch, signed_bytes
 from strands_robots.safety.statements import Purpose
+from strands_robots.safety.stop_link import CHECK_IN, ESTOP, VERDICT, StopLink, notification
 
 Broker = ZenohRouter | NatsServer
 

@@ -15,10 +15,10 @@ from tests.integration.safety.conftest import Stage
 from strands_robots.device_connect import FleetClient
 from strands_robots.device_connect.stop_link import stop_link
 from strands_robots.safety import ed25519
-from strands_robots.safety.estop_listener import ESTOP, StopLink, notification
 from strands_robots.safety.orders import new_epoch, signed_bytes
 from strands_robots.safety.resume import sign
 from strands_robots.safety.statements import Purpose
+from strands_robots.safety.stop_link import ESTOP, StopLink, notification
 
 Send = Callable[..., bool]
 

@@ -12,7 +12,7 @@ from fixtures.paused_motions import PausedMotions
 from fixtures.roster_robots import RosterRobots
 from fixtures.waiting import eventually, free_port
 
-from strands_robots.safety.awake import HOLD_S, PAUSE_S
+from strands_robots.safety.process import HOLD_S, PAUSE_S
 
 ROUNDS = 5
 IN_FLIGHT = 1

@@ -15,9 +15,9 @@ from tests.integration.safety.conftest import Stage
 
 from strands_robots.device_connect.stop_link import stop_link
 from strands_robots.safety import ed25519
-from strands_robots.safety.estop_listener import ESTOP, VERDICT, notification
 from strands_robots.safety.orders import new_epoch, signed_stop
 from strands_robots.safety.statements import Purpose
+from strands_robots.safety.stop_link import ESTOP, VERDICT, notification
 
 
 def locked(*processes: Child) -> set[str]:

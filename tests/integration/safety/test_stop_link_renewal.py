@@ -9,8 +9,9 @@ from fixtures.waiting import eventually, free_port
 
 from strands_robots.device_connect import init_device_connect_sync, loopback_config, stop_device_connect
 from strands_robots.device_connect.stop_link import ZenohStopLink
-from strands_robots.safety.estop_listener import RenewableLink, StopLink, estop_listener, notification
+from strands_robots.safety.estop_listener import estop_listener
 from strands_robots.safety.plane import plane
+from strands_robots.safety.stop_link import RenewableLink, StopLink, notification
 
 
 def seen_by(link: StopLink) -> set[str]:

@@ -14,14 +14,15 @@ from fixtures.waiting import eventually
 from strands_robots.device_connect.backends import LinkConfig
 from strands_robots.device_connect.stop_link import stop_link
 from strands_robots.hardware import HardwareRobot
-from strands_robots.safety.estop_listener import ESTOP, EstopListener, notification
+from strands_robots.safety.estop_listener import EstopListener
 from strands_robots.safety.orders import new_epoch
+from strands_robots.safety.stop_link import ESTOP, notification
 
 ARCHITECTURE = Path(__file__).parents[3] / "docs" / "architecture.md"
 
 
-def way_of_a_stop() -> list[Call]:
-    """Stop an arm over NATS; the calls from the link's callback to the write of the freeze."""
+def way_of_a_stop() -> tuple[list[Call], list[str]]:
+    """Stop an arm over NATS; the calls from the link's callback to the freeze, and all functions entered meanwhile."""
     device = RecordingDevice()
     with NatsServer() as server, CallPath() as path, own_plane(20.0) as plane:
         config = LinkConfig(transport="nats", connect=(server.url,))
@@ -47,12 +48,13 @@ def way_of_a_stop() -> list[Call]:
             registration.close()
             robot.cleanup()
     callback = next(index for index, call in enumerate(way) if call.name.endswith("on_message"))
-    return way[callback:]
+    return way[callback:], path.entered(way[callback:])
 
 
 def test_stop_of_a_real_arm_takes_the_documented_way_with_two_hand_offs() -> None:
-    way = way_of_a_stop()
+    way, entered = way_of_a_stop()
     threads = [name for name, _ in itertools.groupby(call.thread for call in way)]
     assert threads == ["stop-link", "estop-listener", "halt-arm"]
     assert hops(way) == documented(ARCHITECTURE, "stop-path")
     assert len(hops(way)) <= 14
+    assert len(entered) <= 55

@@ -22,7 +22,7 @@ from strands_robots.device_connect import (
     stop_device_connect,
 )
 from strands_robots.mesh import init_mesh, session
-from strands_robots.safety.approval import Grants
+from strands_robots.safety.authorization import Grants
 from strands_robots.state_files import state_dir
 from strands_robots.utils import ValidationError
 

@@ -32,8 +32,8 @@ from strands_robots.drivers.reachy.target import (
 )
 from strands_robots.envelope import Envelope, error, success, text_of
 from strands_robots.safety.gate import MotionGate, MotionRequest
-from strands_robots.safety.halted_verbs import halted_with_verbs
 from strands_robots.safety.stop_executor import RETURN_SHARE
+from strands_robots.safety.stop_targets import halted_with_verbs
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.utils import ValidationError, choice, flag, identifier, shown, text
 

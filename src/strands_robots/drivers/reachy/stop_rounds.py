@@ -15,8 +15,8 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Generic, TypeVar
 
-from strands_robots.safety.ready_threads import ReadyThreads
 from strands_robots.stop_log import stop_logger
+from strands_robots.threads import ReadyThreads
 
 logger = stop_logger(__name__)
 

@@ -22,7 +22,7 @@ from strands_robots.ros.gate import CommandGate
 from strands_robots.ros.link import RosError, RosLink
 from strands_robots.ros.names import bare_kind, graph_name, interface
 from strands_robots.safety.gate import MotionGate, MotionRefused, MotionRequest, Permit
-from strands_robots.safety.halted_verbs import halted_with_verbs
+from strands_robots.safety.stop_targets import halted_with_verbs
 from strands_robots.safety.stopping import PendingVerdict, StopVerdict, halts_in_parts
 from strands_robots.stop_log import stop_logger
 from strands_robots.utils import MissingExtraError, ValidationError, identifier, number, whole

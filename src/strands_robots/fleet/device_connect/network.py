@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from strands_robots.fleet.cached_keys import CachedKeys
     from strands_robots.fleet.lockout_report import LockoutReport, Resumed
     from strands_robots.fleet.stop_button import StopSender
-    from strands_robots.safety.controller import OnProgress
+    from strands_robots.safety.answers import OnProgress
     from strands_robots.safety.network_key import NetworkKey
     from strands_robots.safety.stop_roster import StopOutcome
     from strands_robots.serving.advertised import AdvertisedVerb

@@ -13,12 +13,11 @@ from typing import TYPE_CHECKING, Any
 from strands_robots.envelope import Envelope
 from strands_robots.fleet.adapter import FIND_S, STOP_S
 from strands_robots.fleet.stop_answers import measured, with_plain_stops, with_reasons
-from strands_robots.safety.controller import OnProgress, Progress, StopReport
+from strands_robots.safety.answers import OnProgress, Progress, StopReport
 from strands_robots.safety.orders import new_epoch
-from strands_robots.safety.roster_search import FoundDevices, RosterSearch
+from strands_robots.safety.roster import Sending
 from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope
-from strands_robots.safety.silence import Sending
-from strands_robots.safety.stop_roster import StopOutcome, StopRoster
+from strands_robots.safety.stop_roster import FoundDevices, RosterSearch, StopOutcome, StopRoster
 
 logger = logging.getLogger(__name__)
 

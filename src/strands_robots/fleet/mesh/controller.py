@@ -11,15 +11,12 @@ from strands_robots.fleet.mesh.discovery import LOOK_S
 from strands_robots.fleet.mesh.lockouts import lockable_peers
 from strands_robots.fleet.mesh.standing import MeshReports, mesh_network
 from strands_robots.fleet.stop_answers import stop_outcome
-from strands_robots.safety.answers import Answer
-from strands_robots.safety.controller import DEADLINE_S, OnProgress, Progress, StopReport
+from strands_robots.safety.answers import Answer, OnProgress, Press, Presses, Progress, StopReport
+from strands_robots.safety.controller import DEADLINE_S
 from strands_robots.safety.orders import new_epoch
-from strands_robots.safety.peer_answers import enrolled_peers, stop_distrust
-from strands_robots.safety.presses import Press, Presses
-from strands_robots.safety.roster_inbox import OnReport
+from strands_robots.safety.roster import OnReport, Sending
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
-from strands_robots.safety.silence import Sending
-from strands_robots.safety.statements import ALARM
+from strands_robots.safety.statements import ALARM, enrolled_peers, stop_distrust
 from strands_robots.safety.stop_roster import READ_WITHIN_S, robots_known_at
 from strands_robots.safety.stopping import explain
 

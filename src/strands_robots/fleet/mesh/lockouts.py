@@ -11,8 +11,8 @@ from strands_robots.fleet.cached_keys import Keys
 from strands_robots.fleet.lockout_report import TOO_MANY, LockoutReport, Resumed
 from strands_robots.safety.lockout import OVERFLOW, Lockout
 from strands_robots.safety.orders import new_epoch
-from strands_robots.safety.peer_answers import enrolled_key, enrolled_peers, lockout_distrust, resume_distrust
 from strands_robots.safety.resume import sign
+from strands_robots.safety.statements import enrolled_key, enrolled_peers, lockout_distrust, resume_distrust
 from strands_robots.utils import shown
 
 if TYPE_CHECKING:

@@ -56,10 +56,10 @@ from strands_robots.fleet.mesh_settings import MeshSettings, no_hub
 from strands_robots.fleet.refusals import refusal_of, refusal_of_text, with_meaning
 from strands_robots.fleet.stop_answers import roster_verdict
 from strands_robots.fleet.stop_button import StopSender
-from strands_robots.safety.controller import OnProgress
+from strands_robots.safety.answers import OnProgress
 from strands_robots.safety.network_key import NetworkKey
-from strands_robots.safety.peer_answers import enrolled_peers, lockout_distrust
 from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope
+from strands_robots.safety.statements import enrolled_peers, lockout_distrust
 from strands_robots.safety.stop_roster import StopOutcome
 from strands_robots.tags import read_tags
 from strands_robots.utils import MissingExtraError, ValidationError, finite, near, plain_text, shown

@@ -14,7 +14,7 @@ from strands_robots.fleet.cached_keys import CachedKeys
 from strands_robots.fleet.lockout_report import LockoutReport
 from strands_robots.fleet.mesh.lockouts import ask_peer
 from strands_robots.fleet.mesh.stops import stop_peer
-from strands_robots.safety.peer_answers import enrolled_peers
+from strands_robots.safety.statements import enrolled_peers
 from strands_robots.utils import plain_text
 
 if TYPE_CHECKING:

@@ -9,13 +9,12 @@ from itertools import count
 from typing import TYPE_CHECKING, Any
 
 from strands_robots.bounded_json import json_object
-from strands_robots.safety.estop_listener import ESTOP
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.orders import PARSED_MAX_BYTES
-from strands_robots.safety.peer_answers import enrolled_peers, lockout_distrust
-from strands_robots.safety.roster import Roster, RosterRow
-from strands_robots.safety.roster_inbox import RosterInbox
+from strands_robots.safety.roster import Roster, RosterInbox, RosterRow
 from strands_robots.safety.standing_roster import StandingRoster, controllers_identity
+from strands_robots.safety.statements import enrolled_peers, lockout_distrust
+from strands_robots.safety.stop_link import ESTOP
 
 if TYPE_CHECKING:
     from strands_robots.mesh import Mesh

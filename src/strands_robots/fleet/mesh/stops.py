@@ -12,10 +12,9 @@ from strands_robots.fleet.mesh.discovery import discover, must_answer, only_call
 from strands_robots.fleet.mesh.standing import MeshReports, mesh_network
 from strands_robots.fleet.stop_answers import measured, unanswered
 from strands_robots.safety.orders import new_epoch
-from strands_robots.safety.peer_answers import enrolled_peers, stop_distrust
+from strands_robots.safety.roster import Sending
 from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope
-from strands_robots.safety.silence import Sending
-from strands_robots.safety.statements import ALARM
+from strands_robots.safety.statements import ALARM, enrolled_peers, stop_distrust
 from strands_robots.safety.stop_roster import READ_WITHIN_S, StopOutcome, StopRoster, robots_known_at
 from strands_robots.safety.stopping import explain, grade
 from strands_robots.utils import plain_text

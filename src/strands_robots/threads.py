@@ -1,8 +1,9 @@
-"""Threads that stand ready for work that may block."""
+"""Threads that stand ready for work, and threads that sleep until there is some."""
 
 from __future__ import annotations
 
 import itertools
+import math
 import queue
 import threading
 from collections.abc import Callable
@@ -90,3 +91,46 @@ class ReadyThreads(Generic[T]):
                 if self._idle >= self._count:
                     return
                 self._idle += 1
+
+
+class WokenThread:
+    """Thread that sleeps until it is woken or something is due; started at its first wake.
+
+    Args:
+        name: of the thread.
+        step: done after each wake, and when something is due; it may not raise.
+        due_in: returns the seconds until then; infinite where only a wake counts.
+    """
+
+    def __init__(self, name: str, step: Callable[[], None], due_in: Callable[[], float] = lambda: math.inf) -> None:
+        self._name, self._step, self._due_in = name, step, due_in
+        self._woken, self._starting = threading.Event(), threading.Lock()
+        self._closed = False
+        self._thread: threading.Thread | None = None
+
+    def wake(self) -> None:
+        """Have the step done soon; return at once."""
+        if self._thread is None:
+            with self._starting:
+                if self._thread is None and not self._closed:
+                    self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
+                    self._thread.start()
+        if not self._woken.is_set():
+            self._woken.set()
+
+    def close(self, wait_s: float = 2.0) -> None:
+        """End the thread after its step. Safe to call twice."""
+        with self._starting:
+            self._closed, thread = True, self._thread
+        self._woken.set()
+        if thread is not None and thread is not threading.current_thread():
+            thread.join(wait_s)
+
+    def _run(self) -> None:
+        while not self._closed:
+            left_s = self._due_in()
+            if left_s > 0:
+                self._woken.wait(None if left_s == math.inf else left_s)
+            self._woken.clear()
+            if not self._closed:
+                self._step()

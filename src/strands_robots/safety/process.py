@@ -1,21 +1,148 @@
-"""Clock of a process that notices when it did not run.
-
-Every look at it is a proof that the process runs: one thread looks ten times a second, and every write of a motion
-looks before it. Two looks that are half a second apart mean that nobody got to run in between: the process was stopped
-by a signal, swapped out, or its machine slept. The first look after that holds the motions, whichever thread takes it,
-because after a SIGCONT the thread of a motion may run before any other. A motion that writes seldom causes no hold, and
-a busy machine none as long as any one of the threads that look gets half a second's share of it.
-"""
+"""The process: time slices and garbage collector of its interpreter, and its pauses."""
 
 from __future__ import annotations
 
+import gc
+import sys
 import threading
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 
 from strands_robots.state_files import uptime
 from strands_robots.stop_log import stop_logger
 
 logger = stop_logger(__name__)
+
+SWITCH_S = 0.0005
+"""Longest time in seconds that a busy Python thread may keep the interpreter from the threads of a stop; Python's own
+default is ten times that, and a stop wakes up to three threads on either side."""
+
+
+class _WhileNeeded(ABC):
+    """A setting of the interpreter that is another one while anyone needs that."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._users = 0
+
+    @abstractmethod
+    def _change(self) -> None: ...
+
+    @abstractmethod
+    def _restore(self) -> None: ...
+
+    def begin(self) -> Callable[[], None]:
+        """Change the setting; return the end of it.
+
+        The setting is as before once every caller has ended it.
+        """
+        with self._lock:
+            if not self._users:
+                self._change()
+            self._users += 1
+        left = [None]
+
+        def end() -> None:
+            with self._lock:
+                if not left:
+                    return
+                left.clear()
+                self._users -= 1
+                if not self._users:
+                    self._restore()
+
+        return end
+
+
+class ShortTimeSlices(_WhileNeeded):
+    """Time slices of the interpreter in which busy threads give it up early."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._default_s = SWITCH_S
+
+    def _change(self) -> None:
+        self._default_s = sys.getswitchinterval()
+        self._shorten()
+
+    def _shorten(self) -> None:
+        sys.setswitchinterval(min(self._default_s, SWITCH_S))
+
+    def _restore(self) -> None:
+        sys.setswitchinterval(self._default_s)
+
+    def suspend(self) -> None:
+        """Give the slices their own length while they are short."""
+        with self._lock:
+            if self._users:
+                self._restore()
+
+    def go_on(self) -> None:
+        """Make the slices short again if anyone still needs that."""
+        with self._lock:
+            if self._users:
+                self._shorten()
+
+
+class LongTimeSlices(_WhileNeeded):
+    """Time slices of their own length in place of short ones.
+
+    A stop of many robots is a few milliseconds of work on several threads. Short slices would cut it into dozens of
+    hand-offs, each of which waits for a free core, and save it nothing beside a busy thread.
+    """
+
+    def __init__(self, short: ShortTimeSlices) -> None:
+        super().__init__()
+        self._short = short
+
+    def _change(self) -> None:
+        self._short.suspend()
+
+    def _restore(self) -> None:
+        self._short.go_on()
+
+
+class PausedCollector(_WhileNeeded):
+    """Garbage collector that waits.
+
+    A whole collection stops all threads of a large process for 0.1 s and more.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._enabled = True
+
+    def _change(self) -> None:
+        self._enabled = gc.isenabled()
+        gc.disable()
+
+    def _restore(self) -> None:
+        if self._enabled:
+            gc.enable()
+
+
+_SHORT_SLICES = ShortTimeSlices()
+_LONG_SLICES = LongTimeSlices(_SHORT_SLICES)
+_COLLECTOR = PausedCollector()
+
+shorten_time_slices = _SHORT_SLICES.begin
+"""Shortens the slices of this process."""
+
+
+def undisturbed(*, many: bool) -> Callable[[], None]:
+    """Prepare the interpreter for halts; return the end of it.
+
+    Args:
+        many: there are so many halts that slices of their own length are better for them.
+    """
+    ends = [_COLLECTOR.begin(), *([_LONG_SLICES.begin()] if many else [])]
+
+    def end() -> None:
+        for each in ends:
+            each()
+
+    return end
+
 
 PAUSE_S = 0.5
 """Seconds without a look from which a process counts as one that did not run."""
