@@ -233,8 +233,7 @@ def _real(name: str, tool_name: str | None, options: dict[str, Any]) -> Any:
 
 
 def _reachy(tool_name: str | None, options: dict[str, Any]) -> Any:
-    from strands_robots.drivers.reachy import ReachyDriver  # noqa: PLC0415 - as above
-    from strands_robots.drivers.reachy.discovery import make_reachy  # noqa: PLC0415 - as above
+    from strands_robots.drivers.reachy import ReachyDriver, make_reachy  # noqa: PLC0415 - as above
 
     robot = _construct(make_reachy, driver=_networked(ReachyDriver), **options)
     robot.tool_name_str = tool_name or robot.tool_name_str

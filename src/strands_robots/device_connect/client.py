@@ -25,7 +25,7 @@ from strands_robots.device_connect.backends import LinkConfig, open_client
 from strands_robots.device_connect.backends.base import NoResponderError, ResponderLostError
 from strands_robots.device_connect.discovery import DESCRIBE_S, HEARTBEATS_S, Discovery, Peer, parts
 from strands_robots.device_connect.links import network_of
-from strands_robots.device_connect.process import LOOP_JOIN_TIMEOUT_S
+from strands_robots.device_connect.process import LOOP_JOIN_TIMEOUT_S, LoopThread
 from strands_robots.envelope import Envelope, error
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety.sightings import sightings
@@ -50,8 +50,8 @@ CONNECT_MARGIN_S = 3.0
 PURPOSES = {"getStatus": Purpose.LOCKOUT_STATE, "resume": Purpose.RESUME_ANSWER}
 """Functions whose answer has a signed part, with its purpose."""
 
-LAST_TASKS_S = 1.0
 CLOSED = "the client was closed before there was an answer"
+NOT_CONNECTED = "the client is not connected; use it as a context manager"
 
 IN_FLIGHT = 64
 """Calls of :meth:`FleetClient.call_each` that wait for an answer at a time."""
@@ -103,8 +103,7 @@ class FleetClient:
     def __init__(self, link: LinkConfig, source: str = "strands-robots") -> None:
         self.link = link
         self.source = device_id("source", source)
-        self._loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self._loop.run_forever, name="fleet-client", daemon=True)
+        self._loop: LoopThread | None = None
         self._messaging: Any = None
         self._discovery: Discovery | None = None
         self._network = network_of(link)
@@ -113,7 +112,7 @@ class FleetClient:
         self._closed = False
 
     def __enter__(self) -> Self:
-        self._thread.start()
+        self._loop = LoopThread("fleet-client")
         try:
             self._messaging = self.run(open_client(self.link), self.link.connect_timeout_s + CONNECT_MARGIN_S)
             self._discovery = Discovery(self._messaging)
@@ -130,25 +129,18 @@ class FleetClient:
         """Leave the network; waiting calls get :class:`ClientClosedError`."""
         with self._lock:
             self._closed, pending = True, tuple(self._pending)
-        if self._loop.is_closed():
+        loop, self._loop = self._loop, None
+        if loop is None:
             return
         for each in pending:
             each.cancel()
         messaging, self._messaging = self._messaging, None
         try:
-            if self._thread.is_alive():
-                asyncio.run_coroutine_threadsafe(_ended(messaging), self._loop).result(LOOP_JOIN_TIMEOUT_S)
+            if messaging is not None:
+                loop.submit(messaging.close()).result(LOOP_JOIN_TIMEOUT_S)
         finally:
-            self._end_loop()
-
-    def _end_loop(self) -> None:
-        if not self._thread.is_alive():
-            self._loop.close()
-            return
-        self._loop.call_soon_threadsafe(self._loop.stop)
-        self._thread.join(LOOP_JOIN_TIMEOUT_S)
-        if not self._thread.is_alive():
-            self._loop.close()
+            loop.end()
+            loop.join(LOOP_JOIN_TIMEOUT_S)
 
     def peers(self, timeout: float = 2.0, *, thorough: bool = False) -> list[Peer]:
         """Return the devices of the tenant, sorted by id.
@@ -362,10 +354,10 @@ class FleetClient:
 
     def _submitted(self, work: Coroutine[Any, Any, T]) -> Future[T]:
         with self._lock:
-            if self._closed:
+            if self._closed or self._loop is None:
                 work.close()
-                raise ClientClosedError(CLOSED)
-            done: Future[T] = asyncio.run_coroutine_threadsafe(work, self._loop)
+                raise ClientClosedError(CLOSED) if self._closed else RuntimeError(NOT_CONNECTED)
+            done = self._loop.submit(work)
             self._pending.add(done)
         done.add_done_callback(self._pending.discard)
         return done
@@ -373,7 +365,7 @@ class FleetClient:
     @property
     def _connected(self) -> Discovery:
         if self._discovery is None:
-            raise RuntimeError("the client is not connected; use it as a context manager")
+            raise RuntimeError(NOT_CONNECTED)
         return self._discovery
 
     def _subject(self, rest: str) -> str:
@@ -470,17 +462,6 @@ class EventSubscription:
 
     def __exit__(self, *_exception: object) -> None:
         self.close()
-
-
-async def _ended(messaging: Any) -> None:
-    """Leave the network and wait until cancelled calls have ended."""
-    if messaging is not None:
-        await messaging.close()
-    others = asyncio.all_tasks() - {asyncio.current_task()}
-    for each in others:
-        each.cancel()
-    if others:
-        await asyncio.wait(others, timeout=LAST_TASKS_S)
 
 
 def _event(data: bytes, subject: str) -> DeviceEvent | None:

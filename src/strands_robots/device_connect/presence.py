@@ -284,14 +284,6 @@ class PresenceView:
                 return found
             await asyncio.sleep(POLL_S)
 
-    async def send_discovery_probe(self) -> None:
-        """Ask every device to announce itself."""
-        await (await self._asked()).send_discovery_probe()
-
-    async def wait_for_peers(self, timeout: float = 3.0) -> list[Presence]:  # noqa: ASYNC109 - the framework's
-        """Return the devices, as soon as there is one or ``timeout`` seconds are over."""
-        return await self._within(timeout, self.list_devices) or []
-
     async def wait_for_device_type(self, device_type: str, timeout: float = 10.0) -> Presence | None:  # noqa: ASYNC109
         """Return the first device of a type, or None after ``timeout`` seconds."""
         found = await self._within(timeout, lambda: self.list_devices(device_type=device_type))

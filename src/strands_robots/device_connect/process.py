@@ -9,6 +9,7 @@ Importing this module needs no extra.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import signal
 import threading
 from collections.abc import Coroutine
@@ -21,21 +22,59 @@ T = TypeVar("T")
 LOOP_JOIN_TIMEOUT_S = 5.0
 """Seconds that a failed or stopped bring-up, or a client, waits for its thread to end."""
 
+LAST_TASKS_S = 1.0
+"""Seconds in which cancelled tasks of a loop have to end."""
 
-class DeviceLoop:
-    """An event loop on a thread; it ends when its last user has left."""
 
-    def __init__(self) -> None:
-        self._users = 0
-        self._started: Future[asyncio.AbstractEventLoop] = Future()
-        self._end: asyncio.Event | None = None
-        self._thread = threading.Thread(target=self._live, name="device-connect", daemon=True)
+class LoopThread:
+    """An event loop on a thread of its own."""
+
+    def __init__(self, name: str) -> None:
+        self.loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._live, name=name, daemon=True)
         self._thread.start()
-        self.loop = self._started.result()
 
     def submit(self, coroutine: Coroutine[Any, Any, T]) -> Future[T]:
         """Run a coroutine on the loop; cancelling the future cancels it."""
         return asyncio.run_coroutine_threadsafe(coroutine, self.loop)
+
+    def end(self) -> None:
+        """Have what runs there cancelled, and loop and thread end; return at once."""
+        with contextlib.suppress(RuntimeError):  # it has ended
+            self.loop.call_soon_threadsafe(self.loop.stop)
+
+    def join(self, within: float) -> bool:
+        """Wait for the thread to end; False when it did not."""
+        self._thread.join(within)
+        return not self._thread.is_alive()
+
+    def _live(self) -> None:
+        try:
+            self.loop.run_forever()
+            self.loop.run_until_complete(self._cancel_tasks())
+        finally:
+            self.loop.close()
+
+    async def _cancel_tasks(self) -> None:
+        tasks = asyncio.all_tasks() - {asyncio.current_task()}
+        for task in tasks:
+            task.cancel()
+        if tasks:
+            await asyncio.wait(tasks, timeout=LAST_TASKS_S)
+        await self.loop.shutdown_asyncgens()
+
+
+class DeviceLoop(LoopThread):
+    """The event loop of devices; it ends when its last user has left."""
+
+    def __init__(self) -> None:
+        super().__init__("device-connect")
+        self._users = 0
+
+    def enter(self) -> Self:
+        """Begin one use."""
+        self._users += 1
+        return self
 
     def leave(self) -> None:
         """End one use; the last one ends loop and thread, without waiting for it."""
@@ -43,30 +82,16 @@ class DeviceLoop:
             self._users -= 1
             if self._users:
                 return
-            _forget(self)
-        assert self._end is not None
-        self.loop.call_soon_threadsafe(self._end.set)
+            if self in _shared:
+                _shared.remove(self)
+        self.end()
 
     def join(self, within: float) -> bool:
         """Wait for the thread to end where no user is left; False when it did not."""
         with _lock:
             if self._users:
                 return True
-        self._thread.join(within)
-        return not self._thread.is_alive()
-
-    def _live(self) -> None:
-        with asyncio.Runner() as runner:
-            runner.run(self._until_left())
-
-    async def _until_left(self) -> None:
-        self._end = asyncio.Event()
-        self._started.set_result(asyncio.get_running_loop())
-        await self._end.wait()
-
-    def _enter(self) -> DeviceLoop:
-        self._users += 1
-        return self
+        return super().join(within)
 
 
 _lock = threading.Lock()
@@ -80,15 +105,10 @@ def enter_loop(*, alone: bool) -> DeviceLoop:
     """
     with _lock:
         if alone:
-            return DeviceLoop()._enter()
+            return DeviceLoop().enter()
         if not _shared:
             _shared.append(DeviceLoop())
-        return _shared[0]._enter()
-
-
-def _forget(loop: DeviceLoop) -> None:
-    if loop in _shared:
-        _shared.remove(loop)
+        return _shared[0].enter()
 
 
 class StopSignal:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import asyncio
 import atexit
 import contextlib
-import threading
 import weakref
 from collections.abc import Collection
 from dataclasses import replace
@@ -17,6 +16,9 @@ from typing import Any
 from device_connect_edge.messaging import MessagingError
 
 from strands_robots.device_connect.backends import LinkConfig
+from strands_robots.device_connect.process import LoopThread
+from strands_robots.safety.estop_listener import CHECK_IN_ANSWER, ESTOP, VERDICT, StopLink
+from strands_robots.safety.missed_stops import ANSWER, QUESTION
 from strands_robots.safety.orders import PARSED_MAX_BYTES
 from strands_robots.safety.stop_link import (
     ANSWER,
@@ -110,14 +112,11 @@ class NatsStopLink:
     def __init__(self, link: LinkConfig) -> None:
         self._link = link
         self._root = f"device-connect.{link.tenant}"
-        self._loop: asyncio.AbstractEventLoop | None = None
+        self._loop: LoopThread | None = None
         self._client: Any = None
         self._up = False
         self._on_state: OnState = lambda up: None
-        self._started = threading.Event()
         self._sending: set[asyncio.Future[None]] = set()
-        self._end: asyncio.Event | None = None
-        self._thread: threading.Thread | None = None
         self._stops: set[str] = set()
 
     @property
@@ -134,49 +133,37 @@ class NatsStopLink:
 
     def open(self, events: Collection[str], on_event: OnEvent, on_state: OnState) -> None:
         self._on_state = on_state
-        self._thread = threading.Thread(target=self._run, args=(events, on_event), name="stop-link", daemon=True)
-        self._thread.start()
-        self._started.wait()
+        self._loop = LoopThread("stop-link")
+        self._loop.submit(self._serve(events, on_event))
         _OPEN.add(self)
 
     def publish(self, source: str, event: str, payload: bytes) -> bool:
         loop = self._loop
-        if loop is None or loop.is_closed() or not self._up:
+        if loop is None or not self._up:
             return False
         subject = f"{self._root}.{source}.event.{event}"
         if event == ESTOP:
             self._stops.add(subject)
-        loop.call_soon_threadsafe(self._send, subject, payload)
+        loop.loop.call_soon_threadsafe(self._send, subject, payload)
         return True
 
     def close(self) -> None:
-        loop, end, thread = self._loop, self._end, self._thread
-        if loop is None or end is None or thread is None:
-            return
-        with contextlib.suppress(RuntimeError):  # the loop has ended already
-            loop.call_soon_threadsafe(end.set)
-        thread.join(CLOSE_S)
+        loop, self._loop = self._loop, None
+        if loop is not None:
+            with contextlib.suppress(TimeoutError, MessagingError):
+                loop.submit(self._sent()).result(CLOSE_S)
+            loop.end()
+            loop.join(CLOSE_S)
         _OPEN.discard(self)
 
-    def _set(self, up: bool) -> None:
+    def _set_up(self, up: bool) -> None:
         """Report a change of state."""
         if up != self._up:
             self._up = up
             self._on_state(up)
 
-    def _run(self, events: Collection[str], on_event: OnEvent) -> None:
-        try:
-            with asyncio.Runner() as runner:
-                self._loop, self._end = runner.get_loop(), asyncio.Event()
-                self._started.set()
-                runner.run(self._serve(events, on_event, self._end))
-        except Exception:
-            logger.critical("The e-stop listener's NATS link ended.", exc_info=True)
-        finally:
-            self._started.set()
-            self._set(False)
-
-    async def _serve(self, events: Collection[str], on_event: OnEvent, end: asyncio.Event) -> None:
+    async def _serve(self, events: Collection[str], on_event: OnEvent) -> None:
+        """Carry events, and connect again after a failure, until it is cancelled."""
         from strands_robots.device_connect.backends.nats import NatsBackend  # noqa: PLC0415 - loaded with the first link
 
         def on_message(data: bytes | int, subject: str) -> None:
@@ -184,47 +171,40 @@ class NatsStopLink:
             if len(parts) == 5:
                 on_event(parts[4], parts[2], data)
 
-        while not end.is_set():
+        async def back() -> None:
+            self._set_up(True)
+
+        async def lost() -> None:
+            self._set_up(False)
+
+        while True:
             client = NatsBackend(self._link)
-            if not await self._connected(client, end):
-                continue
             try:
+                await client.connect(servers=[], reconnect_cb=back, disconnect_cb=lost)
                 for event in events:
                     await client.listen(f"{self._root}.*.event.{event}", on_message)
                 # The server has the subscriptions when it has answered this.
                 await client.flush()
                 self._client = client
-                self._set(True)
-                await end.wait()
+                self._set_up(True)
+                await asyncio.Event().wait()
+            except MessagingError as exc:
+                logger.debug("the e-stop listener's connection does not open yet: %s", exc)
+            except Exception:
+                logger.critical("The e-stop listener's NATS link ended.", exc_info=True)
+                raise
             finally:
                 self._client = None
-                self._set(False)
+                self._set_up(False)
                 await client.close()
+            await asyncio.sleep(RETRY_S)
 
-    async def _connected(self, client: Any, end: asyncio.Event) -> bool:
-        """Try once to connect; False, after a pause, when it failed."""
-
-        async def back() -> None:
-            self._set(True)
-
-        async def lost() -> None:
-            self._set(False)
-
-        trying = asyncio.ensure_future(client.connect(servers=[], reconnect_cb=back, disconnect_cb=lost))
-        ending = asyncio.ensure_future(end.wait())
-        await asyncio.wait({trying, ending}, return_when=asyncio.FIRST_COMPLETED)
-        ending.cancel()
-        if not trying.done():
-            trying.cancel()
-        outcome: list[object] = await asyncio.gather(trying, return_exceptions=True)
-        problem = outcome[0]
-        if isinstance(problem, MessagingError):
-            logger.debug("the e-stop listener's connection does not open yet: %s", problem)
-            with contextlib.suppress(TimeoutError):  # still wanted: try again
-                await asyncio.wait_for(end.wait(), RETRY_S)
-        elif isinstance(problem, Exception):
-            raise problem
-        return problem is None
+    async def _sent(self) -> None:
+        """Return when the server has what was published before."""
+        if self._sending:
+            await asyncio.wait(self._sending)
+        if self._client is not None:
+            await self._client.flush()
 
     def _send(self, subject: str, payload: bytes) -> None:
         task = asyncio.ensure_future(self._publish(subject, payload))

@@ -13,8 +13,8 @@ from fixtures.reachy_daemon.process import Daemon, Kind
 from fixtures.waiting import eventually, free_port
 from zeroconf import ServiceInfo, Zeroconf
 
-from strands_robots.drivers.reachy import ReachyDriver, discovery
-from strands_robots.drivers.reachy.discovery import SERVICE, discover, make_reachy
+from strands_robots.drivers import reachy as package
+from strands_robots.drivers.reachy import SERVICE, ReachyDriver, discover, make_reachy
 from strands_robots.drivers.reachy.rest import DaemonUnreachableError
 from strands_robots.drivers.reachy.target import FRAME_STEP, HeadPose, Target
 from strands_robots.safety.gate import MotionRefused
@@ -155,11 +155,11 @@ def test_announced_robot_is_discovered(daemon: Daemon, monkeypatch: pytest.Monke
         if not daemons:
             pytest.skip("multicast does not loop back on this machine")
         assert [(each.name, each.host, each.port) for each in daemons] == [(name, "127.0.0.1", daemon.port)]
-    monkeypatch.setattr(discovery, "discover", lambda within_s: daemons)
+    monkeypatch.setattr(package, "discover", lambda within_s: daemons)
     assert make_reachy().connection.port == daemon.port
-    monkeypatch.setattr(discovery, "discover", lambda within_s: daemons * 2)
+    monkeypatch.setattr(package, "discover", lambda within_s: daemons * 2)
     with pytest.raises(ValidationError, match=f"2 were found: {name} at"):
         make_reachy()
-    monkeypatch.setattr(discovery, "discover", lambda within_s: [])
+    monkeypatch.setattr(package, "discover", lambda within_s: [])
     with pytest.raises(ValidationError, match="none announced itself"):
         make_reachy()
