@@ -17,8 +17,6 @@ from device_connect_edge.messaging import MessagingError
 
 from strands_robots.device_connect.backends import LinkConfig
 from strands_robots.device_connect.process import LoopThread
-from strands_robots.safety.estop_listener import CHECK_IN_ANSWER, ESTOP, VERDICT, StopLink
-from strands_robots.safety.missed_stops import ANSWER, QUESTION
 from strands_robots.safety.orders import PARSED_MAX_BYTES
 from strands_robots.safety.stop_link import (
     ANSWER,
