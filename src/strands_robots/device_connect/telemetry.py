@@ -21,9 +21,9 @@ from strands_robots import settings
 from strands_robots.contract import Robot, RolloutEvent
 from strands_robots.device_connect._compat import describe_anew
 from strands_robots.device_connect.presence import lock_stated
+from strands_robots.rate_limits import RateLimiter
 from strands_robots.serving.offered_verbs import Offers
 from strands_robots.serving.pipeline import Pipeline
-from strands_robots.serving.rate_limiter import RateLimiter
 from strands_robots.serving.workers import UNBOUNDED, ShareFullError, called
 
 logger = logging.getLogger(__name__)

@@ -13,7 +13,7 @@ from strands_robots.mesh.context import Context
 from strands_robots.mesh.executor import BoundedExecutor
 from strands_robots.mesh.transport import TransportError
 from strands_robots.mesh.wire import WireError
-from strands_robots.serving.rate_limiter import RateLimiter
+from strands_robots.rate_limits import RateLimiter
 
 logger = logging.getLogger(__name__)
 
