@@ -15,6 +15,7 @@ afterwards, and a robot whose state cannot be read in time counts as moving.
 from __future__ import annotations
 
 import hmac
+import math
 import secrets
 import threading
 import time
@@ -33,6 +34,7 @@ from strands_robots.safety.resume import configured_keys
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.workers import UNBOUNDED, BoundedCall
 from strands_robots.stop_log import stop_logger
+from strands_robots.threads import WokenThread
 
 logger = stop_logger(__name__)
 
@@ -236,17 +238,17 @@ class TimedLease(Protocol):
 
 
 class LeaseWatch:
-    """One thread that ends leases in time; it lives as long as there is one."""
+    """One thread that ends leases in time."""
 
     def __init__(self) -> None:
-        self._changed = threading.Condition()
+        self._changing = threading.Lock()
         self._leases: set[TimedLease] = set()
-        self._thread: threading.Thread | None = None
+        self._thread = WokenThread("control-leases", self._end_due, self._due_in)
 
     @property
     def running(self) -> bool:
         """True while there is a lease to end."""
-        return self._thread is not None
+        return bool(self._leases)
 
     def add(self, lease: TimedLease) -> None:
         """Watch a lease until it is over.
@@ -254,28 +256,23 @@ class LeaseWatch:
         Raises:
             RuntimeError: no thread can be started.
         """
-        with self._changed:
+        with self._changing:
             self._leases.add(lease)
-            if self._thread is None:
-                thread = threading.Thread(target=self._work, name="control-leases", daemon=True)
-                thread.start()
-                self._thread = thread
-            self._changed.notify_all()
+        self._thread.wake()
 
-    def _work(self) -> None:
-        while True:
-            with self._changed:
-                due = {each: at for each in self._leases if (at := each.due) is not None}
-                now = time.monotonic()
-                ending = [each for each, at in due.items() if at - AHEAD_S <= now]
-                self._leases = set(due).difference(ending)
-                if not due:
-                    self._thread = None
-                    return
-                if not ending:
-                    self._changed.wait(min(due.values()) - AHEAD_S - now)
-            for each in ending:
-                UNBOUNDED.submit(partial(self._end, each))
+    def _due_in(self) -> float:
+        with self._changing:
+            moments = [at for each in self._leases if (at := each.due) is not None]
+        return min(moments, default=math.inf) - AHEAD_S - time.monotonic()
+
+    def _end_due(self) -> None:
+        now = time.monotonic()
+        with self._changing:
+            due = {each: at for each in self._leases if (at := each.due) is not None}
+            ending = [each for each, at in due.items() if at - AHEAD_S <= now]
+            self._leases = set(due).difference(ending)
+        for each in ending:
+            UNBOUNDED.submit(partial(self._end, each))
 
     def _end(self, lease: TimedLease) -> None:
         # A whole collection at this moment would hold the halts back.
