@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from types import FunctionType, MethodType
-from typing import TYPE_CHECKING, Any, Literal, ParamSpec, Protocol, TypeVar, runtime_checkable
+from typing import TYPE_CHECKING, Any, Generic, Literal, ParamSpec, Protocol, TypeVar, runtime_checkable
 
 from strands_robots import settings
 from strands_robots.envelope import Envelope, error, success
@@ -90,6 +90,52 @@ Observer = Callable[[RolloutEvent], None]
 """Called from the control thread: it must return at once and may not raise."""
 
 Unsubscribe = Callable[[], None]
+
+
+class OfRobot(Protocol):
+    """An event of one robot."""
+
+    @property
+    def robot(self) -> str:
+        """Name of the robot."""
+
+
+E = TypeVar("E", bound=OfRobot)
+
+
+class Observers(Generic[E]):
+    """Observers of a robot's events; one that raises is logged and stays subscribed. Thread-safe."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._observers: tuple[Callable[[E], None], ...] = ()
+        self._logged: set[tuple[int, str]] = set()
+
+    def subscribe(self, observer: Callable[[E], None]) -> Unsubscribe:
+        """Call ``observer`` with every event; the returned callable ends that."""
+        with self._lock:
+            self._observers = (*self._observers, observer)
+        once = threading.Lock()
+
+        def unsubscribe() -> None:
+            if once.acquire(blocking=False):
+                with self._lock:
+                    left = list(self._observers)
+                    left.remove(observer)
+                    self._observers = tuple(left)
+
+        return unsubscribe
+
+    def notify(self, event: E) -> None:
+        """Call every observer, in the calling thread."""
+        for observer in self._observers:
+            try:
+                observer(event)
+            except Exception as exc:
+                failure = (id(observer), type(exc).__name__)
+                if failure not in self._logged:
+                    self._logged.add(failure)
+                    logger.exception("An observer of %s raised; it stays subscribed.", event.robot)
 
 
 VERB = "verb"

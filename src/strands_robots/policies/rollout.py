@@ -16,7 +16,7 @@ from contextlib import AbstractContextManager
 from functools import partial
 from typing import Any, Literal, Protocol, TypedDict
 
-from strands_robots.contract import Observer, RolloutEvent, Unsubscribe
+from strands_robots.contract import Observers, RolloutEvent
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.policies.base import (
     Action,
@@ -131,39 +131,8 @@ class Clock:
             stop.wait(left)
 
 
-class RolloutObservers:
-    """Observers of rollout events; one that raises is logged and stays subscribed."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._observers: tuple[Observer, ...] = ()
-        self._logged: set[tuple[int, str]] = set()
-
-    def subscribe(self, observer: Observer) -> Unsubscribe:
-        """Call ``observer`` with every event; the returned callable ends that."""
-        with self._lock:
-            self._observers = (*self._observers, observer)
-        once = threading.Lock()
-
-        def unsubscribe() -> None:
-            if once.acquire(blocking=False):
-                with self._lock:
-                    left = list(self._observers)
-                    left.remove(observer)
-                    self._observers = tuple(left)
-
-        return unsubscribe
-
-    def notify(self, event: RolloutEvent) -> None:
-        """Call every observer, in the calling thread."""
-        for observer in self._observers:
-            try:
-                observer(event)
-            except Exception as exc:
-                failure = (id(observer), type(exc).__name__)
-                if failure not in self._logged:
-                    self._logged.add(failure)
-                    logger.exception("An observer of %s raised; it stays subscribed.", event.robot)
+RolloutObservers = Observers[RolloutEvent]
+"""Observers of the rollouts of one robot."""
 
 
 def unfollowed(rollout: Rollout) -> str:

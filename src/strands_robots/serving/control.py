@@ -25,6 +25,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Protocol, cast
 
+from strands_robots.contract import Observers
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety.authorization import ANONYMOUS, Leave, caller_name
@@ -125,33 +126,6 @@ class ControlChange:
 
 
 OnChange = Callable[[ControlChange], None]
-
-
-class Observers:
-    """Observers of a holder's changes; thread-safe, and one that fails alone."""
-
-    def __init__(self) -> None:
-        self._changing = threading.Lock()
-        self._observers: tuple[OnChange, ...] = ()
-
-    def add(self, observer: OnChange) -> Callable[[], None]:
-        """Tell ``observer`` of every change; return what ends that."""
-        with self._changing:
-            self._observers = (*self._observers, observer)
-
-        def end() -> None:
-            with self._changing:
-                self._observers = tuple(each for each in self._observers if each is not observer)
-
-        return end
-
-    def tell(self, change: ControlChange) -> None:
-        """Hand a change to every observer."""
-        for observer in self._observers:
-            try:
-                observer(change)
-            except Exception:
-                logger.exception("An observer of the control lease failed.")
 
 
 class FirstEpoch:
@@ -334,7 +308,7 @@ class ControlLease:
         self._lease: Lease | None = None
         self._starting = StartingMotions(self._changing)
         self._displaced: dict[str, str] = {}
-        self._observers = Observers()
+        self._observers = Observers[ControlChange]()
         self._first_epoch = first_epoch
         self._holders = 0
 
@@ -351,7 +325,7 @@ class ControlLease:
 
     def observe(self, observer: OnChange) -> Callable[[], None]:
         """Tell ``observer`` of every change of the holder; return what ends that."""
-        return self._observers.add(observer)
+        return self._observers.subscribe(observer)
 
     def facts(self) -> dict[str, Any]:
         """Return the holder as everyone may read it."""
@@ -666,7 +640,7 @@ class ControlLease:
 
     def _tell(self, event: str, lease: Lease, reason: str = "") -> None:
         change = ControlChange(event, self._robot, lease.holder, lease.kind, self.epoch, reason)
-        self._observers.tell(change)
+        self._observers.notify(change)
 
 
 def doubts(verdict: StopVerdict) -> str:

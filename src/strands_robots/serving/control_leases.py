@@ -9,7 +9,7 @@ from concurrent.futures import Future
 from functools import partial
 from typing import Any, Protocol, cast
 
-from strands_robots.contract import Robot, WorldRobot, body_of, holds_robots, robots_in, task_runs
+from strands_robots.contract import Observers, Robot, WorldRobot, body_of, holds_robots, robots_in, task_runs
 from strands_robots.envelope import Envelope, is_error, success
 from strands_robots.identity_map import IdentityMap
 from strands_robots.safety.authorization import Leave
@@ -21,7 +21,6 @@ from strands_robots.serving.control import (
     ControlChange,
     ControlLease,
     FirstEpoch,
-    Observers,
     OnChange,
     doubts,
 )
@@ -69,7 +68,7 @@ class ControlLeases:
         self._by_name: dict[str, ControlLease] = {}
         self._only: ControlLease | None = None
         self._changing = threading.Lock()
-        self._observers, self._telling = Observers(), Share(1, CHANGES_MAX)
+        self._observers, self._telling = Observers[ControlChange](), Share(1, CHANGES_MAX)
         self._first_epoch = FirstEpoch()
         self._first_robot = ""
         self._streams: weakref.WeakSet[InputStreams] = weakref.WeakSet()
@@ -102,7 +101,7 @@ class ControlLeases:
 
     def observe(self, observer: OnChange) -> Callable[[], None]:
         """Tell ``observer``, on another thread, of every change; return what ends that."""
-        return self._observers.add(observer)
+        return self._observers.subscribe(observer)
 
     def of(self, name: str = "") -> ControlLease:
         """Return the lease of the robot, or of the named robot of the world."""
@@ -152,7 +151,7 @@ class ControlLeases:
 
     def _tell(self, change: ControlChange) -> None:
         try:
-            self._telling.submit(partial(self._observers.tell, change))
+            self._telling.submit(partial(self._observers.notify, change))
         except ShareFullError:
             logger.warning("%s: an observer of its holder hangs and is not told: %s.", change.robot, change.event)
 
