@@ -15,7 +15,7 @@ from typing import Any, ClassVar, TypeVar
 from weakref import WeakKeyDictionary
 
 from device_connect_edge.drivers.decorators import get_rpc_source_device
-from device_connect_edge.types import DeviceStatus, EventDef, FunctionDef
+from device_connect_edge.types import DeviceIdentity, DeviceStatus, EventDef, FunctionDef
 
 from strands_robots import settings
 from strands_robots.contract import Haltable, Robot, RolloutEvent, Unsubscribe, observe
@@ -42,6 +42,7 @@ from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.control import ControlChange
 from strands_robots.serving.offered_verbs import Offers, own_verbs
 from strands_robots.serving.pipeline import Command, Pipeline, Result, busy
+from strands_robots.serving.policy_arguments import profile_list
 from strands_robots.serving.stop_arguments import noted
 from strands_robots.serving.stops import stop_within
 from strands_robots.serving.verbs import REQUIRED, Arguments, Kind, Verb, described, labels_of, text_of
@@ -116,6 +117,9 @@ class RobotDriver(CollectedOnce):
 
     cell: str | None = None
     """The cell that the robot is in, "" for none; None asks the robot, then ``STRANDS_CELL``."""
+
+    noun: ClassVar[str] = "Robot"
+    """Begins the description of the device."""
 
     verbs: ClassVar[Mapping[str, Verb]] = {}
     """The verbs of the device, by name; each becomes an RPC method. An instance serves its robot's own besides."""
@@ -340,6 +344,17 @@ class RobotDriver(CollectedOnce):
     async def tell_rollout(self, event: RolloutEvent) -> None:
         """Emit the events that belong to ``event``."""
         raise NotImplementedError
+
+    @property
+    def identity(self) -> DeviceIdentity:
+        """Identity of this device; ``model`` is the robot's own name."""
+        model = self.robot.tool_name_str
+        return DeviceIdentity(
+            device_type=self.device_type,
+            manufacturer="strands-robots",
+            model=model,
+            description=f"{self.noun} {model}{profile_list()}",
+        )
 
     @property
     def functions(self) -> list[FunctionDef]:

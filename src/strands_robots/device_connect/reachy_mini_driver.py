@@ -12,7 +12,8 @@ from device_connect_edge.types import DeviceIdentity, DeviceStatus
 
 from strands_robots.contract import RolloutEvent
 from strands_robots.device_connect._compat import Labels, emit
-from strands_robots.device_connect.base_driver import Activity, RobotDriver
+from strands_robots.device_connect.base_driver import RobotDriver
+from strands_robots.device_connect.telemetry import Activity
 from strands_robots.drivers.reachy import ReachyDriver
 from strands_robots.drivers.reachy.links import DEFAULT_PREFIX
 from strands_robots.safety.authorization import Approval, Authorization

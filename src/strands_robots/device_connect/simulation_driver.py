@@ -6,17 +6,15 @@ from collections.abc import Mapping
 from operator import eq
 from typing import Any, ClassVar, Optional
 
-from device_connect_edge.types import DeviceIdentity
-
 from strands_robots import settings
 from strands_robots.contract import Haltable, RolloutEvent
 from strands_robots.device_connect._compat import Labels, emit
-from strands_robots.device_connect.base_driver import Activity, RobotDriver, stated_type
+from strands_robots.device_connect.base_driver import RobotDriver, stated_type
+from strands_robots.device_connect.telemetry import Activity, rollout_fields
 from strands_robots.envelope import Envelope, fields_of
 from strands_robots.policies.base import plain_numbers
 from strands_robots.safety.authorization import Approval, Authorization
 from strands_robots.safety.stopping import StopVerdict
-from strands_robots.serving.policy_arguments import profile_list
 from strands_robots.serving.robot_verbs import WORLD_VERBS, served_world, world_stop_answer
 from strands_robots.serving.stops import WorldStop, robot_stop
 from strands_robots.serving.verbs import Verb
@@ -33,6 +31,7 @@ class SimulationDeviceDriver(RobotDriver):
     """
 
     device_type = "strands_sim"
+    noun = "Simulation"
     labels: ClassVar[Labels] = {"category": ["robot", "simulation"]}
     verbs: ClassVar[Mapping[str, Verb]] = WORLD_VERBS
 
@@ -47,18 +46,7 @@ class SimulationDeviceDriver(RobotDriver):
         world = served_world(sim)
         super().__init__(world, hardware=hardware, authorization=authorization, approval=approval)
         self.world = world
-        self._model = world.tool_name_str
         self.device_type = stated_type(sim, self.device_type)
-
-    @property
-    def identity(self) -> DeviceIdentity:
-        """Identity of this device; ``model`` is the simulation's own name."""
-        return DeviceIdentity(
-            device_type=self.device_type,
-            manufacturer="strands-robots",
-            model=self._model,
-            description=f"Simulation {self._model}{profile_list()}",
-        )
 
     def stop_target(self, robot_name: str = "") -> Haltable:
         """Return what ``stop`` halts: one robot, or the world and each rollout."""
@@ -185,26 +173,10 @@ class SimulationDeviceDriver(RobotDriver):
 
     async def tell_rollout(self, event: RolloutEvent) -> None:
         """Emit ``policyStarted``, ``streamStep`` or ``policyComplete``."""
+        fields = {"robot_name": event.robot, **rollout_fields(event)}
         if event.kind == "started":
-            await self.policyStarted(
-                robot_name=event.robot,
-                instruction=event.instruction,
-                policy_provider=event.policy,
-                follows_instruction=event.follows_instruction,
-            )
+            await self.policyStarted(**fields)
         elif event.kind == "step":
-            await self.streamStep(
-                step=event.step,
-                observation=plain_numbers(event.observation),
-                action=plain_numbers(event.action),
-                robot_name=event.robot,
-            )
+            await self.streamStep(**fields)
         else:
-            await self.policyComplete(
-                robot_name=event.robot,
-                instruction=event.instruction,
-                steps=event.step,
-                state=event.state,
-                error=event.error,
-                loop=dict(event.loop),
-            )
+            await self.policyComplete(**fields)

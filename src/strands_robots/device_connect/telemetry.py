@@ -21,6 +21,7 @@ from strands_robots import settings
 from strands_robots.contract import Robot, RolloutEvent
 from strands_robots.device_connect._compat import describe_anew
 from strands_robots.device_connect.presence import lock_stated
+from strands_robots.policies.base import plain_numbers
 from strands_robots.rate_limits import RateLimiter
 from strands_robots.serving.offered_verbs import Offers
 from strands_robots.serving.pipeline import Pipeline
@@ -239,6 +240,26 @@ def sweep(hz: float) -> IdleSweep:
     if loop not in _SWEEPS:
         _SWEEPS[loop] = IdleSweep(loop, hz)
     return _SWEEPS[loop]
+
+
+def rollout_fields(event: RolloutEvent) -> dict[str, Any]:
+    """Return what a device tells of an event of a rollout."""
+    if event.kind == "started":
+        return {
+            "instruction": event.instruction,
+            "policy_provider": event.policy,
+            "follows_instruction": event.follows_instruction,
+        }
+    if event.kind == "step":
+        observation, action = plain_numbers(event.observation), plain_numbers(event.action)
+        return {"step": event.step, "observation": observation, "action": action}
+    return {
+        "instruction": event.instruction,
+        "steps": event.step,
+        "state": event.state,
+        "error": event.error,
+        "loop": dict(event.loop),
+    }
 
 
 @dataclass(frozen=True, slots=True)

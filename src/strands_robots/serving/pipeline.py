@@ -251,24 +251,23 @@ class Pipeline:
             raise
         if verb.on_lease:
             self._give_leases(command, arguments)
-        leases, admitted = self.leases, None
+        admit: Callable[..., Leave] | None = None
         if verb.leased and not verb.on_lease:
             lease_id, ttl_s = arguments.pop(LEASE_ID, "") or "", arguments.pop(LEASE_TTL_S, 0.0) or 0.0
             if ttl_s and not lease_id:
                 needs = f"{LEASE_TTL_S} needs a {LEASE_ID}: a secret of the caller's own."
                 raise Refused(RefusalReason.ARGUMENTS, needs)
             name = None if verb.of_world else arguments.get("robot_name", "")
-            if leases is not None:
-                admitted = partial(
-                    leases.admit, verb.name, command.caller, lease_id, name, ttl_s, begun=lambda: command.begun
-                )
+            if self.leases is not None:
+                asked = verb.name, command.caller, lease_id, name, ttl_s
+                admit = partial(self.leases.admit, *asked, begun=lambda: command.begun)
         if verb.kind is not Kind.MOTION:
             return Leave()
-        if admitted is not None:
-            admitted(hold=False)
+        if admit is not None:
+            admit(hold=False)
         self._refuse_locked(verb, command.request)
         wanted = self._unclaimed(command, arguments, callers) if self.hardware else None
-        held = Leave() if admitted is None else admitted(hold=True)
+        held = Leave() if admit is None else admit(hold=True)
         if wanted is None:
             return held
         claimed = None
