@@ -6,7 +6,7 @@ import time
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
-from functools import cached_property, partial
+from functools import partial
 from typing import Any
 
 from strands_robots.envelope import Envelope, error, success
@@ -32,6 +32,11 @@ class TeleopMixin:
     """Observers of teleoperations and of tasks."""
     input_sink: InputSink | None = None
     """Receiver of published frames; a network that carries input streams sets it."""
+
+    def __init__(self) -> None:
+        self._teleop_leaders: dict[str, tuple[str, Callable[..., LeaderPolicy]]] = {}
+        self._teleop_waiting = Waiting()
+        self._teleop_sessions: dict[str, tuple[Rollout, LeaderPolicy]] = {}
 
     @abstractmethod
     def body(self, robot_name: str | None = None) -> Body:
@@ -151,18 +156,6 @@ class TeleopMixin:
         for session in running.values():
             session.void()
         return {f"teleoperation {name}": session for name, session in running.items()}
-
-    @cached_property
-    def _teleop_leaders(self) -> dict[str, tuple[str, Callable[..., LeaderPolicy]]]:
-        return {}
-
-    @cached_property
-    def _teleop_waiting(self) -> Waiting:
-        return Waiting()
-
-    @cached_property
-    def _teleop_sessions(self) -> dict[str, tuple[Rollout, LeaderPolicy]]:
-        return {}
 
     def _teleop_sink(self, publish: bool) -> InputSink | None:
         if publish and self.input_sink is None:

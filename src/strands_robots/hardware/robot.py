@@ -111,6 +111,7 @@ class HardwareRobot(ArmMixin, TeleopMixin):
         model: str | None = None,
         speed_limit: float | Mapping[str, float] | None = None,
     ) -> None:
+        super().__init__()
         name = text("tool_name", tool_name, longest=128)
         rate = settings.number("STRANDS_CONTROL_HZ") if control_hz is None else control_hz
         level = checked_level(stop_level, rest_pose)
@@ -642,7 +643,8 @@ class HardwareRobot(ArmMixin, TeleopMixin):
 
     def _free(self) -> None:
         leader = self.teleoperated_by(self.tool_name_str)
-        busy = self.occupied(self.tool_name_str) or (f"the leader {leader}" if leader else "")
+        task = "" if self._task is None else self.occupied(self.tool_name_str)
+        busy = task or (f"the leader {leader}" if leader else "")
         if busy:
             raise ValidationError(f"{self.tool_name_str} is driven by {busy}; stop that first.")
 

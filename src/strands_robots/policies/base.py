@@ -166,38 +166,27 @@ def checked_speeds(value: object, keys: Iterable[str]) -> dict[str, float]:
     }
 
 
-class SpeedLimit:
-    """Bound on how fast each target may change.
+def speeds_across(ranges: Ranges, full_ranges_per_s: float, unbounded_per_s: float) -> dict[str, float]:
+    """Return the speed of each key that crosses its range so often in a second, and of one without a range.
 
     Args:
-        per_s: greatest speed by action key, in its unit a second; a key that is not named has no bound.
+        full_ranges_per_s: above 0.
+        unbounded_per_s: in the key's unit a second.
     """
+    return {
+        key: (high - low) * full_ranges_per_s if math.isfinite(high - low) else unbounded_per_s
+        for key, (low, high) in ranges.items()
+    }
 
-    def __init__(self, per_s: Mapping[str, float]) -> None:
-        self._per_s = dict(per_s)
 
-    @classmethod
-    def of_ranges(cls, ranges: Ranges, full_ranges_per_s: float, unbounded_per_s: float) -> SpeedLimit:
-        """Bound a key with a finite range by how often it may cross it in a second, any other by a speed.
+def limited(target: Action, last: Mapping[str, float], speeds: Mapping[str, float], dt: float) -> Action:
+    """Return ``target``, moved no further from ``last`` than ``dt`` seconds allow.
 
-        Args:
-            full_ranges_per_s: above 0.
-            unbounded_per_s: of a key without a range, in its unit a second.
-        """
-        return cls(
-            {
-                key: (high - low) * full_ranges_per_s if math.isfinite(high - low) else unbounded_per_s
-                for key, (low, high) in ranges.items()
-            }
-        )
-
-    def limit(self, target: Action, last: Mapping[str, float], dt: float) -> Action:
-        """Return ``target``, moved no further from ``last`` than ``dt`` seconds allow.
-
-        A key without a last value, or without a bound, is not limited.
-        """
-        limited: Action = {}
-        for key, value in target.items():
-            per_s, before = self._per_s.get(key), last.get(key, value)
-            limited[key] = value if per_s is None else min(max(value, before - per_s * dt), before + per_s * dt)
-        return limited
+    Args:
+        speeds: greatest speed by key, in its unit a second; a key without one, or without a last value, has no bound.
+    """
+    bounded: Action = {}
+    for key, value in target.items():
+        per_s, before = speeds.get(key), last.get(key, value)
+        bounded[key] = value if per_s is None else min(max(value, before - per_s * dt), before + per_s * dt)
+    return bounded

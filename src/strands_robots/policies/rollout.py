@@ -25,9 +25,9 @@ from strands_robots.policies.base import (
     Policy,
     PolicyError,
     Ranges,
-    SpeedLimit,
     checked_action,
     is_velocity,
+    limited,
     numbers,
 )
 from strands_robots.safety.gate import Permit, PermitVoidError
@@ -191,7 +191,7 @@ class Rollout:
         self._observers = observers or RolloutObservers()
         self._clock = clock or Clock()
         self._ends_at_rest = ends_at_rest
-        self._speed = SpeedLimit(body.speeds)
+        self._speeds = dict(body.speeds)
         self._last: dict[str, float] = {}
         self._written_at = -math.inf
         self._held_back: Action = {}
@@ -399,10 +399,10 @@ class Rollout:
         # A pause must not add up to a jump.
         dt = min(now - self._written_at, self._period)
         wanted = {**self._held_back, **action}
-        limited = self._speed.limit(wanted, {**numbers(observation), **self._last}, dt)
-        self._written_at, self._last = now, {**self._last, **limited}
-        self._held_back = {key: value for key, value in wanted.items() if limited[key] != value}
-        return limited
+        bounded = limited(wanted, {**numbers(observation), **self._last}, self._speeds, dt)
+        self._written_at, self._last = now, {**self._last, **bounded}
+        self._held_back = {key: value for key, value in wanted.items() if bounded[key] != value}
+        return bounded
 
     def _next(self, tick: int, started: float) -> int:
         late = int((self._clock.now() - started) / self._period) - tick

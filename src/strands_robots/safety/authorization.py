@@ -87,7 +87,7 @@ def motion_refusal(source: object, allow: Sequence[str], *, hardware: bool) -> s
             "A caller without a name may not move this robot: add 'anonymous' to DEVICE_CONNECT_RPC_ALLOW to admit "
             "those, or have the caller name itself."
         )
-    if matches(name, [pattern for pattern in listed if pattern != ANONYMOUS]):
+    if any(fnmatchcase(name, pattern) for pattern in listed if pattern != ANONYMOUS):
         return None
     return f"Caller {shown(name)} may not move this robot: no entry of DEVICE_CONNECT_RPC_ALLOW fits it."
 
