@@ -48,7 +48,7 @@ def way_of_a_stop() -> tuple[list[Call], list[str]]:
             registration.close()
             robot.cleanup()
     callback = next(index for index, call in enumerate(way) if call.name.endswith("on_message"))
-    return way[callback:], path.entered(way[callback:])
+    return way[callback:], path.entered("on_message", "DeviceBody._hold")
 
 
 def test_stop_of_a_real_arm_takes_the_documented_way_with_two_hand_offs() -> None:
