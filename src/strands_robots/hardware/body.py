@@ -357,7 +357,7 @@ class DeviceBody:
             write = partial(write_joints, self.device) if self._limp else self.device.send_action
             self._exchange(lambda: write(targets), urgent=urgent)
         # A bus does not confirm targets; what it answers after them shows that it took them.
-        self._joints(READ_TRIES, urgent=urgent)
+        self.get_joints(READ_TRIES, urgent=urgent)
 
     def _stop_base(self, still: Mapping[str, float]) -> None:
         """Stop the wheels before the arm is read, which one silent motor fails."""
@@ -393,7 +393,7 @@ class DeviceBody:
 
     def _stiffen(self) -> None:
         """Switch the torque on again for a motion, with the present position as target."""
-        present, limp = self._joints(READ_TRIES), self._limp
+        present, limp = self.get_joints(READ_TRIES), self._limp
         self._limp = set()
         try:
             targets = self._targets(present)
