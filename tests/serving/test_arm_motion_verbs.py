@@ -48,7 +48,7 @@ def test_reads_need_no_leave_to_move() -> None:
 
 def test_robot_without_an_arm_says_so() -> None:
     verb = ARM_MOTION_VERBS["getPose"]
-    answer: Any = verb.carry_out(adapt(ToyRobot()), {})
+    answer: Any = verb.call(adapt(ToyRobot()), {})()
     assert answer["reason"] == "This robot has no arm whose motions can be planned here."
 
 
