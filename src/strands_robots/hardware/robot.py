@@ -642,7 +642,7 @@ class HardwareRobot(ArmMixin, TeleopMixin):
         logger.warning("%s lost its port and is connected again.", self.tool_name_str)
 
     def _free(self) -> None:
-        leader = self.teleoperated_by(self.tool_name_str)
+        leader = self.teleoperated_by(self.tool_name_str) if self._teleop_sessions else ""
         task = "" if self._task is None else self.occupied(self.tool_name_str)
         busy = task or (f"the leader {leader}" if leader else "")
         if busy:

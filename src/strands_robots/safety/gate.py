@@ -240,7 +240,7 @@ class MotionGate:
     def held(self) -> bool:
         """True while motions hold: by :meth:`hold`, or after the process did not run."""
         now = self._awake.look()
-        return self._awake.held_at(now) or now < self._held_until
+        return now < self._awake.held_until or now < self._held_until
 
     @property
     def holds(self) -> int:
@@ -358,7 +358,13 @@ class MotionGate:
 
     def refusal(self, verb: str, request: MotionRequest | None = None) -> Envelope | None:
         """Return the refusal of ``verb`` while locked or halted since, else None."""
-        return self._refusal(verb, self._dated(request))
+        dated = self._dated(request)
+        if dated.read:
+            return error(f"{verb} is refused: {dated.read} is declared a read, and a read moves nothing.")
+        locked = self.lockout(verb)
+        if locked is not None:
+            return locked
+        return error(_LATE.format(verb)) if dated.overtaken else None
 
     def permit(self, verb: str, request: MotionRequest | None = None) -> Permit:
         """Return leave to move; raise :class:`MotionRefused` if locked or halted.
@@ -371,7 +377,7 @@ class MotionGate:
         dated = self._dated(request)
         permit = Permit(dated, verb)
         for _ in range(2):
-            refusal = self._refusal(verb, dated)
+            refusal = self.refusal(verb, dated)
             if refusal is not None:
                 raise MotionRefused(refusal)
             # Counted between two looks at the latches: a settling that begins beside this either is a latch that
@@ -412,7 +418,9 @@ class MotionGate:
             if valid:
                 self._generation += 1
             request = MotionRequest(self, self._generation)
-        refusal = self._refusal(permit.verb, request) if valid else error(_LATE.format(permit.verb))
+        refusal = self.lockout(permit.verb) if valid else None
+        if refusal is None and not (valid and not request.overtaken):
+            refusal = error(_LATE.format(permit.verb))
         if refusal is not None:
             raise MotionRefused(refusal)
         return Permit(request, permit.verb)
@@ -430,14 +438,6 @@ class MotionGate:
         # One of a robot that has this one inside: a halt of either refuses the motion.
         made.given_up = request is not None and request.overtaken
         return made
-
-    def _refusal(self, verb: str, request: MotionRequest) -> Envelope | None:
-        if request.read:
-            return error(f"{verb} is refused: {request.read} is declared a read, and a read moves nothing.")
-        locked = self.lockout(verb)
-        if locked is not None:
-            return locked
-        return error(_LATE.format(verb)) if request.overtaken else None
 
 
 _LATE = "{} is refused: the robot was halted after it was asked for; nothing was started."

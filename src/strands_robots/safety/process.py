@@ -173,7 +173,8 @@ class AwakeClock:
     def __init__(self, clock: Callable[[], float] = uptime) -> None:
         self._clock = clock
         self._last = float("inf")
-        self._held_until = float("-inf")
+        self.held_until = float("-inf")
+        """Moment until which every motion holds; never to come where nothing watches."""
         self.pauses = 0
         """Number of times that the process was found not to have run."""
         self._watching = threading.Lock()
@@ -192,15 +193,13 @@ class AwakeClock:
             return now
         if now - last >= PAUSE_S:
             # Before the mark below: whoever finds a fresh mark also finds the hold.
-            self._held_until = now + (HOLD_S if now - last < LINKS_LOST_S else LONG_HOLD_S)
+            self.held_until = now + (HOLD_S if now - last < LINKS_LOST_S else LONG_HOLD_S)
             self.pauses += 1
+            if self._over is None:  # the last watcher ended meanwhile
+                self.held_until = float("-inf")
         if now > last:
             self._last = now
         return now
-
-    def held_at(self, moment: float) -> bool:
-        """Return True while every motion holds; never where nothing watches."""
-        return self._over is not None and moment < self._held_until
 
     def watch(self, woke: Callable[[], None]) -> Callable[[], None]:
         """Call ``woke`` after each pause, on a thread of this clock; return its end.
@@ -218,7 +217,7 @@ class AwakeClock:
                 if not self._watchers and self._over is not None:
                     self._over.set()
                     self._over = None
-                    self._last = float("inf")
+                    self._last, self.held_until = float("inf"), float("-inf")
 
         return unwatch
 
@@ -240,7 +239,7 @@ class AwakeClock:
                 continue
             reported = self.pauses
             logger.warning(
-                "This process did not run for a while; its motions hold for %.1f s.", self._held_until - self._last
+                "This process did not run for a while; its motions hold for %.1f s.", self.held_until - self._last
             )
             for woke in self._watchers:
                 try:

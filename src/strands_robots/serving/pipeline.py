@@ -18,6 +18,7 @@ from functools import partial
 from typing import Any
 from weakref import WeakKeyDictionary
 
+from strands_robots import settings
 from strands_robots.contract import Robot, body_of
 from strands_robots.envelope import Envelope, RefusalReason, Refused, error, is_error
 from strands_robots.identity_map import IdentityMap
@@ -26,7 +27,7 @@ from strands_robots.safety.gate import REFUSALS, MotionGate, MotionRefused, Moti
 from strands_robots.serving.control import NotHolderError
 from strands_robots.serving.control_leases import ControlLeases, leases_of
 from strands_robots.serving.offered_verbs import tasks_refused, unoffered
-from strands_robots.serving.policy_arguments import MOCK, mock_refusal
+from strands_robots.serving.policy_arguments import MOCK, MOCK_REFUSED
 from strands_robots.serving.verbs import LEASE_ID, LEASE_NAMES, LEASE_TTL_S, Arguments, Kind, Verb
 from strands_robots.serving.workers import Shares, shares_of
 from strands_robots.stop_log import stop_logger
@@ -289,10 +290,10 @@ class Pipeline:
             Refused: no grant is for it.
         """
         verb, peer = command.verb, self.peer_id()
-        if arguments.get("policy_provider") == MOCK and getattr(self.robot, "runs_policies", False):
-            refusal = mock_refusal()
-            if refusal is not None:
-                raise Refused(RefusalReason.APPROVAL, f"{verb.name} is refused: {refusal}", reason="mock on hardware")
+        mock = arguments.get("policy_provider") == MOCK and getattr(self.robot, "runs_policies", False)
+        if mock and not settings.boolean("STRANDS_ALLOW_MOCK"):
+            text = f"{verb.name} is refused: {MOCK_REFUSED}"
+            raise Refused(RefusalReason.APPROVAL, text, reason="mock on hardware")
         if self.approval.standing(verb.name, peer, callers):
             return None
         own = {name: value for name, value in command.arguments.items() if name in verb.by_name.keys() - LEASE_NAMES}

@@ -161,16 +161,11 @@ An operator adds a name to the table by ``STRANDS_MESH_POLICY_TYPE_ALLOW``, a pl
 
 _REPO = re.compile(r"([A-Za-z0-9][A-Za-z0-9._-]{0,95})/([A-Za-z0-9][A-Za-z0-9._-]{0,95})\Z")
 
-
-def mock_refusal() -> str | None:
-    """Return why the policy ``mock`` may not move real hardware, or None."""
-    if settings.boolean("STRANDS_ALLOW_MOCK"):
-        return None
-    return (
-        "the policy mock plays slow waves and follows no instruction. Name a profile of --policies FILE "
-        "as policy_provider; to let "
-        "mock move real hardware, serve the robot with --allow-mock (STRANDS_ALLOW_MOCK=true)."
-    )
+MOCK_REFUSED = (
+    "the policy mock plays slow waves and follows no instruction. Name a profile of --policies FILE as "
+    "policy_provider; to let mock move real hardware, serve the robot with --allow-mock (STRANDS_ALLOW_MOCK=true)."
+)
+"""Why the policy ``mock`` may not move real hardware."""
 
 
 def profile_list() -> str:
