@@ -45,10 +45,11 @@ from strands_robots.serving.pipeline import Command, Pipeline, Result, busy
 from strands_robots.serving.policy_arguments import profile_list
 from strands_robots.serving.stop_arguments import noted
 from strands_robots.serving.stops import stop_within
-from strands_robots.serving.verbs import REQUIRED, Arguments, Kind, Verb, described, labels_of, text_of
+from strands_robots.serving.verbs import Arguments, Kind, Verb, described, labels_of, text_of
 from strands_robots.serving.workers import ShareFullError, called, loop_future
 from strands_robots.stop_log import stop_logger
 from strands_robots.utils import START_S, WAIT_S, ValidationError, shown, text
+from strands_robots.verb_parameters import REQUIRED
 
 logger = stop_logger(__name__)
 

@@ -19,7 +19,7 @@ from strands_robots.serving.robot_verbs import WORLD_VERBS, served_world, world_
 from strands_robots.serving.stops import WorldStop, robot_stop
 from strands_robots.serving.verbs import Verb
 
-Observed = tuple[float, int, Mapping[str, Mapping[str, float]]]
+Observed = tuple[float, int, Mapping[str, dict[str, float]]]
 """Simulated time, physics steps, and the joints of each robot."""
 
 

@@ -273,7 +273,7 @@ class Activity:
     busy: bool = False
     facts: Mapping[str, Any] = field(default_factory=dict)
     fault: str = ""
-    joints: Mapping[str, Mapping[str, float]] = field(default_factory=dict, compare=False)
+    joints: Mapping[str, dict[str, float]] = field(default_factory=dict, compare=False)
 
 
 class ReportedDevice(Protocol):

@@ -21,7 +21,7 @@ from strands_robots.recording.cameras import (
     take_picture,
 )
 from strands_robots.safety.gate import MotionRequest
-from strands_robots.serving.verbs import ROBOT_NAME, Arguments, Begin, Check, Kind, Parameter, Verb, between, table
+from strands_robots.serving.verbs import ROBOT_NAME, Arguments, Begin, Kind, Verb, between, table
 from strands_robots.utils import (
     WAIT_S,
     MissingExtraError,
@@ -33,6 +33,7 @@ from strands_robots.utils import (
     shown,
     text,
 )
+from strands_robots.verb_parameters import Check, Parameter
 
 WIDTH, HEIGHT = 640, 480
 """Size of a picture where none is asked for, in pixels."""

@@ -25,20 +25,11 @@ from strands_robots.serving.control import (
     doubts,
 )
 from strands_robots.serving.stops import RobotStop, stop_within
-from strands_robots.serving.verbs import (
-    LEASE_ID,
-    LEASE_ID_MAX,
-    TTL_MAX_S,
-    TTL_MIN_S,
-    Arguments,
-    Kind,
-    Parameter,
-    Verb,
-    table,
-)
+from strands_robots.serving.verbs import LEASE_ID, LEASE_ID_MAX, TTL_MAX_S, TTL_MIN_S, Arguments, Kind, Verb, table
 from strands_robots.serving.workers import Share, ShareFullError
 from strands_robots.stop_log import stop_logger
 from strands_robots.utils import choice, number, text
+from strands_robots.verb_parameters import Parameter
 
 logger = stop_logger(__name__)
 

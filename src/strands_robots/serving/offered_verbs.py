@@ -14,14 +14,7 @@ from strands_robots.envelope import Envelope, error, fields_of, is_error, jsonab
 from strands_robots.safety.gate import MotionRequest
 from strands_robots.serving.advertised import VERBS, RobotDescription
 from strands_robots.serving.arm_verbs import ARM_MOTION_VERBS
-from strands_robots.serving.verbs import (
-    LEASE_NAMES,
-    POLICY_PROVIDER,
-    Arguments,
-    Kind,
-    Verb,
-    described,
-)
+from strands_robots.serving.verbs import LEASE_NAMES, POLICY_PROVIDER, Arguments, Kind, Verb, described
 from strands_robots.utils import ValidationError
 from strands_robots.verb_declaration import DeclaredVerb, declared_verbs
 

@@ -52,11 +52,9 @@ from strands_robots.serving.verbs import (
     MOTOR_IDS,
     NONCE,
     POLICY_PROVIDER,
-    REQUIRED,
     RESUME,
     Arguments,
     Kind,
-    Parameter,
     Verb,
     between,
     described,
@@ -64,6 +62,7 @@ from strands_robots.serving.verbs import (
     table,
 )
 from strands_robots.utils import identifier, number, port
+from strands_robots.verb_parameters import REQUIRED, Parameter
 
 POLL_S = 0.05
 EXECUTE_GRACE_S = 10.0

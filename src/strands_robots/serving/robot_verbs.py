@@ -36,12 +36,12 @@ from strands_robots.serving.verbs import (
     Arguments,
     Begin,
     Kind,
-    Parameter,
     Verb,
     release_torque_verb,
     table,
 )
 from strands_robots.utils import DURATION_MAX_S, ValidationError, duration, number, shown, text
+from strands_robots.verb_parameters import Parameter
 
 WORLD_MEMBERS = (
     *("tool_name_str", "gate", "halt", "subscribe", "list_robots", "start_policy", "stop_policy"),
