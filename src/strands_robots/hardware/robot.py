@@ -565,9 +565,10 @@ class HardwareRobot(ArmMixin, TeleopMixin):
         return settling
 
     def _moving(self) -> list[str]:
-        task = ["task"] if self.occupied(self.tool_name_str) else []
-        task += ["settling"] if self._settling is not None and self._settling.running else []
-        return task + [f"teleoperation {name}" for name in self.teleoperating()] + ["send_action"] * bool(self._sends)
+        task, settling = self._task, self._settling
+        moving = ["task"] if task is not None and task.running else []
+        moving += ["settling"] if settling is not None and settling.running else []
+        return moving + [f"teleoperation {name}" for name in self.teleoperating()] + ["send_action"] * bool(self._sends)
 
     def _voided_loops(self) -> dict[str, Rollout]:
         """Void every running loop; return them as a verdict names them."""
