@@ -1,9 +1,11 @@
-"""Sockets of Zenoh's links are closed without waiting; no other socket is touched."""
+"""Zenoh sessions of every network: loaded late, TLS alone, and sockets that are closed without waiting."""
 
 from __future__ import annotations
 
 import os
 import socket
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -13,7 +15,16 @@ import pytest
 from fixtures.waiting import eventually
 
 from strands_robots import zenoh_session
-from strands_robots.zenoh_session import LINGER, change_links, close_in_background
+from strands_robots.zenoh_session import (
+    LEASE_MS,
+    LINGER,
+    TRY_MS,
+    change_links,
+    close_in_background,
+    for_stops,
+    transport_config,
+    use_tls,
+)
 
 
 @pytest.fixture
@@ -92,3 +103,26 @@ def test_search_that_got_no_thread_is_tried_again_at_the_next_link(monkeypatch: 
     monkeypatch.setattr(zenoh_session, "change_links", searched.set)
     zenoh_session.close_in_background()
     assert searched.wait(20)
+
+
+def test_import_needs_no_zenoh() -> None:
+    program = "import sys; sys.modules['zenoh'] = None; import strands_robots.zenoh_session"
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
+
+
+@pytest.mark.parametrize(("mode", "tries"), [("client", {"timeout_ms": TRY_MS}), ("peer", {})])
+def test_session_of_stops_has_queues_of_its_own_and_a_bounded_lease(mode: str, tries: dict[str, int]) -> None:
+    config = for_stops({"mode": mode, "connect": {}, "transport": transport_config(("data",), 500)})
+    link = config["transport"]["link"]["tx"]
+    assert link["lease"] == LEASE_MS
+    assert link["queue"] == {"size": {"real_time": 16, "interactive_high": 16}}
+    assert {key: config["connect"][key] for key in config["connect"] if key != "retry"} == tries
+
+
+def test_certificates_leave_tls_alone() -> None:
+    config = {"transport": transport_config(("data",), 500)}
+    tls = use_tls(config, ca="/ca.pem", cert="-----BEGIN CERTIFICATE-----", key="/key.pem")
+    assert config["transport"]["link"]["protocols"] == ["tls"]
+    assert tls["enable_mtls"] is True
+    assert tls["root_ca_certificate"] == "/ca.pem"
+    assert "connect_certificate" not in tls and tls["connect_certificate_base64"]

@@ -1,4 +1,4 @@
-"""Zenoh sessions of every network: configuration, callbacks, links, and the session of stops.
+"""Zenoh sessions of every network: configuration, callbacks, links, stops.
 
 Zenoh is imported with the first session. It calls back on its own threads; a sink given here runs there and must only
 hand over. Callbacks are direct: the binding would otherwise start one Python thread for each subscriber, queryable and
@@ -116,7 +116,7 @@ def use_tls(
 
 
 def for_stops(config: dict[str, Any]) -> dict[str, Any]:
-    """Change the configuration of a data-plane session into that of an e-stop session, and return it."""
+    """Make the configuration of a data-plane session that of an e-stop session."""
     config["connect"]["retry"] = {"period_init_ms": 50, "period_max_ms": 250, "period_increase_factor": 2}
     transport = config["transport"]
     transport["link"]["tx"]["lease"] = LEASE_MS
@@ -179,7 +179,10 @@ class LinkedSession:
         self._declared.append(events)
 
     def subscribe(self, key: str, sink: Sink) -> Any:
-        """Have ``sink(sample)`` called for every sample on ``key`` until the close; return what to undeclare before."""
+        """Have ``sink(sample)`` called for every sample on ``key`` until the close.
+
+        The result may be undeclared before.
+        """
         subscriber = self.session.declare_subscriber(key, direct(sink))
         self._declared.append(subscriber)
         return subscriber
@@ -209,7 +212,7 @@ class LinkedSession:
 
 
 class StopSession:
-    """The Zenoh session of a network's e-stop link, opened and renewed on a thread of its own.
+    """Zenoh session of a network's e-stop link, opened and renewed on its own thread.
 
     Its callbacks run on Zenoh's threads.
 
@@ -423,7 +426,7 @@ def _pem_field(name: str, value: str) -> dict[str, str]:
 
 
 class _Open:
-    """What a process has open: a session left open with a subscriber would hang the interpreter's exit."""
+    """Open sessions: with a subscriber, one would hang the interpreter's exit."""
 
     def __init__(self) -> None:
         self.stop_sessions: set[StopSession] = set()
@@ -436,7 +439,7 @@ class _Open:
         self._closed_at = time.monotonic()
 
     def close_all(self) -> None:
-        """Close what is open, and wait until Zenoh's threads have released the callbacks of the last one."""
+        """Close what is open, and wait until Zenoh's threads have released callbacks."""
         for stops in list(self.stop_sessions):
             stops.close()
         for session in list(self.sessions):

@@ -97,8 +97,9 @@ def __dir__() -> list[str]:
 
 
 def load_when_used() -> None:
-    """Have the framework's package run at the first use of a name in it; its submodules import without that.
+    """Have the framework's package run at the first use of a name in it.
 
+    Its submodules import without that.
     ``device_connect_edge/__init__.py`` imports its runtime, pydantic's models and OpenTelemetry, ten times the time of
     the messaging package, which is all that a client needs.
 

@@ -25,7 +25,7 @@ from strands_robots.device_connect.backends import LinkConfig, open_client
 from strands_robots.device_connect.backends.base import NoResponderError, ResponderLostError
 from strands_robots.device_connect.discovery import DESCRIBE_S, HEARTBEATS_S, Discovery, Peer, parts
 from strands_robots.device_connect.links import network_of
-from strands_robots.device_connect.process import LOOP_JOIN_TIMEOUT_S, LoopThread
+from strands_robots.device_connect.process import LOOP_JOIN_TIMEOUT_S, EventLoopThread
 from strands_robots.envelope import Envelope, error
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety.sightings import sightings
@@ -103,7 +103,7 @@ class FleetClient:
     def __init__(self, link: LinkConfig, source: str = "strands-robots") -> None:
         self.link = link
         self.source = device_id("source", source)
-        self._loop: LoopThread | None = None
+        self._loop: EventLoopThread | None = None
         self._messaging: Any = None
         self._discovery: Discovery | None = None
         self._network = network_of(link)
@@ -112,7 +112,7 @@ class FleetClient:
         self._closed = False
 
     def __enter__(self) -> Self:
-        self._loop = LoopThread("fleet-client")
+        self._loop = EventLoopThread("fleet-client")
         try:
             self._messaging = self.run(open_client(self.link), self.link.connect_timeout_s + CONNECT_MARGIN_S)
             self._discovery = Discovery(self._messaging)

@@ -1,4 +1,4 @@
-"""Choice of a link, the opt-in to an unauthenticated one, and what belongs to the network that a link reaches."""
+"""Choice of a link, and what belongs to the network that it reaches."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Presence of devices: what they announce, the heartbeat of their process, and the others as one of them sees them.
+"""Presence of devices: what they announce, their heartbeat, and other devices.
 
 One message a second tells which devices of a loop and a link live. It is a heartbeat of the first of them, on whose
 topic access rules let them publish, with the ids of all in ``devices``. A reader of heartbeats that does not know the
@@ -166,7 +166,7 @@ def process_heartbeat(link: LinkConfig) -> ProcessHeartbeat:
 
 
 def devices_in(data: bytes) -> Iterable[str]:
-    """Return the devices in the heartbeat of a process; none for the heartbeat of a single one."""
+    """Return the devices in a process's heartbeat; none for that of one device."""
     if MARK not in data:
         return ()
     devices = json_object(data).get("devices")

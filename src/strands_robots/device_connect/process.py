@@ -1,4 +1,4 @@
-"""What a process that serves or calls devices has once: the event loop of its robots, and the signal that ends it.
+"""Event loops on threads of their own, and the signal that ends a program.
 
 The code of a robot runs on workers, so its device needs no loop of its own. The methods of a ready ``DeviceDriver`` are
 coroutines of somebody else; such a driver gets a loop of its own, where it blocks no other device.
@@ -26,7 +26,7 @@ LAST_TASKS_S = 1.0
 """Seconds in which cancelled tasks of a loop have to end."""
 
 
-class LoopThread:
+class EventLoopThread:
     """An event loop on a thread of its own."""
 
     def __init__(self, name: str) -> None:
@@ -64,7 +64,7 @@ class LoopThread:
         await self.loop.shutdown_asyncgens()
 
 
-class DeviceLoop(LoopThread):
+class DeviceLoop(EventLoopThread):
     """The event loop of devices; it ends when its last user has left."""
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Registration of a device with the safety plane, and the emergency stops on its runtime's connection."""
+"""Registration of a device with the safety plane, and its runtime's stops."""
 
 from __future__ import annotations
 
@@ -267,10 +267,10 @@ class RegisteredDevice(Protocol):
 
 
 class RuntimeStops:
-    """Emergency stops on the runtime's connection, taken once for the devices of a loop and a link.
+    """Emergency stops on the runtime's connection, taken once for many devices.
 
-    Each stop ends in the safety plane, which halts every robot of the process, so that one subscription does for all of
-    them; one of the devices holds it. The e-stop listener's own connection carries the same stops.
+    They have a loop and a link in common, and one of them holds the subscription. Each stop ends in the safety plane,
+    which halts every robot of the process. The e-stop listener's own connection carries the same stops.
     """
 
     def __init__(self, link: LinkConfig) -> None:

@@ -16,7 +16,7 @@ from typing import Any
 from device_connect_edge.messaging import MessagingError
 
 from strands_robots.device_connect.backends import LinkConfig
-from strands_robots.device_connect.process import LoopThread
+from strands_robots.device_connect.process import EventLoopThread
 from strands_robots.safety.orders import PARSED_MAX_BYTES
 from strands_robots.safety.stop_link import (
     ANSWER,
@@ -110,7 +110,7 @@ class NatsStopLink:
     def __init__(self, link: LinkConfig) -> None:
         self._link = link
         self._root = f"device-connect.{link.tenant}"
-        self._loop: LoopThread | None = None
+        self._loop: EventLoopThread | None = None
         self._client: Any = None
         self._up = False
         self._on_state: OnState = lambda up: None
@@ -131,7 +131,7 @@ class NatsStopLink:
 
     def open(self, events: Collection[str], on_event: OnEvent, on_state: OnState) -> None:
         self._on_state = on_state
-        self._loop = LoopThread("stop-link")
+        self._loop = EventLoopThread("stop-link")
         self._loop.submit(self._serve(events, on_event))
         _OPEN.add(self)
 

@@ -1,4 +1,4 @@
-"""Telemetry of a device: the events of a rollout, and the state of its robot, told when it changes.
+"""Telemetry of a device: events of rollouts, and its robot's state on change.
 
 A robot that does something is looked at through its own share of the workers, at the rate of its events. All robots of
 a loop that do nothing are looked at by one worker in turn, which wakes the device of one that changed.

@@ -1,4 +1,4 @@
-"""TLS of a link's clients, and the reasons of a failed connection: an endpoint is dialled to name why it is silent."""
+"""TLS of a link's clients, and the reasons why an endpoint does not answer."""
 
 from __future__ import annotations
 

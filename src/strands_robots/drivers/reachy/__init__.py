@@ -1,4 +1,7 @@
-"""Driver of Pollen's Reachy Mini through its daemon, which is named or announces itself; loads third parties on use."""
+"""Driver of Pollen's Reachy Mini through its daemon, which may announce itself.
+
+Third parties are loaded on use.
+"""
 
 from __future__ import annotations
 
