@@ -226,38 +226,27 @@ class RobotsPort(MissedStopsPort):
         self._plane.hold(seconds)
 
 
+@dataclass(eq=False)
 class ListenerRegistration:
     """Registration of a device with the listener; the last one closes the link."""
 
-    def __init__(
-        self,
-        listener: EstopListener,
-        robot_id: str,
-        key: Hashable,
-        link: StopLink,
-        identity: Callable[[], SigningIdentity | None],
-        *,
-        network: NetworkKey | None,
-        was_here: bool,
-        codec: StopCodec,
-        asks: bool,
-    ) -> None:
-        self.robot_id = robot_id
-        self.codec, self.asks = codec, asks
-        self.network = network
-        self.was_here = was_here
-        self.identity = identity
-        self.key = key
-        self.link = link
-        self._listener = listener
+    listener: EstopListener
+    robot_id: str
+    key: Hashable
+    link: StopLink
+    identity: Callable[[], SigningIdentity | None]
+    network: NetworkKey | None
+    was_here: bool
+    codec: StopCodec
+    asks: bool
 
     def open(self) -> None:
         """Open the link, unless it is open or this registration has ended."""
-        self._listener.open(self)
+        self.listener.open(self)
 
     def close(self) -> None:
         """Unregister. Safe to call twice."""
-        self._listener.unregister(self)
+        self.listener.unregister(self)
 
 
 class OpenLink(NamedTuple):
@@ -329,9 +318,7 @@ class EstopListener:
                 self._start()
             link = next((each.link for each in self._registrations if each.key == key), None)
             made = make() if link is None else link
-            registration = ListenerRegistration(
-                self, robot_id, key, made, identity, network=network, was_here=was_here, codec=codec, asks=asks
-            )
+            registration = ListenerRegistration(self, robot_id, key, made, identity, network, was_here, codec, asks)
             self._registrations = (*self._registrations, registration)
         if opened:
             registration.open()

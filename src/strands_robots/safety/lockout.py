@@ -196,7 +196,8 @@ class LockoutLatch:
             self.state = self.state.engage(Lockout(epoch, source, reason, self._clock(), scope))
             if self.state.overflow is not None and not crowded:
                 self.crowd = uptime() - SKEW_S, uptime() + SKEW_S
-            self._forget()
+            if len(self._seen) > SEEN_MAX + MAX_EPOCHS:
+                self._forget()
             return True
 
     def inherit(self, state: LockoutState, crowd: Span) -> None:
@@ -237,8 +238,6 @@ class LockoutLatch:
         self.resumed = with_resumed(self.resumed, epochs)
 
     def _forget(self) -> None:
-        if len(self._seen) <= SEEN_MAX + MAX_EPOCHS:
-            return
         active = set(self.state.resumable)
         oldest = next(epoch for epoch in self._seen if epoch not in active)
         del self._seen[oldest]

@@ -213,14 +213,8 @@ def void_calls(target: object) -> tuple[VerbCall, ...]:
     return calls
 
 
-class _Here(threading.local):
-    """Halts under way on this thread, the outermost first."""
-
-    def __init__(self) -> None:
-        self.halts: list[HaltedVerbs] = []
-
-
-_here = _Here()
+_here = threading.local()
+"""Its ``halts`` are the halts under way on this thread, the outermost first."""
 
 
 class HaltedVerbs:
@@ -239,7 +233,7 @@ class HaltedVerbs:
         self._calls = dict.fromkeys((*before, *void_calls(target)))
         # Several stops have one answer, and whoever does not run the verb has to be told of it.
         self._itself = next(iter(asked_by)) if len(set(asked_by)) == 1 else None
-        _here.halts.append(self)
+        _here.__dict__.setdefault("halts", []).append(self)
 
     def asked(self, call: VerbCall) -> bool:
         """Return True for a verb that asks for the halt itself."""
@@ -269,9 +263,10 @@ def verbs_to_end(under_way: VerbsUnderWay) -> Callable[[], bool]:
 
     An inner halt waits for none: the outermost does.
     """
-    if len(_here.halts) != 1:
+    halts = getattr(_here, "halts", ())
+    if len(halts) != 1:
         return lambda: False
-    halted = _here.halts[0]
+    halted = halts[0]
     return lambda: any(not each.valid() and not halted.asked(each) for each in under_way.calls)
 
 
