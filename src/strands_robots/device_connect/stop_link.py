@@ -10,6 +10,7 @@ import atexit
 import contextlib
 import weakref
 from collections.abc import Collection
+from concurrent.futures import Future
 from dataclasses import replace
 from typing import Any
 
@@ -111,6 +112,7 @@ class NatsStopLink:
         self._link = link
         self._root = f"device-connect.{link.tenant}"
         self._loop: EventLoopThread | None = None
+        self._serving: Future[None] | None = None
         self._client: Any = None
         self._up = False
         self._on_state: OnState = lambda up: None
@@ -132,7 +134,8 @@ class NatsStopLink:
     def open(self, events: Collection[str], on_event: OnEvent, on_state: OnState) -> None:
         self._on_state = on_state
         self._loop = EventLoopThread("stop-link")
-        self._loop.submit(self._serve(events, on_event))
+        # Kept: a loop itself keeps no task that nothing else refers to.
+        self._serving = self._loop.submit(self._serve(events, on_event))
         _OPEN.add(self)
 
     def publish(self, source: str, event: str, payload: bytes) -> bool:
