@@ -74,7 +74,7 @@ def read_joints(device: Any) -> dict[str, float]:
 
 
 def joint_reader(device: Any) -> Callable[[], dict[str, float]]:
-    """Return what reads the joints of a device as :func:`read_joints` does; its buses are looked for once."""
+    """Return a :func:`read_joints` of one device, whose buses are looked for once."""
     source = joint_read_source(device)
     if source is None:
         return dict

@@ -104,7 +104,7 @@ E = TypeVar("E", bound=OfRobot)
 
 
 class Observers(Generic[E]):
-    """Observers of a robot's events; one that raises is logged and stays subscribed. Thread-safe."""
+    """Observers of a robot's events; one that raises is logged and stays."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()

@@ -1,4 +1,7 @@
-"""Limits on events: a number in a window of time, or a steady rate. No lock is shared between two limits."""
+"""Limits on events: a number in a window of time, or a steady rate.
+
+No lock is shared between two limits.
+"""
 
 from __future__ import annotations
 

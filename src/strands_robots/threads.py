@@ -94,7 +94,7 @@ class ReadyThreads(Generic[T]):
 
 
 class WokenThread:
-    """Thread that sleeps until it is woken or something is due; started at its first wake.
+    """Thread that sleeps until it is woken, started then, or something is due.
 
     Args:
         name: of the thread.

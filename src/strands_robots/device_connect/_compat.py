@@ -455,7 +455,7 @@ _telemetry = framework.DeviceConnectTelemetry
 
 
 def observed(driver: Any = None) -> bool:
-    """Return True when spans or metrics are recorded in this process, or log lines of a driver's calls."""
+    """Return True when spans, metrics or log lines of a driver are recorded."""
     if driver is not None and (
         callable(getattr(driver, "log_integration", None)) or decorators.logger.isEnabledFor(logging.INFO)
     ):

@@ -293,7 +293,10 @@ class RobotDriver(CollectedOnce):
         return [each for each in found if not (self._stops_are_shared and each["handler"] == self.onEmergencyStop)]
 
     async def on_estop(self, device_id: object, payload: object, raw: bytes | int | None = None) -> None:
-        """Act on an emergency stop that the runtime received; ``raw`` is its message, or the size of a longer one."""
+        """Act on an emergency stop that the runtime received.
+
+        ``raw`` is its message, or the number of bytes of one that is too long to be read.
+        """
         self.stops.receive(device_id, payload, raw)
 
     # Control.

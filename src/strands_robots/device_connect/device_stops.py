@@ -1,4 +1,4 @@
-"""Emergency stops and lockouts of one device, in the safety plane or before it is registered there."""
+"""Emergency stops and lockouts of one device, in the safety plane or not."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ class DeviceStops:
         return {"locked": latch.state.locked, "lockout": [each.fields() for each in latch.state.all]}
 
     def resume(self, arguments: Arguments, request: MotionRequest | None) -> Envelope:
-        """Clear one epoch with a signed assertion; a device that no plane has is registered for it."""
+        """Clear one epoch with a signed assertion, registered for it if need be."""
         device = self._device
         if device.registration is None and self.unregistered is not None:
             self._registered_here = register_safety(device.peer_id, device, None, named=False)
@@ -90,7 +90,7 @@ class DeviceStops:
         return error("resume rejected") if registration is None else registration.resume(arguments["assertion"])
 
     def receive(self, source: object, payload: object, raw: bytes | int | None = None) -> None:
-        """Act on an emergency stop of the runtime, in the safety plane if registered; return at once.
+        """Act on an emergency stop of the runtime, and return at once.
 
         ``raw`` is its message, or the number of bytes of one that is too long to be read.
         """

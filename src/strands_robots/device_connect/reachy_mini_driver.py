@@ -87,7 +87,7 @@ class ReachyMiniDriver(RobotDriver):
         return DeviceStatus(availability=UNAVAILABLE, busy_score=0.0, error_state=away)
 
     def status_of(self, activity: Activity) -> dict[str, Any]:
-        """Return the fields of the status for an activity; a robot that is away is unavailable."""
+        """Return the fields of the status; a robot that is away is unavailable."""
         fields = super().status_of(activity)
         return {**fields, "availability": UNAVAILABLE} if activity.fault else fields
 

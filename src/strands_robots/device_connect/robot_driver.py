@@ -1,4 +1,4 @@
-"""A robot with one body, or a mobile base, as a device: its verbs, and the events of its tasks."""
+"""A robot with one body as a device: its verbs, and the events of its tasks."""
 
 from __future__ import annotations
 

@@ -382,7 +382,7 @@ class StateReports:
         return None if activity.fault else activity
 
     async def read(self) -> None:
-        """Ask the robot for its activity, unless that was done since the last :meth:`end`."""
+        """Ask the robot for its activity, once until :meth:`end`."""
         if not self._read:
             self.activity = await self._looked()
             self._read = True

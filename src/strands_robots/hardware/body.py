@@ -132,7 +132,7 @@ class DeviceBody:
             self._limp = set()
 
     def _look_at_device(self) -> None:
-        """Find its buses, and how fast its joints may be by the calibration that it has now."""
+        """Find its buses, and the speeds of its joints by its calibration."""
         self._read_joints = joint_reader(self.device)
         self.speeds = default_speeds(self.device) | self._speed_limit
         """Greatest speed by action key: as given, else 2 rad/s for an angle."""

@@ -1,4 +1,4 @@
-"""What is known of a LeRobot device: port, identity, units, speeds, joints, parts of an arm.
+"""Facts of a LeRobot device: port, identity, units, speeds, joints, arm.
 
 Neither MuJoCo nor numpy is loaded: a robot says what it can do before its first motion. The model decides then; a
 calibration that does not fit it is found with the first motion.

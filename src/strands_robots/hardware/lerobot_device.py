@@ -1,4 +1,4 @@
-"""LeRobot devices by name, made but not connected, and leader arms on a bus of their own.
+"""LeRobot devices by name, made but not connected, and leader arms.
 
 LeRobot keeps its devices in registries of configuration classes (``RobotConfig``, ``TeleoperatorConfig``,
 ``CameraConfig``), filled when the module of each device is imported. Run on LeRobot 0.4.4 and 0.6.1.

@@ -644,8 +644,7 @@ class HardwareRobot(ArmMixin, TeleopMixin):
 
     def _free(self) -> None:
         leader = self.teleoperated_by(self.tool_name_str) if self._teleop_sessions else ""
-        task = "" if self._task is None else self.occupied(self.tool_name_str)
-        busy = task or (f"the leader {leader}" if leader else "")
+        busy = (self._task and self.occupied(self.tool_name_str)) or (leader and f"the leader {leader}")
         if busy:
             raise ValidationError(f"{self.tool_name_str} is driven by {busy}; stop that first.")
 

@@ -1,4 +1,4 @@
-"""What is known of an arm without numpy: its parts, and the joints that it states."""
+"""Facts of an arm without numpy: its parts, and the joints that it states."""
 
 from __future__ import annotations
 

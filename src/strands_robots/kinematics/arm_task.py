@@ -1,4 +1,4 @@
-"""The motions of an arm as tasks, and its saved places: joints in degrees by place, one file an arm."""
+"""The motions of an arm as tasks, and its saved places, one file an arm."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Contacts of an arm along a path: with itself, its table, and the objects around it."""
+"""Contacts of an arm along a path: with itself, its table and objects."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Motions of an arm: to joints, to a point, along a line, of its gripper, picks and places.
+"""Motions of an arm: to joints or a point, along a line, picks and places.
 
 Each function raises :class:`~strands_robots.utils.ValidationError` with the reason why the motion cannot be.
 

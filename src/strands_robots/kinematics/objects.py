@@ -1,4 +1,4 @@
-"""Objects around an arm: seen by a detector, held between the jaws, looked at after a motion."""
+"""Objects around an arm: seen by a detector, held, looked at after a motion."""
 
 from __future__ import annotations
 

@@ -167,7 +167,7 @@ def checked_speeds(value: object, keys: Iterable[str]) -> dict[str, float]:
 
 
 def speeds_across(ranges: Ranges, full_ranges_per_s: float, unbounded_per_s: float) -> dict[str, float]:
-    """Return the speed of each key that crosses its range so often in a second, and of one without a range.
+    """Return speeds by key: its range so often a second, or one without a range.
 
     Args:
         full_ranges_per_s: above 0.

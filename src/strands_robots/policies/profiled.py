@@ -1,4 +1,4 @@
-"""A policy as its profile describes it: order, units, pictures, speed bound, chunks in time.
+"""A policy as its profile describes it: order, units, pictures, chunks.
 
 A position counts the policy's own steps, of which there are ``rate`` in a second. It goes on only while an action is
 played, so a robot that waits for its policy misses nothing of the path. A chunk begins at the position of its

@@ -1,4 +1,4 @@
-"""Models that are loaded before a motion, and the end of a process that still computes.
+"""Models that are loaded before a motion, and the end of their process.
 
 While the interpreter shuts down, Python ends every thread that comes back to it from native code. glibc does that by
 unwinding the native code, which torch's does not allow: the process would abort. So where torch is loaded the end waits

@@ -129,7 +129,7 @@ class Authorization:
         self._warned = threading.Event()
 
     def motion(self, source: object, verb: str, provider: str = "") -> str | None:
-        """Return and log the reason why ``source`` may not do ``verb`` by a policy, or None."""
+        """Return and log why ``source`` may not do ``verb`` by a policy, or None."""
         allow, providers = self._read("DEVICE_CONNECT_RPC_ALLOW"), self._read("STRANDS_MESH_POLICY_TYPE_ALLOW")
         refusal = motion_refusal(source, allow, hardware=self.hardware)
         if refusal is not None:
@@ -324,7 +324,7 @@ class Approval:
         self._grants = grants
 
     def standing(self, verb: str, peer: str, callers: Collection[str]) -> bool:
-        """Return whether ``verb`` is approved until further notice, so that nothing has to be claimed."""
+        """Return whether ``verb`` is approved without a grant."""
         allow = self._read("STRANDS_ROBOT_COMMAND_ALLOW")
         return (bool(allow) and listed(verb, peer, allow, callers)) or self._bypass()
 

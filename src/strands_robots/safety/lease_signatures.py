@@ -1,4 +1,4 @@
-"""Operator's assertion that takes a robot from its holder: signature, check, and the epochs that keep it fresh.
+"""Operator's assertion that takes a robot from its holder, and its fresh epochs.
 
 It names the robot and the epoch of its control lease. The epoch rises with each holder, so an assertion is good once,
 and a restarted process begins above all epochs of the one before, so that a recorded assertion never fits again.

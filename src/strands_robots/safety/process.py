@@ -1,4 +1,4 @@
-"""The process: time slices and garbage collector of its interpreter, and its pauses."""
+"""Time slices, garbage collector and pauses of the process's interpreter."""
 
 from __future__ import annotations
 

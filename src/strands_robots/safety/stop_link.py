@@ -103,7 +103,7 @@ class StopCodec:
         return notification(event, fields)
 
     def fields(self, payload: bytes | int | None) -> Mapping[str, Any]:
-        """Return the fields of a message; empty for what is none or is too long to be read."""
+        """Return the fields of a message; empty for what cannot be read."""
         return {} if payload is None else params_of(payload)
 
     def epoch(self, source: str, fields: Mapping[str, Any]) -> str:
@@ -123,7 +123,7 @@ class StopCodec:
         return rules.order(stop.source, fields, path, stop.payload, stop.at, network=stop.network, age_s=age_s)
 
     def vouches(self, rules: StopRules) -> bool:
-        """Return True where each stop that counts is signed, so that its source has a share of its own."""
+        """Return True where each stop that counts is signed."""
         return rules.signed
 
     def refused(self, refused: StopRefused) -> bool:
@@ -262,7 +262,7 @@ class FairQueue:
         return event
 
     def take(self) -> StopEvent | None:
-        """Return the next event, of the crowd and of vouched sources in turn; None where there is none."""
+        """Return the next event, of the crowd and of vouched sources in turn."""
         self._crowd_next = not self._crowd_next
         for share in (self._crowd, self._signed) if self._crowd_next else (self._signed, self._crowd):
             buckets = share.buckets

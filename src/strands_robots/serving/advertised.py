@@ -1,4 +1,4 @@
-"""Verbs as a robot advertises them, read from its description within bounds; and the names of our own verbs.
+"""Verbs as a robot advertises them, read within bounds, and the names of ours.
 
 A description is data of its robot. Whatever it holds, nothing raises here, the work is bounded, and texts lose control
 characters, terminal escapes and invisible characters. What is out of bounds is left out and named: more than

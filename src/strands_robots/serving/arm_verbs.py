@@ -1,4 +1,4 @@
-"""Verbs of an arm: where its tip is, moving it, its gripper; and the pictures of any robot's cameras.
+"""Verbs of an arm: its tip, its motions, its gripper; pictures of any robot.
 
 Metres and degrees in the base frame, x forward; the gripper's opening is 0 closed to 1 open.
 """

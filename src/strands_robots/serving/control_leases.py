@@ -1,4 +1,4 @@
-"""Control leases of a robot, the same on every network that serves it, and the verbs on them."""
+"""Control leases of a robot on all its networks, and the verbs on them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Verbs that a robot can carry out now, which is what it advertises, and those that it declares itself."""
+"""Verbs that a robot can carry out now, and those that it declares itself.
+
+A robot advertises only what it can do.
+"""
 
 from __future__ import annotations
 

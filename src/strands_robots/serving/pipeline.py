@@ -164,7 +164,7 @@ class Pipeline:
 
     @classmethod
     def of(cls, robot: Robot | None, peer_id: Callable[[], str], **parts: Any) -> Pipeline:
-        """Make the pipeline of a robot, with leases, shares and pending commands of its own unless given others."""
+        """Make the pipeline of a robot, whose leases and threads all networks share."""
         if robot is not None:
             gate = robot.gate
             # The same on every network: a stop of one robot of a world voids what waits on the others.
@@ -284,7 +284,7 @@ class Pipeline:
     def _unclaimed(
         self, command: Command, arguments: Arguments, callers: Collection[str]
     ) -> tuple[str, str, Collection[str], str] | None:
-        """Return the grant that a motion of real hardware has to claim; None where it is approved anyway.
+        """Return the grant that a motion has to claim; None where it needs none.
 
         Raises:
             Refused: no grant is for it.
@@ -303,7 +303,7 @@ class Pipeline:
         return wanted
 
     def _refusal_of(self, verb: Verb, exc: Exception, *, checked: bool) -> tuple[Envelope, Refused | None]:
-        """Return the answer to a verb that refused by itself, or whose arguments do not fit."""
+        """Return the answer to a verb that refused, or whose arguments do not fit."""
         if isinstance(exc, ValidationError) and not checked:
             lacking = None if self.robot is None else tasks_refused(self.robot, verb, self.peer_id())
             if lacking is not None:

@@ -1,4 +1,4 @@
-"""Stops of a world and of one of its robots, for the stop executor; requested stops that wait for their verdict."""
+"""Stops of a world and of its robots, and stops that wait for their verdict."""
 
 from __future__ import annotations
 

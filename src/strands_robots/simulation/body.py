@@ -1,4 +1,4 @@
-"""One robot of a simulated world: observations, actions, base, units, objects around it."""
+"""One robot of a simulated world: observations, actions, base, objects."""
 
 from __future__ import annotations
 

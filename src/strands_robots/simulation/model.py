@@ -1,4 +1,4 @@
-"""The MuJoCo model compiled from a world's contents, and each robot's parts in it.
+"""The MuJoCo model of a world's contents, and each robot's parts in it.
 
 MuJoCo has one set of options for a whole world. What a file sets there is confined to the model's own parts, refused
 by name, or left at the world's value, so that no model changes the physics of its neighbours.

@@ -1,4 +1,4 @@
-"""The physics of one world in real time, and the lock discipline of the simulation.
+"""The physics of one world in real time, and the discipline of its locks.
 
 This is the only place that documents it. A world has three locks, always taken in this order, and one published value:
 

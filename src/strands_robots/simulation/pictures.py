@@ -1,4 +1,4 @@
-"""Pictures of a simulated world, by OpenGL or without it, and files of its motions."""
+"""Pictures of a simulated world, with or without OpenGL; its recordings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The contents of a world as data, made from checked arguments, and the sources of robot models."""
+"""The contents of a world as data, and the sources of robot models."""
 
 from __future__ import annotations
 
