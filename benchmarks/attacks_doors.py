@@ -23,7 +23,7 @@ from benchmarks.table import Row
 from strands_robots.device_connect.backends import LinkConfig
 from strands_robots.mesh import keys
 from strands_robots.mesh.transport import TransportError
-from strands_robots.mesh.transport.zenoh_config import Posture
+from strands_robots.mesh.transport.config import Posture
 
 STOPS, STOPS_QUICK = 100, 5
 STORED, STORED_QUICK = 10, 2

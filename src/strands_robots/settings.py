@@ -150,7 +150,14 @@ _declare(
     ),
     Setting("STRANDS_MESH_NAMESPACE", "text", "strands", "Zenoh namespace on top of the mesh's keys."),
     Setting("STRANDS_MESH_MULTICAST", "boolean", "false", "Find peers by multicast on the local network."),
-    Setting("STRANDS_MESH_MAX_SESSIONS", "integer", "256", "Zenoh sessions a hub accepts.", 1, 65535),
+    Setting(
+        "STRANDS_MESH_MAX_SESSIONS",
+        "integer",
+        "512",
+        "Zenoh sessions a hub accepts, two a process.",
+        1,
+        65535,
+    ),
     Setting(
         "STRANDS_MESH_MAX_PEERS",
         "integer",

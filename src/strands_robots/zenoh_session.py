@@ -265,13 +265,15 @@ class StopSession:
             if self._thread is not None and not self._thread.is_alive() and not self._closing.is_set():
                 self._start(self._replace)
 
-    def put(self, key: str, payload: bytes, *, answer: bool) -> bool:
+    def put(self, key: str, payload: bytes, *, answer: bool, source: Any = None) -> bool:
         """Publish; False where no link carries it.
 
         Args:
             answer: many of its kind may be sent at once, and it stands before no stop.
+            source: ``zenoh.SourceInfo`` of another session of this process, whose message it is.
         """
         sent, options = False, self._answer_options if answer else self._stop_options
+        options = options if source is None else {**options, "source_info": source}
         for each in self._sessions:
             if not each.remotes:
                 continue

@@ -14,7 +14,7 @@ from tests.cli.conftest import Run
 from strands_robots import settings
 from strands_robots.cli.network import Network
 from strands_robots.cli.output import CliError, Exit
-from strands_robots.mesh.transport.zenoh_config import Posture
+from strands_robots.mesh.transport.config import Posture
 
 Write = Callable[..., Path]
 

@@ -17,14 +17,14 @@ from strands_robots.fleet.adapter import FoundRobot
 from strands_robots.fleet.mesh.network import MeshNetwork
 from strands_robots.mesh import Mesh
 from strands_robots.mesh.session import clear_peers
-from strands_robots.mesh.transport import zenoh_config
+from strands_robots.mesh.transport import config
 
 
 @pytest.fixture
 def barista(monkeypatch: pytest.MonkeyPatch) -> Iterator[Barista]:
     monkeypatch.setenv("STRANDS_MESH_BACKEND", "memory")
     monkeypatch.setenv("BYPASS_TOOL_CONSENT", "true")
-    monkeypatch.setattr(zenoh_config, "DISCOVERY_S", 0.1)
+    monkeypatch.setattr(config, "DISCOVERY_S", 0.1)
     clear_peers()
     robot = Barista()
     with mesh_peer(robot, "bar-1", "robot"), mesh_peer(None, "looker", "tool") as looker:

@@ -323,7 +323,7 @@ class TestEnvironment:
 class TestMesh:
     def test_table_names_the_whole_mesh(self, write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
         from strands_robots.mesh.session import network  # noqa: PLC0415 - needs the settings
-        from strands_robots.mesh.transport.zenoh_config import Posture  # noqa: PLC0415 - as above
+        from strands_robots.mesh.transport.config import Posture  # noqa: PLC0415 - as above
 
         monkeypatch.setenv("ZENOH_CONNECT", "tcp/192.0.2.9:7447")
         monkeypatch.setenv("STRANDS_MESH_LOCAL_DEV", "true")
@@ -345,7 +345,7 @@ class TestMesh:
 
     def test_insecure_is_the_files_alone(self, write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
         from strands_robots.mesh.transport import TransportError  # noqa: PLC0415 - needs the settings
-        from strands_robots.mesh.transport.zenoh_config import Posture  # noqa: PLC0415 - as above
+        from strands_robots.mesh.transport.config import Posture  # noqa: PLC0415 - as above
 
         monkeypatch.setenv("STRANDS_MESH_LOCAL_DEV", "true")
         for insecure, refused in (("false", True), ("true", False)):

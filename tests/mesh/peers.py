@@ -10,11 +10,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from strands_robots.mesh.console_keys import INPUT, ConsoleSigner
 from strands_robots.mesh.core import Mesh, Parts
-from strands_robots.mesh.registry import PeerRegistry
+from strands_robots.mesh.session import PeerRegistry
 from strands_robots.mesh.transport.memory import MemoryBus, MemoryTransport
-from strands_robots.mesh.wire_identity import Identity
+from strands_robots.mesh.wire_identity import INPUT, ConsoleSigner, Identity
 from strands_robots.safety.persistence import LockoutStore
 from strands_robots.safety.plane import SafetyPlane
 

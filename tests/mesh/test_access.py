@@ -11,8 +11,8 @@ import pytest
 from fixtures.access_rules import CMD, DENY, NO_COMMANDS, NOBODY, OPEN, rules
 
 from strands_robots.mesh import keys, topics
-from strands_robots.mesh.transport import TransportError, access
-from strands_robots.mesh.transport.zenoh_config import Posture
+from strands_robots.mesh.transport import TransportError, config
+from strands_robots.mesh.transport.config import Posture
 
 
 @pytest.fixture
@@ -116,5 +116,5 @@ def test_rules_without_certificates_are_said_to_have_no_effect(
 
 
 def test_every_topic_that_moves_a_robot_is_looked_at() -> None:
-    assert {"strands/*/cmd", "strands/broadcast", "strands/*/input/*"} == set(access.MOVING)
-    assert all(topics.topic_of(pattern.replace("*", "x")) is not topics.OTHER for pattern in access.MOVING)
+    assert {"strands/*/cmd", "strands/broadcast", "strands/*/input/*"} == set(config.MOVING)
+    assert all(topics.topic_of(pattern.replace("*", "x")) is not topics.OTHER for pattern in config.MOVING)

@@ -8,6 +8,7 @@ import json
 import random
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.mesh.peers import Fleet
 
-from strands_robots.mesh import keys, registry, topics, wire
+from strands_robots.mesh import keys, session, topics, wire
 from strands_robots.mesh.input import InputReceiver
 from strands_robots.mesh.security import ValidationError, validate_command, validate_input_frame
 from strands_robots.mesh.transport.bridge import SeenCommands
@@ -52,9 +53,10 @@ def test_any_bytes_are_an_object_or_a_wire_error(data: bytes) -> None:
 @given(bodies)
 @settings(max_examples=120)
 def test_any_object_is_a_message_or_a_wire_error(body: dict[str, Any]) -> None:
-    for kind in (wire.Presence, wire.Request, wire.Reply, wire.EstopNotice, wire.ResumeRelay):
+    relayed = partial(wire.relay_of, session=body.get("source_zid"))
+    for parse in (wire.Presence.of, wire.Request.of, wire.Reply.of, wire.issuer_of, relayed):
         try:
-            kind.of(body)
+            parse(body)
         except wire.WireError:
             continue
 
@@ -104,7 +106,7 @@ def test_bytes_that_break_parsers_are_a_wire_error(data: bytes) -> None:
     except wire.WireError:
         return
     with pytest.raises(wire.WireError):
-        wire.EstopNotice.of({"peer_id": "x", **body})
+        wire.issuer_of({"peer_id": "x", **body})
 
 
 def test_a_message_too_large_is_an_error_to_its_sender() -> None:
@@ -269,7 +271,7 @@ def test_invented_peers_do_not_fill_the_registry_beyond_its_bound(
     stranger = peers.stranger()
     for number in range(1500):
         stranger.put(f"strands/p{number}/presence", {"robot_id": f"p{number}", "timestamp": peers.clock()})
-    assert len(console.peers) == registry.SESSION_PEERS_MAX
+    assert len(console.peers) == session.SESSION_PEERS_MAX
     assert console.get_peer("p0") is not None
     assert console.get_peer("p1499") is None
 

@@ -10,7 +10,7 @@ from fixtures.mesh_robots import Arm, World
 from fixtures.waiting import eventually
 from tests.mesh.peers import Fleet, received
 
-from strands_robots.mesh import core, late_peers, safety
+from strands_robots.mesh import core, estop_retry, safety
 from strands_robots.mesh.core import Mesh
 from strands_robots.mesh.resume_authority import keygen, load_signing_key
 from strands_robots.safety.identity import EnrolledKeys, robot_identity
@@ -22,8 +22,8 @@ PASSPHRASE = "Correct-Horse-7-Battery"
 def brief(peers: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
     """Collect answers for a moment only, and look for late peers at once."""
     monkeypatch.setattr(safety, "COLLECT_S", 0.2)
-    monkeypatch.setattr(late_peers, "AGAIN_S", 0.1)
-    monkeypatch.setattr(late_peers, "SPREAD_S", 0.0)
+    monkeypatch.setattr(estop_retry, "AGAIN_S", 0.1)
+    monkeypatch.setattr(estop_retry, "SPREAD_S", 0.0)
     monkeypatch.setattr(core, "LATE_HZ", 20.0)
 
 
@@ -99,9 +99,9 @@ def test_peer_that_goes_on_reporting_no_lockout_is_given_up(peers: Fleet) -> Non
     envelopes = received(peers, "strands/safety/estop")
     peers.clock.pass_(2)
     ghost.put("strands/ghost/presence", {**heartbeat, "timestamp": peers.clock()})
-    eventually(lambda: len(envelopes) == late_peers.TRIES_MAX)
+    eventually(lambda: len(envelopes) == estop_retry.TRIES_MAX)
     first._safety.late.look()
-    assert len(envelopes) == late_peers.TRIES_MAX
+    assert len(envelopes) == estop_retry.TRIES_MAX
 
 
 def test_another_console_resumes_what_a_console_that_is_gone_has_stopped(peers: Fleet, key: Any) -> None:

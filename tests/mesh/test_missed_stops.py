@@ -14,7 +14,7 @@ from fixtures.mesh_robots import Arm
 from fixtures.waiting import eventually
 from tests.mesh.peers import Fleet, received
 
-from strands_robots.mesh import late_peers, missed, safety
+from strands_robots.mesh import estop_retry, safety, stop_link
 from strands_robots.mesh.core import Mesh
 from strands_robots.safety import ed25519
 from strands_robots.safety.missed_stops import LISTEN_S
@@ -28,8 +28,8 @@ from strands_robots.safety.statements import Purpose
 def brief(peers: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
     """Collect answers for a moment only, and look at links often."""
     monkeypatch.setattr(safety, "COLLECT_S", 0.2)
-    monkeypatch.setattr(missed, "LOOK_HZ", 50.0)
-    monkeypatch.setattr(late_peers, "SPREAD_S", 0.0)
+    monkeypatch.setattr(stop_link, "LOOK_HZ", 50.0)
+    monkeypatch.setattr(estop_retry, "SPREAD_S", 0.0)
 
 
 @pytest.fixture

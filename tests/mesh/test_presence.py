@@ -13,11 +13,10 @@ from fixtures.waiting import eventually
 from tests.mesh.peers import Clock, Fleet
 
 from strands_robots.mesh import presence, topics
-from strands_robots.mesh.context import Context
 from strands_robots.mesh.core import Mesh, get_local_robots, init_mesh
 from strands_robots.mesh.presence import PresenceListener, PresencePublisher
-from strands_robots.mesh.registry import PeerRegistry
-from strands_robots.mesh.throttle import AuditThrottle
+from strands_robots.mesh.scheduler import AuditThrottle
+from strands_robots.mesh.session import Context, PeerRegistry
 from strands_robots.mesh.transport import TransportError
 from strands_robots.mesh.transport import bridge as bridges
 from strands_robots.mesh.transport.bridge import BridgeTransport

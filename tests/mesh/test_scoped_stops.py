@@ -10,7 +10,7 @@ from fixtures.mesh_robots import Arm, World
 from fixtures.waiting import eventually
 from tests.mesh.peers import Fleet, received
 
-from strands_robots.mesh import estop_retry, safety, scoped_stops
+from strands_robots.mesh import estop_retry, safety
 from strands_robots.mesh.core import Mesh
 from strands_robots.safety import ed25519
 from strands_robots.safety.orders import REQUIRE_SIGNED, new_epoch
@@ -21,7 +21,7 @@ from strands_robots.safety.statements import Purpose
 @pytest.fixture(autouse=True)
 def standing_console(monkeypatch: pytest.MonkeyPatch) -> None:
     """The clock of these peers stands still, so that none would ever have been there for long."""
-    monkeypatch.setattr(scoped_stops, "DISCOVERY_S", 0.0)
+    monkeypatch.setattr(estop_retry, "DISCOVERY_S", 0.0)
 
 
 def join(peers: Fleet, name: str, cell: str = "") -> tuple[Arm, Mesh]:
@@ -157,14 +157,15 @@ def test_scope_that_is_not_proven_is_every_robot_where_signatures_are_demanded(
     monkeypatch.setenv(REQUIRE_SIGNED, "true")
     console = peers.join(None, "console")
     _, mesh = join(peers, "arm-1", "cell-1")
-    adapter = mesh._adapter
+    rules = mesh._adapter.rules
     body = console._safety._signed(
         {"peer_id": "console", "estop_id": new_epoch(), "scope": {"cell": "cell-2"}}, Purpose.EMERGENCY_STOP, key
     )
-    assert adapter.stop_refusal("console", body) is None
-    assert adapter.scope("console", body) == Scope(cell="cell-2")
-    assert adapter.scope("console", {**body, "scope_sig": ""}) == EVERY_ROBOT
-    assert adapter.scope("console", {**body, "scope": {"cell": "cell-3"}}) == EVERY_ROBOT
+    assert rules.source_refusal("console") is None
+    assert rules.signature_refusal("console", body, Purpose.EMERGENCY_STOP) is None
+    assert rules.scope("console", body) == Scope(cell="cell-2")
+    assert rules.scope("console", {**body, "scope_sig": ""}) == EVERY_ROBOT
+    assert rules.scope("console", {**body, "scope": {"cell": "cell-3"}}) == EVERY_ROBOT
     console.emergency_stop(key, scope=ONLY_ARM_1)
     assert locked(peers) == {"arm-1"}
 

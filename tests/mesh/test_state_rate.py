@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from strands_robots.mesh.state_rate import ACTIVE_S, StateRate
+from strands_robots.mesh.state import ACTIVE_S, StateRate
 from strands_robots.safety.gate import MotionGate
 
 STILL: dict[str, Any] = {"joints": {"pan": 0.5}, "task": {"status": "idle"}}

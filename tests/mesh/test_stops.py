@@ -12,7 +12,7 @@ from fixtures.waiting import eventually
 from tests.mesh.peers import Fleet
 
 from strands_robots.envelope import Envelope, success
-from strands_robots.mesh import rpc, teleop
+from strands_robots.mesh import input_receiver, rpc
 from strands_robots.mesh.input_receiver import InputReceiver
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.stops import CALLER_MAX
@@ -36,7 +36,7 @@ class Hanging(Arm):
 
 def test_a_stop_does_not_wait_for_a_stream_whose_frame_hangs(peers: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("BYPASS_TOOL_CONSENT", "true")
-    monkeypatch.setattr(teleop, "JOIN_S", 60.0)
+    monkeypatch.setattr(input_receiver, "JOIN_S", 60.0)
     arm = Hanging()
     peers.join(arm, "arm-1")
     console, leader = peers.join(None, "console"), peers.join(None, "lead")
@@ -44,7 +44,7 @@ def test_a_stop_does_not_wait_for_a_stream_whose_frame_hangs(peers: Fleet, monke
     assert opened["result"]["status"] == "success"
     frame = {"peer_id": "lead", "device": "leader", "method": "arm", "t": peers.clock(), "seq": 1}
     leader.publish(
-        "strands/lead/input/leader", leader.sign_input({**frame, "action": {"shoulder.pos": 1.0}, "events": None})
+        "strands/lead/input/leader", leader.inputs.sign({**frame, "action": {"shoulder.pos": 1.0}, "events": None})
     )
     assert arm.inside.wait(20)
     answers: list[Any] = []
@@ -60,7 +60,7 @@ def test_a_stop_is_answered_while_the_frames_of_every_stream_hang(
     peers: Fleet, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setenv("BYPASS_TOOL_CONSENT", "true")
-    monkeypatch.setattr(teleop, "JOIN_S", 0.1)
+    monkeypatch.setattr(input_receiver, "JOIN_S", 0.1)
     waited, join = list[str](), InputReceiver.join
 
     def noting(receiver: InputReceiver, timeout: float) -> bool:
@@ -77,7 +77,7 @@ def test_a_stop_is_answered_while_the_frames_of_every_stream_hang(
         frame = {"peer_id": "lead", "device": device, "method": "arm", "t": peers.clock(), "seq": 1}
         leader.publish(
             f"strands/lead/input/{device}",
-            leader.sign_input({**frame, "action": {"shoulder.pos": 1.0}, "events": None}),
+            leader.inputs.sign({**frame, "action": {"shoulder.pos": 1.0}, "events": None}),
         )
         assert arm.inside.wait(20)
         arm.inside.clear()
@@ -238,7 +238,7 @@ def test_a_frame_that_waits_for_the_bus_is_refused_after_a_stop(peers: Fleet, mo
     console.send("arm-1", {"action": "teleop_receive", "source_peer_id": "lead"}, timeout=20)
     frame = {"peer_id": "lead", "device": "leader", "method": "arm", "t": peers.clock(), "seq": 1}
     leader.publish(
-        "strands/lead/input/leader", leader.sign_input({**frame, "action": {"shoulder.pos": 1.0}, "events": None})
+        "strands/lead/input/leader", leader.inputs.sign({**frame, "action": {"shoulder.pos": 1.0}, "events": None})
     )
     assert arm.inside.wait(20)
     asking = threading.Thread(target=lambda: console.send("arm-1", {"action": "stop"}, timeout=20))

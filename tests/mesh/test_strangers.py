@@ -11,11 +11,11 @@ from fixtures.mesh_robots import Arm
 from fixtures.waiting import eventually
 from tests.mesh.peers import Fleet, received, signed
 
-from strands_robots.mesh import commands, registry, safety
-from strands_robots.mesh.console_keys import INPUT, MOTION, ConsoleSigner
+from strands_robots.mesh import commands, safety, session
 from strands_robots.mesh.core import Mesh
 from strands_robots.mesh.input import InputReceiver
 from strands_robots.mesh.transport import Sample
+from strands_robots.mesh.wire_identity import INPUT, MOTION, ConsoleSigner
 
 START = {"action": "start", "instruction": "wave", "policy_provider": "mock", "duration": 0.5}
 TRIES = 1000
@@ -122,9 +122,9 @@ def test_captured_frame_does_not_count_again_after_a_restart(peers: Fleet) -> No
     peers.clock.pass_(1.0)
     peers.meshes[0].close()
     mesh = peers.join(arm, "arm-1")
-    assert mesh.input_refusal(captured) == "it was sent before this peer started, by its sender's clock"
+    assert mesh.inputs.refusal(captured) == "it was sent before this peer started, by its sender's clock"
     later = {**frame, "t": peers.clock(), "action": {"shoulder.pos": 1.0}}
-    assert mesh.input_refusal(signed(peers, later)) is None
+    assert mesh.inputs.refusal(signed(peers, later)) is None
 
 
 def test_flood_of_unsigned_commands_lets_no_captured_one_count_again(
@@ -177,10 +177,10 @@ def test_flood_of_names_evicts_no_living_peer_and_a_frozen_robot_is_named(
     monkeypatch.setattr(safety, "COLLECT_S", 0.2)
     _, console = fleet_of(peers)
     peers.bus.partition(peers.transports["arm-1"])
-    for session in range(20):
+    for flood in range(20):
         stranger = peers.stranger()
         for number in range(100):
-            name = f"ghost-{session}-{number}"
+            name = f"ghost-{flood}-{number}"
             stranger.put(f"strands/{name}/presence", {"robot_id": name, "timestamp": peers.clock()})
     assert len(console.peers) <= 1024
     assert console.peer_wire_zid("arm-1") == peers.transports["arm-1"].session_id
@@ -191,7 +191,7 @@ def test_flood_of_names_evicts_no_living_peer_and_a_frozen_robot_is_named(
 
 def test_silent_row_makes_place_for_a_newcomer() -> None:
     now = [0.0]
-    table = registry.PeerRegistry(clock=lambda: now[0], most=lambda: 2)
+    table = session.PeerRegistry(clock=lambda: now[0], most=lambda: 2)
     assert table.update("a", "robot", "", {}) and table.update("b", "robot", "", {})
     assert not table.update("c", "robot", "", {})
     now[0] = 20.0

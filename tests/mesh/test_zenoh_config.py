@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from strands_robots.mesh import keys, topics
-from strands_robots.mesh.transport import TransportError, zenoh_config
-from strands_robots.mesh.transport.zenoh_config import Posture
+from strands_robots.mesh.transport import TransportError, config
+from strands_robots.mesh.transport.config import Posture
 
 
 @pytest.fixture(autouse=True)
@@ -21,12 +21,12 @@ def test_without_any_setting_the_mesh_stays_on_loopback_without_certificates() -
     posture = Posture.from_settings()
     assert posture.hub == "tcp/127.0.0.1:7447"
     assert posture.credentials is None
-    config = zenoh_config.hub(posture)
-    assert config["scouting"]["multicast"]["enabled"] is False
-    assert config["namespace"] == "strands"
-    assert config["adminspace"]["enabled"] is False
-    assert config["transport"]["unicast"]["max_sessions"] == 256
-    limits = {key: rule["size_limit"] for rule in config["low_pass_filter"] for key in rule["key_exprs"]}
+    stated = config.hub(posture)
+    assert stated["scouting"]["multicast"]["enabled"] is False
+    assert stated["namespace"] == "strands"
+    assert stated["adminspace"]["enabled"] is False
+    assert stated["transport"]["unicast"]["max_sessions"] == 512
+    limits = {key: rule["size_limit"] for rule in stated["low_pass_filter"] for key in rule["key_exprs"]}
     assert limits["strands/strands/*/cmd"] == 16 * 1024
     assert limits["strands/strands/safety/estop"] == 4 * 1024
 
@@ -73,10 +73,10 @@ def test_auth_mode_none_needs_its_opt_in(monkeypatch: pytest.MonkeyPatch) -> Non
     ],
 )
 def test_loopback_is_recognised_by_the_address(endpoint: str, inside: bool) -> None:
-    assert zenoh_config.is_loopback(endpoint) is inside
+    assert config.is_loopback(endpoint) is inside
 
 
-def use(monkeypatch: pytest.MonkeyPatch, issued: zenoh_config.TlsCredentials) -> None:
+def use(monkeypatch: pytest.MonkeyPatch, issued: config.TlsCredentials) -> None:
     for name, value in issued.settings().items():
         monkeypatch.setenv(name, value)
 
@@ -86,11 +86,11 @@ def test_certificates_bring_mutual_tls_and_access_control(monkeypatch: pytest.Mo
     use(monkeypatch, keys.issue(tmp_path, "arm-1", ["192.168.1.2", "arm.example"]))
     posture = Posture.from_settings()
     assert posture.hub == "tls/127.0.0.1:7447"
-    config = zenoh_config.hub(posture)
-    assert config["transport"]["link"]["protocols"] == ["tls"]
-    tls = config["transport"]["link"]["tls"]
+    stated = config.hub(posture)
+    assert stated["transport"]["link"]["protocols"] == ["tls"]
+    tls = stated["transport"]["link"]["tls"]
     assert tls["enable_mtls"] and tls["verify_name_on_connect"] and tls["close_link_on_expiration"]
-    assert config["access_control"]["default_permission"] == "deny"
+    assert stated["access_control"]["default_permission"] == "deny"
 
 
 def test_files_that_others_may_read_or_that_are_links_are_refused(
@@ -120,12 +120,12 @@ def test_access_rules_that_allow_by_default_need_the_opt_in(monkeypatch: pytest.
     monkeypatch.setenv("STRANDS_MESH_ACL_FILE", str(rules))
     rules.write_text("{enabled: true, /* hm */ default_permission: 'allow', rules: [], subjects: [], policies: []}")
     with pytest.raises(TransportError, match="STRANDS_MESH_ACCEPT_PERMISSIVE_ACL"):
-        zenoh_config.hub(Posture.from_settings())
+        config.hub(Posture.from_settings())
     monkeypatch.setenv("STRANDS_MESH_ACCEPT_PERMISSIVE_ACL", "true")
-    assert zenoh_config.hub(Posture.from_settings())["access_control"]["default_permission"] == "allow"
+    assert config.hub(Posture.from_settings())["access_control"]["default_permission"] == "allow"
     rules.write_text("nonsense")
     with pytest.raises(TransportError, match="no access control"):
-        zenoh_config.hub(Posture.from_settings())
+        config.hub(Posture.from_settings())
     rules.write_text(" " * (257 * 1024))
     with pytest.raises(TransportError, match="256 KiB"):
         Posture.from_settings()
@@ -163,10 +163,10 @@ def test_every_topic_has_a_size_and_only_telemetry_is_downsampled() -> None:
 
 def test_stated_endpoints_route_for_others_and_are_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ZENOH_CONNECT", "tcp/127.0.0.1:7447")
-    config = zenoh_config.explicit(Posture.from_settings())
-    assert config["mode"] == "router"
-    assert config["connect"]["exit_on_failure"] is False
-    assert config["connect"]["timeout_ms"] == -1
-    assert config["connect"]["retry"] == {"period_init_ms": 1000, "period_max_ms": 8000, "period_increase_factor": 2}
+    stated = config.explicit(Posture.from_settings())
+    assert stated["mode"] == "router"
+    assert stated["connect"]["exit_on_failure"] is False
+    assert stated["connect"]["timeout_ms"] == -1
+    assert stated["connect"]["retry"] == {"period_init_ms": 1000, "period_max_ms": 8000, "period_increase_factor": 2}
     for scout in ("gossip", "multicast"):
-        assert config["scouting"][scout]["autoconnect"]["router"] == ["router", "peer"]
+        assert stated["scouting"][scout]["autoconnect"]["router"] == ["router", "peer"]

@@ -16,7 +16,6 @@ from strands_robots.drivers.reachy import ReachyDriver
 from strands_robots.drivers.ros.ros_bridge import RosBridgedRobot
 from strands_robots.envelope import success
 from strands_robots.hardware import HardwareRobot
-from strands_robots.mesh.children import OneRobot
 from strands_robots.ros.gate import CommandGate
 from strands_robots.ros.memory import MemoryLink
 from strands_robots.safety.authorization import Leave
@@ -26,6 +25,7 @@ from strands_robots.serving.peer_verbs import PEER_VERBS
 from strands_robots.serving.pipeline import Command, Pipeline, Result
 from strands_robots.serving.reachy_verbs import REACHY_VERBS
 from strands_robots.serving.robot_verbs import ARM_VERBS, NAVIGATING_BASE_VERBS, WORLD_VERBS
+from strands_robots.serving.stops import OneRobot
 from strands_robots.serving.verbs import Verb
 
 

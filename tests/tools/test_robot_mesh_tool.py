@@ -24,7 +24,7 @@ from strands_robots.fleet.mesh.network import MeshNetwork
 from strands_robots.fleet.networks import Networks
 from strands_robots.mesh import Mesh, init_mesh, safety
 from strands_robots.mesh.session import clear_peers
-from strands_robots.mesh.transport import zenoh_config
+from strands_robots.mesh.transport import config
 from strands_robots.safety.plane import plane
 from strands_robots.safety.scope import EVERY_ROBOT
 from strands_robots.tools import robot_mesh
@@ -188,7 +188,7 @@ def test_device_connect_is_left_out_where_the_setting_says_so(
 def on_the_mesh(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setenv("STRANDS_ROBOT_MESH_DC", "off")
     monkeypatch.setenv("STRANDS_MESH_BACKEND", "memory")
-    monkeypatch.setattr(zenoh_config, "DISCOVERY_S", 0.1)
+    monkeypatch.setattr(config, "DISCOVERY_S", 0.1)
     monkeypatch.setattr(MODULE, "STOP_S", 20.0)
     monkeypatch.setattr(safety, "COLLECT_S", 20.0)
     clear_peers()

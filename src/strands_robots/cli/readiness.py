@@ -116,7 +116,7 @@ def mesh_port_problem(*, answers: bool = True) -> str:
     Args:
         answers: a mesh answers there. A Zenoh router in Python is then not told from a robot process.
     """
-    from strands_robots.mesh.transport.zenoh_config import stated_endpoints  # noqa: PLC0415 - loaded when it is used
+    from strands_robots.mesh.transport.config import stated_endpoints  # noqa: PLC0415 - loaded when it is used
 
     if any(stated_endpoints()) or settings.raw("STRANDS_MESH_BACKEND").lower() not in ("", "zenoh", "bridge"):
         return ""

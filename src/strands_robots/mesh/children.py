@@ -13,127 +13,28 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
-from strands_robots.contract import Observer, Unsubscribe, WorldRobot, for_request
-from strands_robots.envelope import Envelope, error
+from strands_robots.contract import WorldRobot
+from strands_robots.envelope import error
 from strands_robots.mesh import topics
 from strands_robots.mesh.commands import CommandReceiver, SenderCheck, execute_on
-from strands_robots.mesh.context import Context
+from strands_robots.mesh.input_receiver import TeleopReceivers
 from strands_robots.mesh.presence import DESCRIBE_S, PresencePublisher
 from strands_robots.mesh.safety import status_of
-from strands_robots.mesh.teleop import TeleopReceivers
-from strands_robots.mesh.throttle import AuditThrottle
+from strands_robots.mesh.scheduler import AuditThrottle
+from strands_robots.mesh.session import Context
 from strands_robots.mesh.transport import Declaration, Sample, TransportError, undeclare
-from strands_robots.recording.cameras import has_cameras
 from strands_robots.safety.gate import MotionRequest
 from strands_robots.safety.identity import SigningIdentity
-from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.arm_verbs import ARM_MOTION_VERBS, PICTURE_VERBS
 from strands_robots.serving.peer_verbs import PEER_VERBS, TELEOP_VERBS, description_of
 from strands_robots.serving.pipeline import Own, Pipeline
-from strands_robots.serving.stops import RobotStop
+from strands_robots.serving.stops import OneRobot
 from strands_robots.serving.verbs import Arguments, Verb
 from strands_robots.utils import ValidationError, identifier
 
 logger = logging.getLogger(__name__)
 
 CHILDREN_MAX = 64
-
-
-class OneRobot:
-    """One robot of a world, seen as a world that holds nothing else."""
-
-    whole = False
-    """Physics is stepped and reset by the world alone."""
-
-    def __init__(self, world: WorldRobot, name: str) -> None:
-        self._world = world
-        self.tool_name_str = name
-        self.gate = world.gate
-
-    @property
-    def has_cameras(self) -> bool:
-        """True where the world has cameras."""
-        return has_cameras(self._world)
-
-    def arm_verbs(self, robot_name: str = "") -> frozenset[str]:
-        """Return the verbs of an arm that the world carries out for it."""
-        own = getattr(self._world, "arm_verbs", None)
-        verbs: frozenset[str] = own(self.tool_name_str) if callable(own) else frozenset()
-        return verbs
-
-    def list_robots(self) -> list[str]:
-        return [name for name in self._world.list_robots() if name == self.tool_name_str]
-
-    def start_policy(
-        self,
-        robot_name: str,
-        instruction: str,
-        policy_provider: str = "mock",
-        duration: float = 30.0,
-        *,
-        request: MotionRequest | None = None,
-        **policy: Any,
-    ) -> Envelope:
-        policy |= {"policy_provider": policy_provider, "duration": duration}
-        return for_request(request, self._world.start_policy)(robot_name, instruction, **policy)
-
-    def stop_policy(self, robot_name: str) -> Envelope:
-        return self._world.stop_policy(robot_name)
-
-    def outcomes(self) -> dict[str, Any]:
-        """Return how its last policy or motion ended, by its name."""
-        ended: dict[str, Any] = getattr(self._world, "outcomes", dict)()
-        return {name: ended[name] for name in ended if name == self.tool_name_str}
-
-    def list_policies_running(self) -> list[dict[str, Any]]:
-        return [row for row in self._world.list_policies_running() if row.get("robot") == self.tool_name_str]
-
-    def get_state(self) -> Envelope:
-        return self._own(self._world.get_state())
-
-    def get_features(self) -> Envelope:
-        return self._own(self._world.get_features())
-
-    def step(self, n: int = 1) -> Envelope:
-        return error(f"step: {self.tool_name_str} is one robot of a world; ask the world.")
-
-    def reset(self) -> Envelope:
-        return error(f"reset: {self.tool_name_str} is one robot of a world; ask the world.")
-
-    def subscribe(self, observer: Observer) -> Unsubscribe:
-        return self._world.subscribe(observer)
-
-    def halt(self, reason: str = "") -> StopVerdict:
-        """Stop this robot alone."""
-        stop = self.stop_target()
-        return StopVerdict() if stop is None else stop.halt(reason)
-
-    def stop_target(self, name: str = "") -> RobotStop | None:
-        """Return the stop of this robot; None when it left its world.
-
-        Raises:
-            ValidationError: ``name`` is another robot's.
-        """
-        if name not in ("", self.tool_name_str):
-            raise ValidationError(f"there is no robot of this name; the robots here are {self.tool_name_str}")
-        return RobotStop(self._world, self.tool_name_str) if self.list_robots() else None
-
-    def facts(self) -> dict[str, Any]:
-        """Return its fields of presence."""
-        running = self.list_policies_running()
-        told: dict[str, Any] = {
-            "tool_name": self.tool_name_str,
-            "task_status": "running" if running else "idle",
-            "world": True,
-            "sim_robots": [self.tool_name_str],
-        }
-        return told | ({"instruction": str(running[0].get("instruction", ""))} if running else {})
-
-    def _own(self, told: Envelope) -> Envelope:
-        robots = told.get("robots")
-        if not isinstance(robots, Mapping):
-            return told
-        return {**told, "robots": {name: robots[name] for name in robots if name == self.tool_name_str}}
 
 
 @dataclass(slots=True)

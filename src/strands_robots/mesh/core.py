@@ -7,40 +7,30 @@ import re
 import secrets
 import threading
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
-from itertools import count
 from typing import Any
 
 from strands_robots import settings
 from strands_robots._mesh_switch import mesh_env_request
 from strands_robots.contract import body_of, holds_robots
-from strands_robots.mesh import session, topics, wire
+from strands_robots.mesh import session, topics
 from strands_robots.mesh.children import Children
 from strands_robots.mesh.commands import CommandReceiver, SenderCheck, execute_on, pong
-from strands_robots.mesh.console_keys import INPUT, ConsoleSigner, ConsoleTrust
-from strands_robots.mesh.context import Context
-from strands_robots.mesh.executor import BoundedExecutor
-from strands_robots.mesh.hearing import Hearing
-from strands_robots.mesh.input_receiver import InputReceiver
-from strands_robots.mesh.missed import MeshMissedStops
-from strands_robots.mesh.older_peers import Pacer
+from strands_robots.mesh.input_receiver import InputReceiver, InputSide, TeleopReceivers, join
 from strands_robots.mesh.presence import DESCRIBE_S, PresencePublisher
-from strands_robots.mesh.registry import PeerRegistry
 from strands_robots.mesh.rpc import Requester
 from strands_robots.mesh.safety import FleetSafety, OnAnswers, status_of
 from strands_robots.mesh.safety_adapter import SafetyAdapter
-from strands_robots.mesh.scheduler import Scheduler
+from strands_robots.mesh.scheduler import AuditSink, AuditThrottle, BoundedExecutor, Scheduler
 from strands_robots.mesh.security import validate_peer_id
 from strands_robots.mesh.sensors import CameraPublisher, SensorLoopsMixin, SensorPublisher
-from strands_robots.mesh.state import Description, StateReader
-from strands_robots.mesh.state_rate import IDLE_HZ, STATE_RATES, StateRate
-from strands_robots.mesh.stream import StepPublisher
-from strands_robots.mesh.subscriptions import DataCallback, SampleCallback, Subscriptions
-from strands_robots.mesh.teleop import TeleopReceivers, join
-from strands_robots.mesh.throttle import AuditSink, AuditThrottle
+from strands_robots.mesh.session import Context, Pacer, PeerRegistry
+from strands_robots.mesh.state import IDLE_HZ, STATE_RATES, Description, StateRate, StateReader
+from strands_robots.mesh.stop_link import Hearing
+from strands_robots.mesh.stream import DataCallback, SampleCallback, StepPublisher, Subscriptions
 from strands_robots.mesh.transport import Declaration, Sample, Transport
-from strands_robots.mesh.wire_identity import Identity, identity_of
+from strands_robots.mesh.wire_identity import ConsoleSigner, ConsoleTrust, Identity, identity_of
 from strands_robots.recording.cameras import frames_of
 from strands_robots.safety.gate import MotionGate
 from strands_robots.safety.persistence import simulation_key
@@ -120,8 +110,8 @@ class Mesh(SensorLoopsMixin):
         self._own_verbs = {} if self.robot is None else own_verbs(self.robot)
         self._parts = parts or Parts()
         self._lifecycle_lock = threading.Lock()
-        self._frames: dict[str, count[int]] = {}
-        self._newest_input: dict[tuple[str, str], tuple[float, float]] = {}
+        self._hardware = self.robot is not None and not holds_robots(self.robot) and peer_type != "sim"
+        self.inputs = InputSide(hardware=self._hardware)
         key = _safety_key(self.robot, self.peer_id, keep=self._parts.keep)
         # A locked robot that leaves the mesh stays on the safety plane: to leave and join again must not unlock it.
         self._adapter = SafetyAdapter(self.peer_id, self.robot, key, self._parts.plane, self._parts.cell)
@@ -130,15 +120,14 @@ class Mesh(SensorLoopsMixin):
     def _compose(self) -> None:
         """Make the parts of one stay on the mesh."""
         parts, robot, peer = self._parts, self.robot, self.peer_id
-        self._hardware = hardware = robot is not None and not holds_robots(robot) and self.peer_type != "sim"
+        hardware = self._hardware
         self._context = context = Context(
             peer, parts.registry, parts.recorder(peer), Identity(), parts.clock, parts.monotonic
         )
         context.pacer, context.has_robot = parts.pacer, robot is not None
         context.console, context.consoles = ConsoleSigner(parts.clock), ConsoleTrust(parts.clock)
+        self.inputs.begin(context)
         self._handles: list[Declaration] = []
-        self._missed: MeshMissedStops | None = None
-        self._inputs: dict[str, dict[str, Any]] = {}
         self._unwatch: Callable[[], None] = lambda: None
         self._scheduler = Scheduler(peer)
         self._sensors = SensorPublisher(context, self._scheduler)
@@ -149,7 +138,7 @@ class Mesh(SensorLoopsMixin):
         self._presence = PresencePublisher(context, self.peer_type, self._describe, self._announced)
         self._state = StateReader(peer, robot, parts.clock)
         self._steps = StepPublisher(context, robot, settings.number("STRANDS_MESH_STREAM_HZ"))
-        self._delivery = BoundedExecutor(f"{peer}-delivery", 1, DELIVERIES_MAX, drop_oldest=True)
+        self._delivery = BoundedExecutor(f"{peer}-delivery", DELIVERIES_MAX)
         self._subscriptions = Subscriptions(self._delivery)
         own: dict[str, Own] = {
             "teleop_status": self._teleop.status,
@@ -212,8 +201,8 @@ class Mesh(SensorLoopsMixin):
     def _describe(self) -> dict[str, Any]:
         """Return the fields of presence: the robot's own, and the streams of this peer."""
         fields = self._description.read()
-        if self._inputs:
-            fields["inputs"] = list(self._inputs.values())
+        if inputs := self.inputs.announced():
+            fields["inputs"] = inputs
         return {**fields, "topics": published} if (published := self._sensors.topics()) else fields
 
     # Life.
@@ -266,21 +255,17 @@ class Mesh(SensorLoopsMixin):
         context, peer = self._context, self.peer_id
         context.transport = transport
         context.identity = (self._parts.identity or identity_of)(transport)
+        # The resumes first: one that the broker kept tells which kept e-stop is over.
+        self._handles.append(transport.declare_subscriber(topics.resume(), self._safety.on_resume))
+        self._safety.join()
         for key, receive in (
-            # The resumes first: one that the broker kept tells which kept e-stop is over.
-            (topics.resume(), self._safety.on_resume),
-            (topics.estop(), self._safety.on_estop),
             (topics.command(peer), self._commands.on_command),
             (topics.broadcast(), self._commands.on_command),
             (topics.responses(peer), self._requester.on_response),
             (topics.check_in_answer("*"), self._safety.on_check_in_answer),
         ):
             self._handles.append(transport.declare_subscriber(key, receive))
-        self._missed = MeshMissedStops.joined_by(context, self._adapter)
         if self.robot is not None:
-            if self._adapter.needs_check_in:
-                controllers = topics.check_in("*")
-                self._handles.append(transport.declare_subscriber(controllers, self._safety.on_check_in))
             self.robot.gate.attach(self._hearing)
             self._hearing.look()
         self._presence.start()
@@ -322,8 +307,7 @@ class Mesh(SensorLoopsMixin):
         if dropped:
             logger.info("%s left the mesh and dropped %d subscriptions.", self.peer_id, dropped)
         self._presence.stop()
-        if self._missed is not None:
-            self._missed.left_by(self._context, self._adapter)
+        self._safety.leave()
         if self.children is not None:
             self.children.close()
         for handle in self._handles:
@@ -520,52 +504,6 @@ class Mesh(SensorLoopsMixin):
     def on_stream(self, peer_id: str, callback: DataCallback | None = None) -> str | None:
         """Hear another peer's policy steps."""
         return self.subscribe(topics.stream(peer_id), callback)
-
-    def announce_input(self, device: str, method: str | None, hz: float) -> None:
-        """Name an input stream in the presence, or remove it without ``method``."""
-        if method is None:
-            self._inputs.pop(device, None)
-        else:
-            self._inputs[device] = {"device": device, "method": method, "hz": hz}
-
-    def next_input(self, device: str) -> int:
-        """The number of the next frame of an input stream. It rises for as long as this peer lives, so that a follower
-        does not take a leader that began again for one of its own earlier frames."""
-        return next(self._frames.setdefault(device, count()))
-
-    def sign_input(self, frame: dict[str, Any]) -> dict[str, Any]:
-        """Return an input frame signed by our certificate, else by this user's console."""
-        identity = self._context.identity
-        return identity.sign(frame) if identity.signs else self._context.console.sign(frame, INPUT)
-
-    def input_refusal(self, frame: Mapping[str, Any]) -> str | None:
-        """Return the reason why a frame may not move this peer's robot, or None.
-
-        Only real hardware asks for a signature, and takes each signed frame once, also on a stream that was reopened.
-        """
-        if not self._hardware:
-            return None
-        identity, source = self._context.identity, str(frame.get("peer_id"))
-        certified = identity.refusal(frame, source) if identity.checks else "no certificate is checked here"
-        why = certified and (certified if identity.required else self._context.consoles.refusal(frame, INPUT))
-        if why is not None:
-            return why
-        stream, sequence = (source, str(frame.get("device"))), wire.finite(frame.get("seq")) or 0.0
-        newest = (wire.finite(frame.get("t")) or 0.0, sequence)
-        if self._context.predates(newest[0]):
-            return "it was sent before this peer started, by its sender's clock"
-        if newest <= self._newest_input.get(stream, (0.0, -1.0)):
-            return "it is no newer than the last one"
-        self._newest_input[stream] = newest
-        return None
-
-    def record(self, event: str, about: str, **payload: Any) -> None:
-        """Record an event about a peer in the audit log."""
-        self._context.audit(event, about, **payload)
-
-    def now(self) -> float:
-        """Wall-clock seconds, as stated on the wire."""
-        return self._context.clock()
 
     # Safety.
 

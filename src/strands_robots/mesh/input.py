@@ -11,18 +11,15 @@ import math
 import threading
 import time
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from strands_robots.mesh import topics
-from strands_robots.mesh.input_receiver import InputReceiver
+from strands_robots.mesh.input_receiver import InputMesh, InputReceiver
 from strands_robots.mesh.security import validate_mesh_identifier
 from strands_robots.mesh.transport import TransportError
 from strands_robots.mesh.wire import WireError
 from strands_robots.teleoperators.leader import teleop_events
 from strands_robots.utils import ValidationError, number, shown, teleoperator_contract_error, text
-
-if TYPE_CHECKING:
-    from strands_robots.mesh.core import Mesh
 
 __all__ = ["INPUT_HZ_DEFAULT", "InputPublisher", "InputReceiver", "MeshInputSink"]
 
@@ -37,7 +34,7 @@ LOGGED_ERRORS = 5
 class MeshInputSink:
     """Publishes the input frames of ``teleoperate(publish=True)``."""
 
-    def __init__(self, mesh: Mesh) -> None:
+    def __init__(self, mesh: InputMesh) -> None:
         self._mesh = mesh
 
     def publish(self, device: str, method: str, action: Mapping[str, float], events: Mapping[str, Any] | None) -> None:
@@ -46,12 +43,12 @@ class MeshInputSink:
             "peer_id": self._mesh.peer_id,
             "device": device,
             "method": method,
-            "t": self._mesh.now(),
-            "seq": self._mesh.next_input(device),
+            "t": self._mesh.inputs.now(),
+            "seq": self._mesh.inputs.next_number(device),
             "action": dict(action),
             "events": None if events is None else {str(key): bool(value) for key, value in events.items()},
         }
-        self._mesh.publish(topics.input_stream(self._mesh.peer_id, device), self._mesh.sign_input(frame))
+        self._mesh.publish(topics.input_stream(self._mesh.peer_id, device), self._mesh.inputs.sign(frame))
 
 
 class InputPublisher:
@@ -64,7 +61,7 @@ class InputPublisher:
 
     def __init__(
         self,
-        mesh: Mesh,
+        mesh: InputMesh,
         teleoperator: Any,
         device_name: str = "leader",
         method: str = "arm",
@@ -132,13 +129,13 @@ class InputPublisher:
             target=self._publish_loop, args=(self._stopping,), name=f"mesh-input-{self._device}", daemon=True
         )
         self._thread.start()
-        self._mesh.announce_input(self._device, self._method, self._hz)
+        self._mesh.inputs.announce(self._device, self._method, self._hz)
 
     def stop(self) -> dict[str, Any]:
         """Stop, wait at most 2 s for the loop, and return the counters."""
         if self._running:
             self._running, self._ended = False, time.monotonic()
-            self._mesh.announce_input(self._device, None, 0)
+            self._mesh.inputs.announce(self._device, None, 0)
         self._stopping.set()
         thread = self._thread
         if thread is not None and thread is not threading.current_thread():

@@ -1,29 +1,36 @@
-"""Follower's side of an input stream: the guards before a frame moves it."""
+"""Follower's side of input streams: the guards before a frame moves it."""
 
 from __future__ import annotations
 
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
+from itertools import count
 from typing import Any, Protocol
 
 from strands_robots import settings
 from strands_robots.bus_access import read_joints
 from strands_robots.contract import Haltable, for_request
-from strands_robots.envelope import is_error
+from strands_robots.envelope import Envelope, error, is_error, success
 from strands_robots.mesh import topics, wire
-from strands_robots.mesh.executor import BoundedExecutor
+from strands_robots.mesh.scheduler import BoundedExecutor
 from strands_robots.mesh.security import INPUT_VALUE_ABS, validate_input_frame, validate_mesh_identifier
+from strands_robots.mesh.session import Context
 from strands_robots.mesh.transport import Sample
+from strands_robots.mesh.wire_identity import INPUT
 from strands_robots.policies.base import numbers
 from strands_robots.safety.gate import MotionGate, MotionRefused, MotionRequest, Permit
 from strands_robots.safety.stop_executor import stop_executor
+from strands_robots.serving.verbs import Arguments
+from strands_robots.serving.workers import UNBOUNDED
 from strands_robots.stop_log import stop_logger
 from strands_robots.utils import ValidationError
 
 logger = stop_logger(__name__)
+
+LOGGED_ERRORS = 5
 
 ApplyFn = Callable[[Any, dict[str, float]], Any]
 
@@ -38,16 +45,91 @@ WATCH_S = 0.05
 AUDIT_EVERY = 100
 DEPTH = 32
 BURST = 10.0
-LOGGED_ERRORS = 5
 REJECTIONS = ("source", "lockout", "expired", "freshness", "invalid")
 UNITS_FULL_SCALE = {"normalized": 100.0, "radians": 6.283185307179586, "degrees": 360.0, "percent": 100.0}
 """Largest magnitude in each unit: LeRobot's normalised range is -100 to 100, an angle's one turn."""
 
 
-class FollowerMesh(Protocol):
-    """The part of a mesh peer that a receiver uses."""
+class InputSide:
+    """Numbers, names and signatures of the input streams of one peer.
 
+    Args:
+        hardware: it takes signed frames alone.
+    """
+
+    _context: Context
+
+    def __init__(self, *, hardware: bool) -> None:
+        self._hardware = hardware
+        self._frames: dict[str, count[int]] = {}
+        self._newest: dict[tuple[str, str], tuple[float, float]] = {}
+        self._announced: dict[str, dict[str, Any]] = {}
+
+    def now(self) -> float:
+        """Return wall-clock seconds, as stated on the wire."""
+        return self._context.clock()
+
+    def record(self, event: str, about: str, **payload: Any) -> None:
+        """Record an event about a peer in the audit log."""
+        self._context.audit(event, about, **payload)
+
+    def begin(self, context: Context) -> None:
+        """Begin a stay on the mesh.
+
+        The numbers rise and the newest frames are known for as long as the peer lives: no follower takes a leader that
+        began again for one of its own earlier frames, and no frame counts again on a stream that was reopened.
+        """
+        self._context = context
+        self._announced.clear()
+
+    def announced(self) -> list[dict[str, Any]]:
+        """Return the streams as the presence names them."""
+        return list(self._announced.values())
+
+    def announce(self, device: str, method: str | None, hz: float) -> None:
+        """Name an input stream in the presence, or remove it without ``method``."""
+        if method is None:
+            self._announced.pop(device, None)
+        else:
+            self._announced[device] = {"device": device, "method": method, "hz": hz}
+
+    def next_number(self, device: str) -> int:
+        """Return the number of the next frame of an input stream."""
+        return next(self._frames.setdefault(device, count()))
+
+    def sign(self, frame: dict[str, Any]) -> dict[str, Any]:
+        """Return an input frame signed by our certificate, else by this user's console."""
+        identity = self._context.identity
+        return identity.sign(frame) if identity.signs else self._context.console.sign(frame, INPUT)
+
+    def refusal(self, frame: Mapping[str, Any]) -> str | None:
+        """Return the reason why a frame may not move this peer's robot, or None.
+
+        Only real hardware asks for a signature, and takes each signed frame once, also on a stream that was reopened.
+        """
+        if not self._hardware:
+            return None
+        identity, source = self._context.identity, str(frame.get("peer_id"))
+        certified = identity.refusal(frame, source) if identity.checks else "no certificate is checked here"
+        why = certified and (certified if identity.required else self._context.consoles.refusal(frame, INPUT))
+        if why is not None:
+            return why
+        stream, sequence = (source, str(frame.get("device"))), wire.finite(frame.get("seq")) or 0.0
+        newest = (wire.finite(frame.get("t")) or 0.0, sequence)
+        if self._context.predates(newest[0]):
+            return "it was sent before this peer started, by its sender's clock"
+        if newest <= self._newest.get(stream, (0.0, -1.0)):
+            return "it is no newer than the last one"
+        self._newest[stream] = newest
+        return None
+
+
+class InputMesh(Protocol):
+    """The part of a mesh peer that publishers and receivers use."""
+
+    peer_id: str
     robot: Any
+    inputs: InputSide
 
     @property
     def lockout_epoch(self) -> str | None:
@@ -56,20 +138,14 @@ class FollowerMesh(Protocol):
     def peer_wire_zid(self, peer_id: str) -> str | None:
         """Return the session that a peer announced itself from, or None."""
 
-    def listen(self, topic: str, heard: Callable[[Sample], None], name: str) -> bool:
+    def publish(self, key: str, payload: dict[str, Any]) -> None:
+        """Publish an object under a key."""
+
+    def listen(self, topic: str, receive: Callable[[Sample], None], name: str) -> bool:
         """Receive raw samples on the transport's thread; False off the mesh."""
 
     def unsubscribe(self, name: str) -> None:
         """Drop a subscription."""
-
-    def record(self, event: str, about: str, **payload: Any) -> None:
-        """Record an event in the audit log."""
-
-    def now(self) -> float:
-        """Return wall-clock seconds."""
-
-    def input_refusal(self, frame: Mapping[str, Any]) -> str | None:
-        """Return the reason why a frame may not move the peer's robot, or None."""
 
 
 class InputReceiver:
@@ -87,7 +163,7 @@ class InputReceiver:
 
     def __init__(
         self,
-        mesh: FollowerMesh,
+        mesh: InputMesh,
         robot: Any,
         source_peer_id: str,
         device_name: str = "leader",
@@ -163,10 +239,10 @@ class InputReceiver:
         fields = {"device": self._device, "session": self._session}
         if self.start_refusal is not None:
             logger.warning("%s was not opened: %s", self.topic, self.start_refusal)
-            self._mesh.record("input_stream_refused", self._source, **fields, reason=self.start_refusal)
+            self._mesh.inputs.record("input_stream_refused", self._source, **fields, reason=self.start_refusal)
             return
         ttl = settings.number("STRANDS_MESH_INPUT_STREAM_TTL_S")
-        self._mesh.record("input_stream_opened", self._source, **fields, lifetime_s=ttl)
+        self._mesh.inputs.record("input_stream_opened", self._source, **fields, lifetime_s=ttl)
 
     def stop(self) -> dict[str, Any]:
         """Close the stream, wait up to 2 s for its last frame, return the counters."""
@@ -221,7 +297,7 @@ class InputReceiver:
         self._session, self._sequence, self._last, self._seeded = session, -1, {}, False
         self._tokens, self._refilled = BURST, time.monotonic()
         self._counts = Counter()
-        self._executor = BoundedExecutor(f"mesh-follow-{self._device}", 1, DEPTH, drop_oldest=True)
+        self._executor = BoundedExecutor(f"mesh-follow-{self._device}", DEPTH)
         self._opened, self._ended, self._running = time.monotonic(), 0.0, True
         if not self._mesh.listen(self.topic, self.on_frame, self._name):
             self._running, self._ended = False, time.monotonic()
@@ -258,7 +334,7 @@ class InputReceiver:
 
     def _lose(self, silent: float) -> None:
         logger.warning("%s: the leader is silent; the stream is closed.", self.topic)
-        self._mesh.record("input_stream_lost", self._source, device=self._device, silent_s=round(silent, 2))
+        self._mesh.inputs.record("input_stream_lost", self._source, device=self._device, silent_s=round(silent, 2))
         self.close()
 
     def _hold(self) -> None:
@@ -286,7 +362,7 @@ class InputReceiver:
         if time.monotonic() - self._opened > settings.number("STRANDS_MESH_INPUT_STREAM_TTL_S"):
             self._counts["expired"] += 1
             self.close()
-            self._mesh.record("input_stream_expired", self._source, device=self._device)
+            self._mesh.inputs.record("input_stream_expired", self._source, device=self._device)
             return
         try:
             frame = wire.decode(sample.payload, topics.BY_NAME["input"].max_bytes)
@@ -300,7 +376,7 @@ class InputReceiver:
     def _checked(self, frame: Mapping[str, Any], heard: float) -> dict[str, float] | None:
         """Return the action of a frame that passed every guard; else count it."""
         stamp = wire.finite(frame.get("t"))
-        if stamp is None or not wire.fresh(stamp, self._mesh.now()):
+        if stamp is None or not wire.fresh(stamp, self._mesh.inputs.now()):
             self._counts["freshness"] += 1
             return None
         if frame.get("action") is None:
@@ -312,7 +388,7 @@ class InputReceiver:
         if sequence <= self._sequence:
             self._counts["out_of_order"] += 1
             return None
-        why = self._mesh.input_refusal(frame)
+        why = self._mesh.inputs.refusal(frame)
         if why is not None or frame.get("peer_id") != self._source or frame.get("device") != self._device:
             self._counts["source"] += 1
             if self._counts["source"] <= LOGGED_ERRORS:
@@ -396,7 +472,7 @@ class InputReceiver:
             if self._counts["errors"] <= LOGGED_ERRORS:
                 logger.warning("%s: not applied: %s", self.topic, answer.get("reason"))
         if self._counts["received"] % AUDIT_EVERY == 0:
-            self._mesh.record(
+            self._mesh.inputs.record(
                 "input_stream_applied", self._source, device=self._device, frames=self._counts["received"]
             )
 
@@ -429,3 +505,88 @@ def present_joints(robot: Any) -> dict[str, float]:
     robots = state.get("robots")
     joints = next(iter(robots.values()), None) if isinstance(robots, Mapping) else state.get("joints")
     return numbers(joints) if isinstance(joints, Mapping) else {}
+
+
+STREAMS_MAX = 8
+JOIN_S = 2.0
+
+Key = tuple[str, str]
+
+
+class TeleopReceivers:
+    """Opens, lists and closes receivers; at most eight at once."""
+
+    def __init__(self, open_receiver: Callable[[str, str], InputReceiver]) -> None:
+        self._open = open_receiver
+        self._receivers: dict[Key, InputReceiver] = {}
+        self._lock = threading.Lock()
+
+    def receive(self, command: Arguments, request: MotionRequest | None = None) -> Envelope:
+        """Follow ``source_peer_id``'s device (``leader`` by default)."""
+        key = (command["source_peer_id"], command.get("device_name", "leader"))
+        with self._lock:
+            self._end(lambda key, each: not each.running)
+            if key in self._receivers:
+                return success(f"Already following {key[0]}/{key[1]}.", **self._receivers[key].stats)
+            if len(self._receivers) >= STREAMS_MAX:
+                return error(f"teleop_receive: {STREAMS_MAX} input streams are open already.")
+            receiver = self._open(*key)
+            receiver.start(request)
+            if receiver.start_refusal is not None:
+                return error(f"teleop_receive: {receiver.start_refusal}.")
+            self._receivers[key] = receiver
+        return success(f"Following {key[0]}/{key[1]}.", **receiver.stats)
+
+    def status(self, command: Arguments, request: MotionRequest | None = None) -> Envelope:
+        """The counters of every stream."""
+        with self._lock:
+            streams = [receiver.stats for receiver in self._receivers.values()]
+        return success(f"{sum(stream['running'] for stream in streams)} input streams run.", streams=streams)
+
+    def stop(self, command: Arguments, request: MotionRequest | None = None) -> Envelope:
+        """Close the named stream or all, and wait up to 2 s for last frames."""
+        source, device = command.get("source_peer_id"), command.get("device_name")
+        with self._lock:
+            ended = self._end(lambda key, _: source in (None, key[0]) and device in (None, key[1]))
+        join(ended, JOIN_S)
+        return success(f"{len(ended)} input streams closed.", streams=[each.stats for each in ended])
+
+    def close(self) -> list[InputReceiver]:
+        """Close all of them; those closed, to :func:`join`."""
+        with self._lock:
+            return self._end(lambda key, each: True)
+
+    def leading(self) -> bool:
+        """Return True while a leader moves a robot."""
+        return any(receiver.leading for receiver in list(self._receivers.values()))
+
+    def void(self) -> None:
+        """Let no frame move anything from now on, because a robot is being stopped.
+
+        It waits for nothing, neither for the lock nor for a frame that a slow bus still takes.
+        """
+        for receiver in list(self._receivers.values()):
+            receiver.void()
+
+    def reap(self) -> None:
+        """Close the streams that a stop has voided, without waiting."""
+        with self._lock:
+            ended = self._end(lambda key, each: not each.running)
+        if ended:
+            UNBOUNDED.submit(lambda: _joined(ended))
+
+    def _end(self, chosen: Callable[[Key, InputReceiver], bool]) -> list[InputReceiver]:
+        ended = [self._receivers.pop(key) for key, each in list(self._receivers.items()) if chosen(key, each)]
+        for receiver in ended:
+            receiver.close()
+        return ended
+
+
+def join(closed: Iterable[InputReceiver], timeout: float) -> list[str]:
+    """Wait for the last frames of closed streams; return the unfinished ones."""
+    deadline = time.monotonic() + timeout
+    return [each.topic for each in closed if not each.join(max(0.0, deadline - time.monotonic()))]
+
+
+def _joined(closed: Iterable[InputReceiver]) -> None:
+    join(closed, JOIN_S)

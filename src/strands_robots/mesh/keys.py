@@ -15,8 +15,7 @@ from strands_robots import certificates
 from strands_robots.certificates import AUTHORITY_DAYS, CA_CERT, CA_KEY, ISSUED_DAYS
 from strands_robots.mesh import topics
 from strands_robots.mesh.security import validate_peer_id
-from strands_robots.mesh.transport.access import MESSAGES, allow, deny_by_default
-from strands_robots.mesh.transport.zenoh_config import TlsCredentials
+from strands_robots.mesh.transport.config import MESSAGES, TlsCredentials, allow, deny_by_default
 from strands_robots.utils import ValidationError
 
 __all__ = ["CA_CERT", "CA_KEY", "acl", "init", "issue"]

@@ -11,10 +11,8 @@ from typing import Any, ClassVar
 
 from strands_robots.mesh import session as mesh_session
 from strands_robots.mesh import topics, wire
-from strands_robots.mesh.context import Context
-from strands_robots.mesh.registry import PeerRegistry
-from strands_robots.mesh.scheduler import repeat
-from strands_robots.mesh.throttle import TroubleLog
+from strands_robots.mesh.scheduler import TroubleLog, repeat
+from strands_robots.mesh.session import Context, PeerRegistry
 from strands_robots.mesh.transport import Declaration, Sample, Transport, TransportError, undeclare
 from strands_robots.mesh.wire_identity import IdentityError
 from strands_robots.safety.sightings import sightings

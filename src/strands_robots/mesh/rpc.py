@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import threading
 import time
 import uuid
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from queue import Empty, SimpleQueue
 from typing import Any
 
-from strands_robots.mesh import console_keys, session, topics, wire
-from strands_robots.mesh.context import Context
-from strands_robots.mesh.older_peers import ASK_AGAIN_S, COMMANDS_S
-from strands_robots.mesh.registry import Attribution, attribute
+from strands_robots.mesh import session, topics, wire, wire_identity
 from strands_robots.mesh.security import validate_command
+from strands_robots.mesh.session import ASK_AGAIN_S, COMMANDS_S, Attribution, Context, attribute
 from strands_robots.mesh.transport import Sample, TransportError
 from strands_robots.safety.sightings import sightings
 from strands_robots.safety.statements import Purpose
@@ -156,7 +155,27 @@ class Requester:
             if problem is not None:
                 logger.warning("broadcast: %s", problem)
                 return []
-            return self._collect(turn, clean, seconds, missing)
+            older = self._context.registry.older()
+            pause = ASK_AGAIN_S if older else REPEAT_S
+
+            def absent(replies: Iterable[dict[str, Any]]) -> set[str]:
+                return missing([each for each in replies if each["type"] == "response"]) if missing else set()
+
+            def send(replies: Mapping[str, dict[str, Any]]) -> None:
+                left = absent(replies.values())
+                # Towards a peer of a 0.5 release each of them would wait for the one before it.
+                keys = [topics.broadcast()] if older and len(left) > 1 else [topics.command(peer) for peer in left]
+                for key in keys:
+                    self._publish(key, clean, turn)
+
+            return self._collect(
+                turn,
+                seconds,
+                lambda replies: missing is None or bool(absent(replies)),
+                send,
+                every_s=pause,
+                first_s=seconds if missing is None else pause,
+            )
         finally:
             self._close(turn)
 
@@ -171,66 +190,55 @@ class Requester:
         Args:
             stops: returns the stop of each peer that has to answer. It is asked, and a peer without a result gets the
                 stop again, every ``ASK_AGAIN_S``.
-            goes_on: ends the collection; it gets the replies so far, many times a second. A peer's result replaces an
-                error of it.
+            goes_on: ends the collection; it gets the replies so far, many times a second.
         """
-        turn, replies = Turn(BROADCAST_RESPONDER), dict[str, dict[str, Any]]()
-        now = again = time.monotonic()
-        deadline = now + seconds
+        turn = Turn(BROADCAST_RESPONDER)
+
+        def send(replies: Mapping[str, dict[str, Any]]) -> None:
+            for peer, command in stops().items():
+                if replies.get(peer, {}).get("type") != "response":
+                    self._publish(topics.command(peer), command, turn)
+
         try:
-            while now < deadline:
-                if now >= again:
-                    again = now + ASK_AGAIN_S
-                    for peer, command in stops().items():
-                        if replies.get(peer, {}).get("type") != "response":
-                            self._publish(topics.command(peer), command, turn)
-                if not goes_on(list(replies.values())):
-                    break
-                with contextlib.suppress(Empty):  # no answer in this interval
-                    reply = turn.next(LOOK_S)
-                    if reply is None:
-                        break
-                    peer = str(reply["responder_id"])
-                    if peer not in replies or (replies[peer]["type"], reply["type"]) == ("error", "response"):
-                        replies[peer] = reply
-                now = time.monotonic()
+            return self._collect(turn, seconds, goes_on, send, every_s=ASK_AGAIN_S, look_s=LOOK_S)
         finally:
             self._close(turn)
-        return list(replies.values())
 
     def _collect(
         self,
         turn: Turn,
-        command: dict[str, Any],
         seconds: float,
-        missing: Callable[[list[dict[str, Any]]], set[str]] | None,
+        goes_on: Callable[[list[dict[str, Any]]], bool],
+        send: Callable[[Mapping[str, dict[str, Any]]], None],
+        *,
+        every_s: float,
+        first_s: float = 0.0,
+        look_s: float = math.inf,
     ) -> list[dict[str, Any]]:
+        """Return the replies of one turn; a peer's result replaces an error of it.
+
+        Args:
+            goes_on: ends the collection, given the replies so far.
+            send: sends the command again, given the replies by peer; after ``first_s`` and then every ``every_s``.
+            look_s: seconds between two questions of ``goes_on``, where no reply comes.
+        """
         replies: dict[str, dict[str, Any]] = {}
-
-        def absent() -> set[str]:
-            return missing([each for each in replies.values() if each["type"] == "response"]) if missing else set()
-
         now = time.monotonic()
-        deadline = now + seconds
-        older = self._context.registry.older()
-        pause = ASK_AGAIN_S if older else REPEAT_S
-        again = now + pause if missing is not None else deadline
-        while now < deadline and (missing is None or absent()):
+        deadline, due = now + seconds, now + first_s
+        while now < deadline:
+            if now >= due:
+                send(replies)
+                due = time.monotonic() + every_s
+            if not goes_on(list(replies.values())):
+                break
             with contextlib.suppress(Empty):  # no answer in this interval
-                reply = turn.next(min(deadline, again) - now)
+                reply = turn.next(max(0.0, min(deadline, due, now + look_s) - now))
                 if reply is None:
                     break
                 peer = str(reply["responder_id"])
                 if peer not in replies or (replies[peer]["type"], reply["type"]) == ("error", "response"):
                     replies[peer] = reply
             now = time.monotonic()
-            if missing is not None and now >= again:
-                left = absent()
-                # Towards a peer of a 0.5 release each of them would wait for the one before it.
-                keys = [topics.broadcast()] if older and len(left) > 1 else [topics.command(peer) for peer in left]
-                for key in keys:
-                    self._publish(key, command, turn)
-                again = time.monotonic() + pause
         return list(replies.values())
 
     def on_response(self, sample: Sample) -> None:
@@ -341,7 +349,7 @@ class Requester:
         request = wire.Request(context.peer_id, self._open(turn), command, context.clock(), target_id=target)
         body = request.to_wire()
         if kind_of_action(command) is Kind.MOTION:
-            body = context.console.sign(body, console_keys.MOTION)
+            body = context.console.sign(body, wire_identity.MOTION)
         try:
             body = context.identity.sign(body)
             transport = context.transport

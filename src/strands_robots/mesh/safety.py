@@ -1,8 +1,7 @@
-"""Fleet e-stop and resume, between the wire and the safety plane.
+"""Emergency stops that a peer issues, its resumes and its check-ins.
 
-Nothing is decided here. Locking, halting and checking a resume are the plane's, reached through a
-:class:`SafetyAdapter`; this module translates between it and the wire, and :class:`EstopRetry` repeats a stop to the
-peers that missed it.
+Stops of others are received by :class:`~.stop_link.PeerStops`. Locking, halting and the check of a resume are the
+safety plane's, reached through a :class:`SafetyAdapter`; :class:`EstopRetry` repeats a stop to those that missed it.
 """
 
 from __future__ import annotations
@@ -19,24 +18,22 @@ from typing import Any
 from strands_robots.audit import audit_head, own_log_id
 from strands_robots.contract import Robot
 from strands_robots.mesh import session, topics, wire
-from strands_robots.mesh.context import Context
-from strands_robots.mesh.estop_retry import EstopRetry
-from strands_robots.mesh.late_peers import KNOWN_S, LatePeers
-from strands_robots.mesh.missed import epoch_of
-from strands_robots.mesh.older_peers import SAFETY, SAFETY_S, Closings
+from strands_robots.mesh.estop_retry import KNOWN_S, Closings, EstopRetry, LatePeers, ScopedStop
 from strands_robots.mesh.rpc import Requester, stop_outcome
 from strands_robots.mesh.safety_adapter import SafetyAdapter
-from strands_robots.mesh.scoped_stops import ScopedStop
-from strands_robots.mesh.throttle import RecentKeys
+from strands_robots.mesh.scheduler import RecentKeys
+from strands_robots.mesh.session import SAFETY, SAFETY_S, Context
+from strands_robots.mesh.stop_link import COMMANDED, PeerStops
 from strands_robots.mesh.transport import Sample, TransportError
 from strands_robots.safety import ed25519
 from strands_robots.safety.checkin import CheckInAnswers, HeadWitness
 from strands_robots.safety.gate import MotionRequest
 from strands_robots.safety.lockout import is_epoch
-from strands_robots.safety.orders import NO_REASON, StopOrder, new_epoch, signed_stop, stated_reason
+from strands_robots.safety.orders import NO_REASON, StopOrder, StopRefused, new_epoch, signed_stop, stated_reason
 from strands_robots.safety.resume import REJECTED, configured_keys, sign
 from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope, none_known
 from strands_robots.safety.statements import Proof, Purpose, enrolled_peers, proof_of, record_heads
+from strands_robots.safety.stop_link import ESTOP, StopEvent
 from strands_robots.safety.stopping import Outcome, StopVerdict
 from strands_robots.serving.peer_verbs import PEER_VERBS, peer_stop_answer
 from strands_robots.serving.pipeline import Own
@@ -95,8 +92,8 @@ class FleetSafety:
     def __init__(
         self, context: Context, adapter: SafetyAdapter, requester: Requester, resumes: Share, *, robot: bool = True
     ) -> None:
-        self._context = context
-        self._adapter = adapter
+        self.context = context
+        self.adapter = adapter
         self._requester = requester
         self._witness, self._answers = HeadWitness(always=not robot), CheckInAnswers()
         audit_head(), own_log_id()  # read from the disk now, so that no stop waits for it
@@ -110,7 +107,7 @@ class FleetSafety:
             lambda peer: requester.send(peer, {"action": "status"}, STATUS_S).get("result"),
         )
         self.late = LatePeers(context, adapter.epochs)
-        self._recent: deque[tuple[str, Scope]] = deque(maxlen=RECENT_MAX)
+        self.stops: PeerStops | None = None
         self._admitted: deque[str] = deque(maxlen=RECENT_MAX)
         self._resumed: deque[str] = deque(maxlen=RECENT_MAX)
         self.network = session.network().text
@@ -118,7 +115,17 @@ class FleetSafety:
         self._press = ("", 0.0)
 
     def locked(self) -> bool:
-        return bool(self._adapter.epochs())
+        return bool(self.adapter.epochs())
+
+    def join(self) -> None:
+        """Receive stops; a robot also on a connection of its own."""
+        self.stops = PeerStops.joined_by(self)
+
+    def leave(self) -> None:
+        """Receive no more; nothing where this peer has not joined."""
+        stops, self.stops = self.stops, None
+        if stops is not None:
+            stops.left_by(self)
 
     # Issuing.
 
@@ -137,7 +144,7 @@ class FleetSafety:
 
         Where no robot in ``scope`` is there, every robot is stopped.
         """
-        context = self._context
+        context = self.context
         if not estop_id or estop_id != self._press[0]:
             self._press = (estop_id or new_epoch(), context.clock())
         epoch, pressed = self._press
@@ -150,7 +157,7 @@ class FleetSafety:
             return self._stop_some(order, signing_key, on_answers, remembers, on_widened)
         self._latest = order.epoch
         # The fleet receives the stop while the local robot halts.
-        local = self._adapter.begin(order)
+        local = self.adapter.begin(order)
         none = {"responses_received": 0, "peers_not_stopped": 0, "peers_silent": 0}
         self._publish_estop(order, none, signing_key)
         roster = {row["peer_id"] for row in context.registry.all() if row["reachable"]} - {context.peer_id}
@@ -175,7 +182,7 @@ class FleetSafety:
         self._retry.begin(
             order.epoch,
             unreached,
-            lambda: order.epoch in self._adapter.epochs(),
+            lambda: order.epoch in self.adapter.epochs(),
             lambda: self._publish_estop(order, counts, signing_key, paced=True),
         )
         return responses
@@ -189,8 +196,8 @@ class FleetSafety:
         on_widened: Callable[[], None],
     ) -> list[dict[str, Any]]:
         """Stop the robots of the order's scope; return their replies, a local one first."""
-        context, scope = self._context, order.scope
-        local = self._adapter.begin(order)
+        context, scope = self.context, order.scope
+        local = self.adapter.begin(order)
         none = {"responses_received": 0, "peers_not_stopped": 0, "peers_silent": 0}
         body = self._estop_body(order, none, signing_key)
         stop = ScopedStop(
@@ -206,7 +213,7 @@ class FleetSafety:
         if stop.widened:
             on_widened()
             return self.emergency_stop(signing_key, reason=order.reason, estop_id=order.epoch, on_answers=on_answers)
-        own = self._local_reply(order, local() if local is not None else None) if self._adapter.within(scope) else []
+        own = self._local_reply(order, local() if local is not None else None) if self.adapter.within(scope) else []
         counts, stopped = self._conclude(order, [*own, *replies], replies, stop.targets())
         if scope.cell:
             self._close_stop(order, counts, signing_key, {str(each["responder_id"]) for each in replies})
@@ -226,7 +233,7 @@ class FleetSafety:
         self, order: StopOrder, responses: list[dict[str, Any]], replies: list[dict[str, Any]], roster: set[str]
     ) -> tuple[dict[str, Any], set[str]]:
         """Log and audit the answers to a stop; return their counts, and who stopped."""
-        context = self._context
+        context = self.context
         stopped = {str(each["responder_id"]) for each in responses if stop_outcome(each) is Outcome.STOPPED}
         not_stopped = [name for each in responses if (name := str(each["responder_id"])) not in stopped]
         silent = sorted(roster - {str(each["responder_id"]) for each in replies})
@@ -253,7 +260,7 @@ class FleetSafety:
 
     def _close_stop(self, order: StopOrder, counts: dict[str, Any], signing_key: Any, answered: set[str]) -> None:
         """Publish the stop with its counts, later where a 0.5 peer would drop it."""
-        older = self._context.registry.older()
+        older = self.context.registry.older()
 
         def publish() -> None:
             self._publish_estop(order, counts, signing_key, paced=bool(older))
@@ -272,14 +279,14 @@ class FleetSafety:
         """The reply of the local robot in a peer's form; none without a robot."""
         if not self._robot:
             return []
-        context = self._context
+        context = self.context
         result = peer_stop_answer(verdict or StopVerdict(unknown={context.peer_id: "no answer"}))
         return [wire.Reply("response", context.peer_id, order.epoch, result, timestamp=context.clock()).to_wire()]
 
     def _publish_estop(
         self, order: StopOrder, counts: dict[str, Any], signing_key: Any, *, paced: bool = False
     ) -> None:
-        context = self._context
+        context = self.context
         if paced and context.registry.older():
             with context.pacer.turn(SAFETY, SAFETY_S):
                 self._put_estop(order, counts, signing_key)
@@ -293,74 +300,39 @@ class FleetSafety:
         return replace(order, original=payload, network=self.network)
 
     def _put_estop(self, order: StopOrder, counts: dict[str, Any], signing_key: Any) -> None:
-        body = self._estop_body(order, counts, signing_key)
-        self._publish(topics.estop(), body, f"Emergency stop {order.epoch}", logging.CRITICAL)
+        self._send_stop(order.epoch, self._estop_body(order, counts, signing_key))
 
     def _estop_body(self, order: StopOrder, counts: dict[str, Any], signing_key: Any) -> dict[str, Any]:
         # The time is that of the sending, because peers in the field refuse what is older than a minute.
-        context = self._context
-        counts = {**counts, "lockout_engaged": True}
-        notice = wire.EstopNotice(context.peer_id, context.clock(), order.epoch, context.session_id(), counts)
+        context = self.context
+        head = {"peer_id": context.peer_id, "t": context.clock(), "estop_id": order.epoch}
         why = {} if order.reason == NO_REASON else {"reason": order.reason}
-        stated = {**notice.to_wire(), "pressed_at": order.pressed, **why, **order.scope.field()}
+        times = {"lockout_engaged": True, **self._from_session(), "pressed_at": order.pressed}
+        stated = {**head, **counts, **times, **why, **order.scope.field()}
         return self._signed(stated, Purpose.EMERGENCY_STOP, signing_key)
 
     # Receiving.
 
-    def on_estop(self, sample: Sample) -> None:
-        """Receive a fleet e-stop; on return all robots are locked and halting."""
-        received = time.monotonic()
-        context = self._context
-        if not sample.payload:
-            return  # a broker's stored stop was cleared
-        try:
-            body = wire.decode(sample.payload, topics.BY_NAME["estop"].max_bytes)
-            _require_same_session(body, sample)
-            notice = wire.EstopNotice.of(body)
-        except wire.WireError as exc:
-            context.audit("estop_rejected", reason=str(exc))
-            return
-        if notice.peer_id == context.peer_id and sample.session == context.session_id():
-            return
-        why = self._adapter.stop_refusal(notice.peer_id, body)
-        if why is not None:
-            context.audit("estop_rejected", notice.peer_id, reason=why)
-            return
-        epoch = epoch_of(notice, body)
-        scope = self._adapter.scope(notice.peer_id, body)
-        self._latest = epoch if scope.everything else self._latest
-        if (epoch, scope) in self._recent:
+    def issued(self, epoch: str) -> None:
+        """Note the latest stop of every robot; its resume clears the broker's copy."""
+        self._latest = epoch
+
+    def resumed_since(self, epoch: str) -> bool:
+        """Return True for a stop that the broker stored with its resume."""
+        return epoch in self._resumed
+
+    def begun(self, order: StopOrder, fields: Mapping[str, Any], *, repeated: bool) -> None:
+        """Note a stop of another peer whose halts are ordered; return at once."""
+        context, epoch = self.context, order.epoch
+        if repeated:
             self.late.heard(epoch)
-            context.audit("remote_estop_redundant", notice.peer_id, estop_id=epoch)
-            return
-        if sample.retained and epoch in self._resumed:
-            context.audit("remote_estop_redundant", notice.peer_id, estop_id=epoch, reason="resumed since")
-            return
-        pressed = wire.finite(body.get("pressed_at"))
-        order = StopOrder(
-            epoch,
-            notice.peer_id,
-            stated_reason(body) or NO_REASON,
-            "mesh",
-            True,
-            notice.t,
-            received,
-            pressed,
-            scope=scope,
-            # A console passes on what it sent, and nothing of others.
-            original=sample.payload if self._robot else None,
-            network=self.network,
-        )
-        self._recent.append((epoch, scope))
-        # The plane locks and starts the halts at once; nothing on this path waits.
-        if self._adapter.begin(order) is None:
-            if self._adapter.within(scope):
-                context.audit("remote_estop_redundant", notice.peer_id, estop_id=epoch)
+            if self.adapter.within(order.scope):
+                context.audit("remote_estop_redundant", order.source, estop_id=epoch)
             return
         if order.timing(context.clock()) == "ahead":
-            context.audit("estop_clock_skew", notice.peer_id, estop_id=epoch)
-        if scope.everything:
-            self.late.stopped(epoch, lambda: self._repeat_estop({**body, "estop_id": epoch}))
+            context.audit("estop_clock_skew", order.source, estop_id=epoch)
+        if order.scope.everything:
+            self.late.stopped(epoch, lambda: self._repeat_estop({**fields, "estop_id": epoch}))
         self._publish_event("emergency_stop", epoch)
 
     def on_own_estop(self, given: object, sample: Sample, sender: str, peer_id: str) -> str | None:
@@ -372,55 +344,54 @@ class FleetSafety:
             sender: of the command, who must be the envelope's issuer.
             peer_id: to whom the command was sent: this peer, or a robot of its world.
         """
-        context, received = self._context, time.monotonic()
-        try:
-            body = dict(given) if isinstance(given, Mapping) else {}
-            _require_same_session(body, sample)
-            notice = wire.EstopNotice.of(body)
-        except wire.WireError as exc:
-            context.audit("estop_rejected", reason=str(exc))
+        context, received, stops = self.context, time.monotonic(), self.stops
+        if stops is None:
             return None
-        why = "its issuer is not the sender" if notice.peer_id != sender else self._adapter.stop_refusal(sender, body)
-        if why is not None or notice.estop_id is None:
-            context.audit("estop_rejected", sender, reason=why or "it has no estop_id")
-            return None
-        scope = self._adapter.scope(sender, body)
-        if peer_id in scope.only:
-            # A robot of a world is locked with it.
-            scope = replace(scope, only=scope.only | {context.peer_id})
+        body = dict(given) if isinstance(given, Mapping) else {}
         original = None
         with contextlib.suppress(wire.WireError):  # too long to be passed on
             original = wire.encode(body, topics.BY_NAME["estop"].max_bytes)
-        self._adapter.begin(
-            StopOrder(
-                notice.estop_id,
-                sender,
-                stated_reason(body) or NO_REASON,
-                "mesh",
-                True,
-                notice.t,
-                received,
-                wire.finite(body.get("pressed_at")),
-                scope=scope,
-                # Others that it names may have missed theirs.
-                original=original,
-                network=self.network,
-            )
-        )
-        return notice.estop_id
+        stop = StopEvent(ESTOP, sample.session or "", original, received, stops.network.text, stops.codec)
+        order = stops.codec.order(self.adapter.rules, stop, body, COMMANDED)
+        if isinstance(order, StopOrder) and (order.source != sender or not is_epoch(body.get("estop_id"))):
+            order = StopRefused(sender, "its issuer is not the sender, or it has no estop_id")
+        if not isinstance(order, StopOrder):
+            if order is not None:
+                stops.refused(order)
+            return None
+        if peer_id in order.scope.only:
+            # A robot of a world is locked with it.
+            order = replace(order, scope=replace(order.scope, only=order.scope.only | {context.peer_id}))
+        # Others that it names may have missed theirs.
+        self.adapter.begin(replace(order, original=original, path="mesh"))
+        return order.epoch
 
     def _repeat_estop(self, body: dict[str, Any]) -> None:
         """Publish a stop of another issuer again, from our session."""
-        session = self._context.session_id()
         bare = {key: value for key, value in body.items() if key != "source_zid"}
         # A signature covers the time, so a signed stop keeps it.
-        sent = {} if "sig" in bare else {"t": self._context.clock()}
-        again = {**bare, **sent} | ({} if session is None else {"source_zid": session})
-        self._publish(topics.estop(), again, f"Emergency stop {body['estop_id']}", logging.CRITICAL)
+        sent = {} if "sig" in bare else {"t": self.context.clock()}
+        again = {**bare, **sent, **self._from_session()}
+        self._send_stop(str(body["estop_id"]), again)
+
+    def _send_stop(self, epoch: str, body: dict[str, Any]) -> None:
+        """Publish a stop on both connections, as either may hang."""
+        stops = self.stops
+        if stops is not None:
+            stops.publish(topics.estop(), body)
+        self._publish(topics.estop(), body, f"Emergency stop {epoch}", logging.CRITICAL)
+        if stops is not None:
+            with contextlib.suppress(TransportError):  # the next repetition tries again
+                stops.open(self)  # by a peer without a robot, which had no connection of its own until now
+
+    def _from_session(self) -> dict[str, str]:
+        """Return the field that states our session, where the transport has any."""
+        session = self.context.session_id()
+        return {} if session is None else {"source_zid": session}
 
     def _publish_event(self, event: str, epoch: str) -> None:
         """Publish the redacted event for dashboards: its code, without the reason."""
-        context = self._context
+        context = self.context
         body = {
             "peer_id": context.peer_id,
             "t": context.clock(),
@@ -433,7 +404,7 @@ class FleetSafety:
 
     def _publish(self, key: str, body: dict[str, Any], subject: str, level: int) -> None:
         try:
-            self._context.put(key, body)
+            self.context.put(key, body)
         except (TransportError, wire.WireError) as exc:
             logger.log(level, "%s was not published: %s", subject, exc)
 
@@ -441,7 +412,7 @@ class FleetSafety:
 
     def resume(self, signing_key: Any, targets: Sequence[str] | None) -> dict[str, Any]:
         """Sign for every epoch here and at the targets, and relay the assertions."""
-        context, own = self._context, self._adapter.epochs()
+        context, own = self.context, self.adapter.epochs()
         try:
             names = [identifier("target", name) for name in targets] if targets is not None else None
             wanted = (
@@ -464,7 +435,7 @@ class FleetSafety:
             self._unresumed.pop(epoch, None)
             for assertion in assertions:
                 ours = epoch in own and context.peer_id in assertion["targets"]
-                rejected = self._adapter.resume(assertion) if ours else None
+                rejected = self.adapter.resume(assertion) if ours else None
                 if rejected is not None:
                     return {"status": "error", "error": rejected}
                 if relayed:
@@ -476,8 +447,8 @@ class FleetSafety:
 
     def _reported(self, peers: Iterable[str]) -> list[str]:
         """Ask peers that report lockouts for their epochs; return all of them."""
-        registry = self._context.registry
-        waited = {peer for peer in peers if "locked" in (registry.get(peer) or {})} - {self._context.peer_id}
+        registry = self.context.registry
+        waited = {peer for peer in peers if "locked" in (registry.get(peer) or {})} - {self.context.peer_id}
         if not waited:
             return []
 
@@ -495,7 +466,7 @@ class FleetSafety:
         Args:
             peer_id: the robot of this peer's world that was asked, if one was.
         """
-        answer = self._adapter.answer_to_resume(assertion, peer_id)
+        answer = self.adapter.answer_to_resume(assertion, peer_id)
         if answer["status"] == "ok":
             self._relay(assertion)
             self._note_admitted(assertion)
@@ -503,29 +474,27 @@ class FleetSafety:
 
     def on_resume(self, sample: Sample) -> None:
         """Receive a relayed resume; one meant for others is not counted as refused."""
-        context = self._context
+        context = self.context
         try:
             body = wire.decode(sample.payload, topics.BY_NAME["resume"].max_bytes)
-            _require_same_session(body, sample)
-            relay = wire.ResumeRelay.of(body)
+            relayer, assertion = wire.relay_of(body, sample.session)
         except wire.WireError as exc:
             context.audit("resume_denied", reason=str(exc))
             return
-        if relay.peer_id == context.peer_id and sample.session == context.session_id():
+        if relayer == context.peer_id and sample.session == context.session_id():
             return
-        assertion = relay.assertion
         if sample.retained:
             self._note_retained(assertion)
             return
-        epochs = self._adapter.epochs()
+        epochs = self.adapter.epochs()
         if not isinstance(assertion, dict) or not epochs or assertion.get("epoch") not in epochs:
-            context.audit("remote_resume_redundant", relay.peer_id)
+            context.audit("remote_resume_redundant", relayer)
             return
         targets = assertion.get("targets")
         if not isinstance(targets, list) or context.peer_id not in targets:
             return
         try:
-            self._resumes.submit(lambda: self._admit_relayed(relay))
+            self._resumes.submit(lambda: self._admit_relayed(relayer, assertion))
         except ShareFullError as exc:
             logger.warning("%s: a relayed resume was left out: %s", context.peer_id, exc)
 
@@ -541,15 +510,15 @@ class FleetSafety:
         if signature is not None and ed25519.signed_by_one_of(configured_keys(), signature, covered):
             self._resumed.append(str(assertion.get("epoch")))
 
-    def _admit_relayed(self, relay: wire.ResumeRelay) -> None:
+    def _admit_relayed(self, relayer: str, assertion: Mapping[str, Any]) -> None:
         # The plane records a refusal with its reason; that it came twice is known here alone.
-        nonce = str(relay.assertion.get("nonce"))
-        if self._adapter.resume(relay.assertion) is None:
+        nonce = str(assertion.get("nonce"))
+        if self.adapter.resume(assertion) is None:
             self._admitted.append(nonce)
-            self._note_admitted(relay.assertion)
-            self._context.audit.always("remote_resume_applied", about=relay.peer_id)
+            self._note_admitted(assertion)
+            self.context.audit.always("remote_resume_applied", about=relayer)
         elif nonce in self._admitted:
-            self._context.audit("resume_replay_rejected", relay.peer_id)
+            self.context.audit("resume_replay_rejected", relayer)
 
     def _note_admitted(self, assertion: Any) -> None:
         """Pass an admitted resume on to targets that are back within its minute."""
@@ -560,9 +529,9 @@ class FleetSafety:
             self._relay(assertion)
 
     def _relay(self, assertion: Any) -> None:
-        context = self._context
-        relay = wire.ResumeRelay(context.peer_id, context.clock(), assertion, context.session_id())
-        self._publish(topics.resume(), relay.to_wire(), "A resume", logging.ERROR)
+        context = self.context
+        body = {"peer_id": context.peer_id, "t": context.clock(), "assertion": assertion, **self._from_session()}
+        self._publish(topics.resume(), body, "A resume", logging.ERROR)
         transport = context.transport
         if transport is not None and isinstance(assertion, dict) and assertion.get("epoch") == self._latest:
             # A newcomer must not be locked by a stop that is over.
@@ -573,22 +542,27 @@ class FleetSafety:
 
     def check_in(self, signing_key: Any = None) -> None:
         """Check in with the robots that need a live controller."""
-        peer = self._context.peer_id
+        peer = self.context.peer_id
         body = self._signed({"peer_id": peer, "estop_id": new_epoch()}, Purpose.CHECK_IN, signing_key)
+        if self.stops is not None:
+            with contextlib.suppress(TransportError):  # the next check-in tries again
+                self.stops.open(self)
+            if self.stops.publish(topics.check_in(peer), body):
+                return
         self._publish(topics.check_in(peer), body, "A check-in", logging.ERROR)
 
     def on_check_in(self, sample: Sample) -> None:
         """Record the check-in of a controller; a refused one is audited."""
-        context = self._context
+        context = self.context
         stated = self._stated(sample, "checkin", "peer_id", topics.check_in)
         if stated is None:
             return
         source, body = stated
-        why = self._adapter.check_in(source, body)
+        why = self.adapter.check_in(source, body)
         if why is not None:
             context.audit("checkin_rejected", source, reason=why)
             return
-        answer = self._answers.answer(context.peer_id, body.get("estop_id"), self._adapter.identity)
+        answer = self._answers.answer(context.peer_id, body.get("estop_id"), self.adapter.identity)
         if answer is not None:
             self._publish(topics.check_in_answer(context.peer_id), answer, "An answer to a check-in", logging.WARNING)
 
@@ -604,13 +578,13 @@ class FleetSafety:
         key = None if self._robot else (enrolled_peers() or {}).get(source)
         proof = proof_of(Purpose.CHECK_IN_ANSWER, source, body, key)
         if proof is not Proof.WRONG:
-            self._witness.receive(source, body, by=self._context.peer_id, proven=proof is Proof.SIGNED)
+            self._witness.receive(source, body, by=self.context.peer_id, proven=proof is Proof.SIGNED)
 
     def _stated(
         self, sample: Sample, topic: str, name: str, key: Callable[[str], str]
     ) -> tuple[str, dict[str, Any]] | None:
         """Return the sender and the body; None, audited, if it is not its own."""
-        context, rejected = self._context, f"{topic}_rejected"
+        context, rejected = self.context, f"{topic}_rejected"
         try:
             body = wire.decode(sample.payload, topics.BY_NAME[topic].max_bytes)
             source = identifier(name, body.get(name))
@@ -629,21 +603,12 @@ class FleetSafety:
 
     def _signed(self, fields: dict[str, Any], purpose: Purpose, signing_key: Any) -> dict[str, Any]:
         """Return the fields with the time; with a key also signed."""
-        stated = {**fields, "t": self._context.clock()}
+        stated = {**fields, "t": self.context.clock()}
         if signing_key is None:
             return stated
         stated["nonce"] = secrets.token_hex(16)
-        return signed_stop(signing_key, purpose, self._context.peer_id, stated)
+        return signed_stop(signing_key, purpose, self.context.peer_id, stated)
 
     def _denied(self, why: str) -> dict[str, Any]:
-        self._context.audit("resume_denied", reason=why)
+        self.context.audit("resume_denied", reason=why)
         return {"status": "error", "error": REJECTED}
-
-
-def _require_same_session(body: dict[str, Any], sample: Sample) -> None:
-    """Raise WireError unless body and sample state the same session, or none."""
-    stated = body.get("source_zid")
-    if stated is None and sample.session is None:
-        return
-    if not isinstance(stated, str) or stated != sample.session:
-        raise wire.WireError("source_zid and the sample's session disagree")

@@ -16,9 +16,9 @@ from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.orders import StopOrder, StopRules
 from strands_robots.safety.plane import Registered, SafetyPlane, plane
 from strands_robots.safety.resume import REJECTED
-from strands_robots.safety.scope import EVERY_ROBOT, SCOPE, Scope
+from strands_robots.safety.scope import Scope
 from strands_robots.safety.sightings import DuplicateDeviceError, sightings
-from strands_robots.safety.statements import LockoutAnnouncer, Purpose, with_lockout_statement, with_resume_statement
+from strands_robots.safety.statements import LockoutAnnouncer, with_lockout_statement, with_resume_statement
 from strands_robots.safety.stop_targets import Stoppable
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.stop_log import stop_logger
@@ -172,19 +172,6 @@ class SafetyAdapter:
         stated = {**self.facts(), "cell": self._cell}
         facts = with_lockout_statement(self.identity, peer_id or self._peer_id, stated, nonce)
         return {**facts, "lockout": self.lockouts(), "check_in": check_in}
-
-    def stop_refusal(self, source: str, body: Mapping[str, Any]) -> str | None:
-        """The reason why an e-stop of ``source`` does not count, or None."""
-        why = self._decision.source_refusal(source)
-        if why is None and self._decision.required:
-            why = self._decision.signature_refusal(source, body, Purpose.EMERGENCY_STOP)
-        return why
-
-    def scope(self, source: str, body: Mapping[str, Any]) -> Scope:
-        """Return the scope of an e-stop that counts."""
-        if SCOPE not in body:
-            return EVERY_ROBOT
-        return self._decision.scope(source, body, demanded=self._decision.required)
 
     def within(self, scope: Scope) -> bool:
         """Return True when a stop of this scope is for this robot."""

@@ -26,9 +26,8 @@ from strands_robots.contract import body_of
 from strands_robots.envelope import is_error, text_of
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.mesh import topics
-from strands_robots.mesh.context import Context
-from strands_robots.mesh.scheduler import Scheduler
-from strands_robots.mesh.throttle import TroubleLog
+from strands_robots.mesh.scheduler import Scheduler, TroubleLog
+from strands_robots.mesh.session import Context
 from strands_robots.recording.cameras import Frames, jpeg
 from strands_robots.utils import ValidationError, identifier, shown, w_positive, yaw_of
 

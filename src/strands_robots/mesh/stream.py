@@ -1,17 +1,22 @@
-"""Policy steps on the wire: the observation and the action of each."""
+"""Policy steps that a peer publishes, and the topics that its user subscribes to.
+
+Both leave the thread that they come on, a rollout's or the transport's, at once, for a thread of the peer's own.
+"""
 
 from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping
+import threading
+from collections import deque
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from strands_robots.contract import RolloutEvent, Unsubscribe, robots_in
-from strands_robots.mesh import topics
-from strands_robots.mesh.context import Context
-from strands_robots.mesh.executor import BoundedExecutor
-from strands_robots.mesh.transport import TransportError
+from strands_robots.mesh import topics, wire
+from strands_robots.mesh.scheduler import BoundedExecutor
+from strands_robots.mesh.session import Context
+from strands_robots.mesh.transport import Declaration, Sample, Transport, TransportError, undeclare
 from strands_robots.mesh.wire import WireError
 from strands_robots.rate_limits import RateLimiter
 
@@ -37,7 +42,7 @@ class StepPublisher:
         self._hz = hz
         self._handed_in = RateLimiter(hz)
         self._rollouts = RateLimiter(hz)
-        self._executor = BoundedExecutor(f"{context.peer_id}-stream", 1, WAITING, drop_oldest=True)
+        self._executor = BoundedExecutor(f"{context.peer_id}-stream", WAITING)
         self._unsubscribe: Unsubscribe | None = None
         self._several = False
         self._unpublished = 0
@@ -134,3 +139,92 @@ def _plain(value: Any) -> Any:
         entries = [_plain(entry) for entry in value if not isinstance(entry, list | tuple)]
         return entries if len(entries) == len(value) and None not in entries else None
     return None
+
+
+DataCallback = Callable[[str, dict[str, Any]], None]
+SampleCallback = Callable[[str, dict[str, Any], str | None], None]
+
+INBOX_MAX = 256
+
+
+class Subscriptions:
+    """Named subscriptions; callbacks run one after another on one thread.
+
+    A slow callback loses the oldest messages; it never delays a command or a stop.
+    """
+
+    def __init__(self, executor: BoundedExecutor) -> None:
+        self._executor = executor
+        self._lock = threading.Lock()
+        self._declared: dict[str, Declaration] = {}
+        self.inbox: dict[str, deque[dict[str, Any]]] = {}
+
+    def add(
+        self,
+        transport: Transport,
+        topic: str,
+        name: str,
+        *,
+        callback: DataCallback | None = None,
+        on_sample: SampleCallback | None = None,
+        direct: Callable[[Sample], None] | None = None,
+    ) -> bool:
+        """Subscribe under ``name``, replacing it; False when the transport refused.
+
+        Args:
+            direct: called with the raw sample on the transport's thread instead, for parts of the mesh.
+        """
+        try:
+            declared = transport.declare_subscriber(topic, direct or self._deliverer(callback, name, on_sample))
+        except TransportError as exc:
+            logger.warning("subscribe %s: %s", topic, exc)
+            return False
+        refused = transport.refusals().get(topic)
+        if refused is not None:
+            logger.warning("subscribe %s: %s", topic, refused)
+            undeclare([declared])
+            return False
+        self.remove(name)
+        with self._lock:
+            self._declared[name] = declared
+            if callback is None and on_sample is None and direct is None:
+                self.inbox.setdefault(name, deque(maxlen=INBOX_MAX))
+        return True
+
+    def remove(self, name: str) -> bool:
+        """Undeclare; False when there is none of that name."""
+        with self._lock:
+            declared = self._declared.pop(name, None)
+            self.inbox.pop(name, None)
+        if declared is None:
+            return False
+        undeclare([declared])
+        return True
+
+    def clear(self) -> int:
+        """Undeclare all of them; how many there were."""
+        names = list(self._declared)
+        return sum(self.remove(name) for name in names)
+
+    def _deliverer(
+        self, callback: DataCallback | None, name: str, on_sample: SampleCallback | None
+    ) -> Callable[[Sample], None]:
+        def deliver(sample: Sample) -> None:
+            try:
+                data = wire.decode(sample.payload, topics.topic_of(sample.key).max_bytes)
+            except wire.WireError as exc:
+                logger.debug("%s: %s", sample.key, exc)
+                return
+            if on_sample is not None:
+                on_sample(sample.key, data, sample.session)
+            elif callback is not None:
+                callback(sample.key, data)
+            else:
+                inbox = self.inbox.get(name)
+                if inbox is not None:
+                    inbox.append({"key": sample.key, **data})
+
+        def submit(sample: Sample) -> None:
+            self._executor.submit(lambda: deliver(sample))
+
+        return submit

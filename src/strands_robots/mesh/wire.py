@@ -14,11 +14,13 @@ from typing import Any, Literal
 
 from strands_robots.bounded_json import OutOfBoundsError, parsed
 from strands_robots.errors import StrandsRobotsError
-from strands_robots.safety.lockout import is_epoch
 from strands_robots.utils import ValidationError, identifier, peer_id, shown
 
 FRESH_S = 60.0
 AHEAD_S = 5.0
+
+OTHER_SESSION = "source_zid and the sample's session disagree"
+"""A stop or a resume states the session that it came from."""
 
 BROADCAST_TARGET = "<broadcast>\x00"
 """The target of a command to all; the NUL keeps it apart from every peer id."""
@@ -208,58 +210,22 @@ class Reply:
         return cls(kind, responder, turn, body.get("result"), text, stamp, body)
 
 
-@dataclass(frozen=True, slots=True)
-class EstopNotice:
-    """A fleet e-stop. ``source_zid`` is None where the transport names no sessions."""
-
-    peer_id: str
-    t: float
-    estop_id: str | None
-    source_zid: str | None
-    counts: Mapping[str, Any] = field(default_factory=dict)
-
-    def to_wire(self) -> dict[str, Any]:
-        body = {"peer_id": self.peer_id, "t": self.t, "estop_id": self.estop_id, **self.counts}
-        return body | ({"source_zid": self.source_zid} if self.source_zid is not None else {})
-
-    @classmethod
-    def of(cls, body: Mapping[str, Any]) -> EstopNotice:
-        """Parse ``body``. Raises WireError for an empty issuer or a bad time."""
-        issuer = body.get("peer_id")
-        if not isinstance(issuer, str) or not issuer.strip() or len(issuer) > 256:
-            raise WireError(f"peer_id must name the issuer, not {shown(issuer)}")
-        zid, epoch = body.get("source_zid"), body.get("estop_id")
-        return cls(
-            issuer,
-            _time(body, "t"),
-            epoch if is_epoch(epoch) else None,
-            zid if isinstance(zid, str) else None,
-        )
+def issuer_of(body: Mapping[str, Any]) -> tuple[str, float]:
+    """Return the issuer of an e-stop and its time. Raises WireError without one."""
+    issuer, at = body.get("peer_id"), finite(body.get("t"))
+    if not isinstance(issuer, str) or not issuer.strip() or len(issuer) > 256:
+        raise WireError(f"peer_id must name the issuer, not {shown(issuer)}")
+    if at is None:
+        raise WireError(f"t must be a finite number, not {shown(body.get('t'))}")
+    return issuer, at
 
 
-@dataclass(frozen=True, slots=True)
-class ResumeRelay:
-    """A signed resume on its way to the fleet."""
-
-    peer_id: str
-    t: float
-    assertion: Any
-    source_zid: str | None
-
-    def to_wire(self) -> dict[str, Any]:
-        body = {"peer_id": self.peer_id, "t": self.t, "assertion": self.assertion}
-        return body | ({"source_zid": self.source_zid} if self.source_zid is not None else {})
-
-    @classmethod
-    def of(cls, body: Mapping[str, Any]) -> ResumeRelay:
-        """Parse ``body``. Raises WireError for a bad peer id or a bad time."""
-        zid = body.get("source_zid")
-        return cls(
-            _identifier(body, "peer_id"),
-            _time(body, "t"),
-            body.get("assertion"),
-            zid if isinstance(zid, str) else None,
-        )
+def relay_of(body: Mapping[str, Any], session: str | None) -> tuple[str, Any]:
+    """Return the peer that relays a resume, and its assertion, or raise WireError."""
+    if body.get("source_zid") != session:
+        raise WireError(OTHER_SESSION)
+    _time(body, "t")
+    return _identifier(body, "peer_id"), body.get("assertion")
 
 
 def _peer(body: Mapping[str, Any], name: str) -> str:

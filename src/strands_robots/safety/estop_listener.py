@@ -114,12 +114,14 @@ class Member:
         name: its name on the network.
         identity: returns what signs for it.
         was_here: it was served from this machine in the ten minutes before its start.
+        asks: False for what moves nothing, which answers with what it sent.
     """
 
     robot_id: str
     name: str
     identity: Callable[[], SigningIdentity | None]
     was_here: bool = False
+    asks: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,7 +171,7 @@ class RobotsPort(MissedStopsPort):
         return all(each.locked for each in self._plane.robots.values())
 
     def devices(self) -> Sequence[str]:
-        return [each.name for each in self._members()]
+        return [each.name for each in self._members() if each.asks]
 
     def publish(self, event: str, source: str, fields: Mapping[str, Any]) -> bool:
         return self._publish(event, source, fields)
@@ -452,8 +454,11 @@ class EstopListener:
         key, link, codec = registration.key, registration.link, registration.codec
 
         def members() -> list[Member]:
-            here = [each for each in self._registrations if each.key == key and each.asks and each.network is not None]
-            return [Member(each.robot_id, self._wire_id(each.robot_id), each.identity, each.was_here) for each in here]
+            here = [each for each in self._registrations if each.key == key and each.network is not None]
+            return [
+                Member(each.robot_id, self._wire_id(each.robot_id), each.identity, each.was_here, each.asks)
+                for each in here
+            ]
 
         def publish(event: str, source: str, fields: Mapping[str, Any]) -> bool:
             return link.publish(source, event, codec.encode(event, fields))

@@ -1,17 +1,20 @@
-"""Stops of a world and of its robots, and stops that wait for their verdict."""
+"""Stops of a world and of its robots, one of them as a world, and stops that wait."""
 
 from __future__ import annotations
 
 import threading
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 from strands_robots import settings
-from strands_robots.contract import Haltable, WorldRobot
-from strands_robots.envelope import Envelope
+from strands_robots.contract import Haltable, Observer, Unsubscribe, WorldRobot, for_request
+from strands_robots.envelope import Envelope, error
+from strands_robots.recording.cameras import has_cameras
+from strands_robots.safety.gate import MotionRequest
 from strands_robots.safety.stop_executor import StopExecutor, stop_executor
 from strands_robots.safety.stop_targets import StopOfRobot
 from strands_robots.safety.stopping import (
@@ -239,3 +242,100 @@ def _grouped(due: deque[tuple[StopVerdict, Request]]) -> list[tuple[StopVerdict,
         same = (verdict.halted, tuple(verdict.not_stopped.items()), tuple(verdict.unknown.items()))
         groups.setdefault(same, (verdict, {}))[1][request] = None
     return [(verdict, list(requests)) for verdict, requests in groups.values()]
+
+
+class OneRobot:
+    """One robot of a world, seen as a world that holds nothing else."""
+
+    whole = False
+    """Physics is stepped and reset by the world alone."""
+
+    def __init__(self, world: WorldRobot, name: str) -> None:
+        self._world = world
+        self.tool_name_str = name
+        self.gate = world.gate
+
+    @property
+    def has_cameras(self) -> bool:
+        """True where the world has cameras."""
+        return has_cameras(self._world)
+
+    def arm_verbs(self, robot_name: str = "") -> frozenset[str]:
+        """Return the verbs of an arm that the world carries out for it."""
+        own = getattr(self._world, "arm_verbs", None)
+        verbs: frozenset[str] = own(self.tool_name_str) if callable(own) else frozenset()
+        return verbs
+
+    def list_robots(self) -> list[str]:
+        return [name for name in self._world.list_robots() if name == self.tool_name_str]
+
+    def start_policy(
+        self,
+        robot_name: str,
+        instruction: str,
+        policy_provider: str = "mock",
+        duration: float = 30.0,
+        *,
+        request: MotionRequest | None = None,
+        **policy: Any,
+    ) -> Envelope:
+        policy |= {"policy_provider": policy_provider, "duration": duration}
+        return for_request(request, self._world.start_policy)(robot_name, instruction, **policy)
+
+    def stop_policy(self, robot_name: str) -> Envelope:
+        return self._world.stop_policy(robot_name)
+
+    def outcomes(self) -> dict[str, Any]:
+        """Return how its last policy or motion ended, by its name."""
+        ended: dict[str, Any] = getattr(self._world, "outcomes", dict)()
+        return {name: ended[name] for name in ended if name == self.tool_name_str}
+
+    def list_policies_running(self) -> list[dict[str, Any]]:
+        return [row for row in self._world.list_policies_running() if row.get("robot") == self.tool_name_str]
+
+    def get_state(self) -> Envelope:
+        return self._own(self._world.get_state())
+
+    def get_features(self) -> Envelope:
+        return self._own(self._world.get_features())
+
+    def step(self, n: int = 1) -> Envelope:
+        return error(f"step: {self.tool_name_str} is one robot of a world; ask the world.")
+
+    def reset(self) -> Envelope:
+        return error(f"reset: {self.tool_name_str} is one robot of a world; ask the world.")
+
+    def subscribe(self, observer: Observer) -> Unsubscribe:
+        return self._world.subscribe(observer)
+
+    def halt(self, reason: str = "") -> StopVerdict:
+        """Stop this robot alone."""
+        stop = self.stop_target()
+        return StopVerdict() if stop is None else stop.halt(reason)
+
+    def stop_target(self, name: str = "") -> RobotStop | None:
+        """Return the stop of this robot; None when it left its world.
+
+        Raises:
+            ValidationError: ``name`` is another robot's.
+        """
+        if name not in ("", self.tool_name_str):
+            raise ValidationError(f"there is no robot of this name; the robots here are {self.tool_name_str}")
+        return RobotStop(self._world, self.tool_name_str) if self.list_robots() else None
+
+    def facts(self) -> dict[str, Any]:
+        """Return its fields of presence."""
+        running = self.list_policies_running()
+        fields: dict[str, Any] = {
+            "tool_name": self.tool_name_str,
+            "task_status": "running" if running else "idle",
+            "world": True,
+            "sim_robots": [self.tool_name_str],
+        }
+        return fields | ({"instruction": str(running[0].get("instruction", ""))} if running else {})
+
+    def _own(self, answer: Envelope) -> Envelope:
+        robots = answer.get("robots")
+        if not isinstance(robots, Mapping):
+            return answer
+        return {**answer, "robots": {name: robots[name] for name in robots if name == self.tool_name_str}}

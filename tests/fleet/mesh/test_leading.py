@@ -12,8 +12,8 @@ from fixtures.devices import RecordingDevice
 from strands_robots.errors import RobotError
 from strands_robots.fleet.mesh.leading import LedPeer, LimitedFollower, RemoteFollower, await_peer
 from strands_robots.hardware import HardwareRobot
-from strands_robots.mesh.transport import zenoh_config
-from strands_robots.mesh.transport.zenoh_config import Posture
+from strands_robots.mesh.transport import config
+from strands_robots.mesh.transport.config import Posture
 from strands_robots.teleoperators.leader import LeaderPolicy
 from strands_robots.utils import ValidationError
 
@@ -31,7 +31,7 @@ def test_peer_is_awaited_longer_than_its_link_may_pause(monkeypatch: pytest.Monk
     await_peer(mesh, "arm-1")
     monkeypatch.setenv(stated, "tcp/127.0.0.1:7447")
     await_peer(mesh, "arm-1")
-    retry = zenoh_config.explicit(Posture.from_settings())["connect"]["retry"]
+    retry = config.explicit(Posture.from_settings())["connect"]["retry"]
     assert waited[0] < retry["period_max_ms"] / 1000 < waited[1]
 
 

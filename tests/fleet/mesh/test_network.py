@@ -16,7 +16,7 @@ from strands_robots.errors import ArgumentsError, LockoutError, NoSuchRobotError
 from strands_robots.fleet.mesh import descriptions, network
 from strands_robots.fleet.mesh.network import MeshNetwork
 from strands_robots.mesh import session
-from strands_robots.mesh.transport import zenoh_config
+from strands_robots.mesh.transport import config
 from strands_robots.serving.advertised import RobotDescription
 
 Reply = Callable[[dict[str, Any]], dict[str, Any]]
@@ -65,7 +65,7 @@ def joined(mesh: FakeMesh) -> MeshNetwork:
 
 @pytest.fixture(autouse=True)
 def quick_discovery(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(zenoh_config, "DISCOVERY_S", 0.05)
+    monkeypatch.setattr(config, "DISCOVERY_S", 0.05)
 
 
 def test_silent_peers_hold_up_a_list_for_a_bounded_time(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -182,7 +182,7 @@ def test_motion_is_not_sent_to_a_peer_that_was_not_seen() -> None:
 
 
 def test_stop_of_a_seen_peer_is_sent_at_once_and_asks_for_nothing_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(zenoh_config, "DISCOVERY_S", 60.0)
+    monkeypatch.setattr(config, "DISCOVERY_S", 60.0)
     monkeypatch.delattr(time, "sleep")
     mesh = FakeMesh([row("arm-1")], done)
     there = joined(mesh)

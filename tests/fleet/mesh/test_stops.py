@@ -12,15 +12,15 @@ from strands_robots.envelope import Envelope
 from strands_robots.fleet.mesh import discovery, network, stops
 from strands_robots.fleet.mesh.network import MeshNetwork
 from strands_robots.fleet.mesh.standing import mesh_network
-from strands_robots.mesh.transport import zenoh_config
-from strands_robots.mesh.transport.zenoh_config import Posture
+from strands_robots.mesh.transport import config
+from strands_robots.mesh.transport.config import Posture
 from strands_robots.safety import stop_roster
 from strands_robots.safety.roster import Roster
 
 
 def test_discovery_of_a_stated_endpoint_outlasts_its_retry_pause() -> None:
-    pause = zenoh_config.explicit(Posture.from_settings())["connect"]["retry"]["period_max_ms"] / 1000
-    assert pause + zenoh_config.DISCOVERY_S < zenoh_config.LINK_DISCOVERY_S
+    pause = config.explicit(Posture.from_settings())["connect"]["retry"]["period_max_ms"] / 1000
+    assert pause + config.DISCOVERY_S < config.LINK_DISCOVERY_S
 
 
 class TimedMesh:
@@ -154,7 +154,7 @@ def test_connecting_peer_waits_for_its_listener(
     monkeypatch.setenv("ZENOH_CONNECT", "tcp/127.0.0.1:7447")
     mesh = timed_mesh({"arm-1": 7.0})
     assert locked(mesh)["stopped"] is True
-    assert mesh.now < 7.0 + 2 * zenoh_config.DISCOVERY_S
+    assert mesh.now < 7.0 + 2 * config.DISCOVERY_S
 
 
 def test_robot_that_left_without_an_answer_is_named(

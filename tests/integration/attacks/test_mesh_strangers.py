@@ -14,7 +14,7 @@ from fixtures.mesh_strangers import APPROVED, WAVE, Stranger, stranger_on
 from fixtures.waiting import eventually
 from tests.integration.mesh.networks import OverZenoh, network
 
-from strands_robots.mesh.registry import SESSION_PEERS_MAX
+from strands_robots.mesh.session import SESSION_PEERS_MAX
 
 TRIES = 15
 KINDS = ["unsigned", "copied source", "wrong key", "another purpose", "replay", "ghosts and a stolen name"]

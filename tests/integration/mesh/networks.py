@@ -17,10 +17,10 @@ from fixtures.waiting import eventually, free_port
 from tests.mesh.peers import Fleet, RealClock
 
 from strands_robots.mesh import keys
-from strands_robots.mesh.transport import Transport, access
+from strands_robots.mesh.transport import Transport, config
+from strands_robots.mesh.transport.config import Posture
 from strands_robots.mesh.transport.iot import Account, IotMqttTransport
 from strands_robots.mesh.transport.zenoh import ZenohTransport
-from strands_robots.mesh.transport.zenoh_config import Posture
 
 CANNOT = {
     ("mqtt", "input"): "input frames are not sent over MQTT",
@@ -153,7 +153,7 @@ class OverTls(OverZenoh):
         own = keys.issue(self.folder / "keys", name)
         return ZenohTransport(
             Posture(
-                "strands", (f"tls/127.0.0.1:{self.port}",), (), None, own, access.certified_peers("strands/"), False, 16
+                "strands", (f"tls/127.0.0.1:{self.port}",), (), None, own, config.certified_peers("strands/"), False, 16
             )
         )
 
@@ -208,7 +208,7 @@ class OverBoth(OverMqtt):
         own = keys.issue(self._keys, name)
         return ZenohTransport(
             Posture(
-                "strands", (f"tls/127.0.0.1:{self.port}",), (), None, own, access.certified_peers("strands/"), False, 16
+                "strands", (f"tls/127.0.0.1:{self.port}",), (), None, own, config.certified_peers("strands/"), False, 16
             )
         )
 

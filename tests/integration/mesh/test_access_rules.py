@@ -18,7 +18,7 @@ from tests.integration.mesh.conftest import Join
 
 from strands_robots.device_connect.backends import LinkConfig
 from strands_robots.mesh import keys
-from strands_robots.mesh.transport import access
+from strands_robots.mesh.transport import config
 
 CMD = "strands/strands/*/cmd"
 
@@ -93,12 +93,12 @@ LETS_IN = {
 def test_zenoh_takes_each_name_of_a_subject_literally(tmp_path: Path, subject: dict[str, Any], through: bool) -> None:
     authority = Authority(tmp_path)
     known, own = {"id": "arm", "cert_common_names": ["arm"]}, {"id": "who", **subject}
-    put = access.allow("open", ["put"], ["ingress"], [CMD])
-    hear = access.allow("hear", ["put", "declare_subscriber"], ["ingress", "egress"], ["strands/strands/**"])
-    told = access.allow("told", ["declare_subscriber"], ["egress"], ["**"])
+    put = config.allow("open", ["put"], ["ingress"], [CMD])
+    hear = config.allow("hear", ["put", "declare_subscriber"], ["ingress", "egress"], ["strands/strands/**"])
+    told = config.allow("told", ["declare_subscriber"], ["egress"], ["**"])
     policies = [{"rules": ["open"], "subjects": ["who"]}, {"rules": ["hear"], "subjects": ["arm"]}]
     everyone = {"rules": ["told"], "subjects": ["all"]}
-    rules = access.deny_by_default([put, hear, told], [known, own, {"id": "all"}], [*policies, everyone])
+    rules = config.deny_by_default([put, hear, told], [known, own, {"id": "all"}], [*policies, everyone])
     received: list[str] = []
     with ZenohRouter(authority.issue("router"), rules) as router, ExitStack() as sessions:
         arm, mallory = (

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 import pytest
 from fixtures.waiting import accepts, eventually, free_port
 
+from strands_robots.mesh.transport.config import Posture
 from strands_robots.mesh.transport.zenoh import ZenohTransport
-from strands_robots.mesh.transport.zenoh_config import Posture
 
 
 @pytest.fixture

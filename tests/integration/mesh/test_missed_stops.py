@@ -18,8 +18,8 @@ from fixtures.tcp_proxy import TcpProxy
 from fixtures.waiting import eventually, free_port
 from tests.integration.mesh.conftest import Join
 
+from strands_robots.mesh.transport.config import Posture
 from strands_robots.mesh.transport.zenoh import ZenohTransport
-from strands_robots.mesh.transport.zenoh_config import Posture
 
 LEASE_S = 4.0
 STRANGERS = 10_000

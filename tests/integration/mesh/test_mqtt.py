@@ -14,10 +14,10 @@ from fixtures.mqtt_retainer import Retainer, command
 from fixtures.waiting import eventually, free_port
 
 from strands_robots.mesh import keys
-from strands_robots.mesh.console_keys import MOTION, ConsoleSigner
 from strands_robots.mesh.resume_authority import keygen
 from strands_robots.mesh.transport import TransportError
 from strands_robots.mesh.transport.iot import Account, IotMqttTransport, filter_of
+from strands_robots.mesh.wire_identity import MOTION, ConsoleSigner
 
 Join = Callable[..., MeshPeer]
 PASSPHRASE = "Correct-Horse-7-Battery"

@@ -12,10 +12,9 @@ from fixtures.older_mesh_peer import OlderMeshPeer
 from fixtures.waiting import eventually, free_port
 
 from strands_robots.mesh.core import Mesh, Parts
-from strands_robots.mesh.older_peers import Pacer
-from strands_robots.mesh.registry import PeerRegistry
+from strands_robots.mesh.session import Pacer, PeerRegistry
+from strands_robots.mesh.transport.config import Posture
 from strands_robots.mesh.transport.zenoh import ZenohTransport
-from strands_robots.mesh.transport.zenoh_config import Posture
 from strands_robots.safety.persistence import LockoutStore
 from strands_robots.safety.plane import SafetyPlane
 

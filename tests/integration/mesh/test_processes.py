@@ -9,8 +9,8 @@ from pathlib import Path
 from fixtures.waiting import accepts, eventually
 from tests.integration.mesh.conftest import Join
 
-from strands_robots.mesh.registry import PEER_TIMEOUT
 from strands_robots.mesh.resume_authority import keygen
+from strands_robots.mesh.session import PEER_TIMEOUT
 from strands_robots.safety.persistence import LockoutStore
 
 

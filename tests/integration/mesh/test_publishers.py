@@ -8,8 +8,8 @@ import pytest
 from fixtures.waiting import free_port
 
 from strands_robots.mesh.transport import zenoh
+from strands_robots.mesh.transport.config import Posture
 from strands_robots.mesh.transport.zenoh import ZenohTransport
-from strands_robots.mesh.transport.zenoh_config import Posture
 
 THREADS = 8
 MESSAGES = 2000

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from pathlib import Path
 
+from fixtures import mesh_call_path
 from fixtures.call_path import Call, CallPath, documented, hops
 from fixtures.devices import RecordingDevice
 from fixtures.nats_server import NatsServer
@@ -48,7 +49,7 @@ def way_of_a_stop() -> tuple[list[Call], list[str]]:
             registration.close()
             robot.cleanup()
     callback = next(index for index, call in enumerate(way) if call.name.endswith("on_message"))
-    return way[callback:], path.entered("on_message", "DeviceBody._hold")
+    return way[callback:], path.entered(way[callback:])
 
 
 def test_stop_of_a_real_arm_takes_the_documented_way_with_two_hand_offs() -> None:
@@ -57,4 +58,13 @@ def test_stop_of_a_real_arm_takes_the_documented_way_with_two_hand_offs() -> Non
     assert threads == ["stop-link", "estop-listener", "halt-arm"]
     assert hops(way) == documented(ARCHITECTURE, "stop-path")
     assert len(hops(way)) <= 14
+    assert len(entered) <= 55
+
+
+def test_stop_over_the_mesh_takes_the_documented_way_with_two_hand_offs(tmp_path: Path) -> None:
+    way, entered = mesh_call_path.stop(tmp_path)
+    assert len(list(itertools.groupby(call.thread for call in way))) == 3
+    assert way[-1].thread == "halt-arm"
+    assert hops(way) == documented(ARCHITECTURE, "mesh-stop-path")
+    assert len(hops(way)) <= 13
     assert len(entered) <= 55

@@ -25,3 +25,21 @@ def test_execute_takes_the_documented_way_of_at_most_ten_hops_and_ninety_functio
     assert way.count("hand-over") == 2
     assert len(way) - 2 <= 10
     assert len(entered) <= 90, "\n".join(entered)
+
+
+def test_execute_over_the_mesh_takes_no_longer_way(
+    tmp_path: Path,
+) -> None:
+    state = tmp_path / "state"
+    state.mkdir(mode=0o700)
+    settings = {"BYPASS_TOOL_CONSENT": "true", "STRANDS_ALLOW_MOCK": "true", "STRANDS_STATE_DIR": str(state)}
+    traced = [sys.executable, "-m", "fixtures.mesh_call_path"]
+    told = subprocess.run(
+        traced, cwd=ROOT, env={**os.environ, **settings}, capture_output=True, text=True, timeout=100, check=False
+    )
+    assert told.returncode == 0, told.stderr
+    way, entered = (block.split() for block in told.stdout.split("\n\n"))
+    assert way == documented(ROOT / "docs" / "architecture.md", "mesh-command-path")
+    assert way.count("hand-over") == 2
+    assert len(way) - 2 <= 10
+    assert len(entered) <= 90, "\n".join(entered)

@@ -74,7 +74,8 @@ def result(rpc_id: RpcId, value: object) -> bytes:
     Raises:
         TypeError, ValueError: the value has no JSON at all.
     """
-    return sendable(json.dumps({"jsonrpc": "2.0", "id": rpc_id, "result": value}).encode())
+    reply = json.dumps({"jsonrpc": "2.0", "id": rpc_id, "result": value}).encode()
+    return sendable(reply) if b"NaN" in reply or b"Infinity" in reply else reply
 
 
 def sendable(reply: bytes, size_max: int | None = None) -> bytes:

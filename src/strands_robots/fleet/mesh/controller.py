@@ -33,7 +33,7 @@ class MeshController:
     """
 
     def __init__(self, mesh: Mesh, signing_key: Any = None) -> None:
-        from strands_robots.mesh.transport.zenoh_config import DISCOVERY_S  # noqa: PLC0415 - the network is loaded when it is used
+        from strands_robots.mesh.transport.config import DISCOVERY_S  # noqa: PLC0415 - the network is loaded when it is used
 
         self._mesh = mesh
         self._key = signing_key

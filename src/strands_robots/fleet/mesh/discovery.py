@@ -53,7 +53,7 @@ def discover(
         since: when it joined, in monotonic seconds; just now by default.
         within: seconds from now that are waited at most for such links.
     """
-    from strands_robots.mesh.transport.zenoh_config import (  # noqa: PLC0415 - loaded when it is used
+    from strands_robots.mesh.transport.config import (  # noqa: PLC0415 - loaded when it is used
         DISCOVERY_S,
         LINK_DISCOVERY_S,
         stated_endpoints,

@@ -270,7 +270,7 @@ def await_peer(mesh: Mesh, peer: str) -> None:
         NoSuchRobotError: it is not seen in time.
     """
     from strands_robots.mesh.core import wait_for_peer  # noqa: PLC0415 - the network is loaded when it is used
-    from strands_robots.mesh.transport.zenoh_config import discovery_timeout  # noqa: PLC0415 - as above
+    from strands_robots.mesh.transport.config import discovery_timeout  # noqa: PLC0415 - as above
 
     if not wait_for_peer(mesh, peer, discovery_timeout(_PEER_S)):
         raise NoSuchRobotError(f"No peer {peer!r} is on the mesh of this machine")

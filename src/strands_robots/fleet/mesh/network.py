@@ -137,7 +137,7 @@ class MeshNetwork:
         from strands_robots.mesh import session  # noqa: PLC0415 - the network is loaded when it is used
         from strands_robots.mesh.core import Mesh, Parts  # noqa: PLC0415 - as above
         from strands_robots.mesh.transport import TransportError  # noqa: PLC0415 - as above
-        from strands_robots.mesh.transport.zenoh_config import stated_endpoints  # noqa: PLC0415 - as above
+        from strands_robots.mesh.transport.config import stated_endpoints  # noqa: PLC0415 - as above
         from strands_robots.mesh.wire_identity import IdentityError, visitor_id  # noqa: PLC0415 - as above
 
         try:
@@ -286,7 +286,7 @@ class MeshNetwork:
         self, robot: str, timeout: float = STOP_S, robot_name: str = "", *, insist: bool = False
     ) -> Envelope | None:
         """Stop the peer; *stopped* counts only where an enrolled robot has signed it."""
-        from strands_robots.mesh.transport.zenoh_config import DISCOVERY_S, discovery_timeout  # noqa: PLC0415 - loaded when it is used
+        from strands_robots.mesh.transport.config import DISCOVERY_S, discovery_timeout  # noqa: PLC0415 - loaded when it is used
 
         # It leaves at once, and again until the peers in reach are known: a hub may not have linked it yet.
         mesh, longest = self._joined_mesh, discovery_timeout(DISCOVERY_S)
@@ -475,7 +475,7 @@ class MeshNetwork:
 
         The first stop of a command then waits for the others from its own sending on.
         """
-        from strands_robots.mesh.transport.zenoh_config import DISCOVERY_S  # noqa: PLC0415 - loaded when it is used
+        from strands_robots.mesh.transport.config import DISCOVERY_S  # noqa: PLC0415 - loaded when it is used
 
         return None if self._given and time.monotonic() < self._joined + DISCOVERY_S else self._joined
 
@@ -516,7 +516,7 @@ class MeshNetwork:
 
     def _waited_for(self, robot: str) -> bool:
         """Return whether the peer is in reach, once that can be known."""
-        from strands_robots.mesh.transport.zenoh_config import DISCOVERY_S, discovery_timeout  # noqa: PLC0415 - as above
+        from strands_robots.mesh.transport.config import DISCOVERY_S, discovery_timeout  # noqa: PLC0415 - as above
 
         # A loaded machine gets twice the time.
         return awaited(self._joined_mesh, robot, self._joined + max(discovery_timeout(DISCOVERY_S), 2 * DISCOVERY_S))

@@ -140,6 +140,28 @@ class Transport(ABC):
             TransportError: the transport is closed.
         """
 
+    @property
+    def stops_up(self) -> bool:
+        """True while stops also arrive on a connection of their own."""
+        return False
+
+    def open_stops(
+        self, on_stop: Callable[[str, bytes], None], on_check_in: Callback | None = None
+    ) -> Callable[[], None]:
+        """Open a connection for stops alone, and return what closes it; wait for nothing.
+
+        A transport without one receives stops on its only connection.
+
+        Args:
+            on_stop: called with the publisher's session, "" for none, and the message.
+            on_check_in: called for check-ins, where robots need a live controller.
+        """
+        return lambda: None
+
+    def put_stop(self, key: str, payload: Mapping[str, Any]) -> bool:
+        """Publish there, as from :attr:`session_id`; False where it is not up."""
+        return False
+
     def refusals(self) -> Mapping[str, str]:
         """Key expressions whose subscription the network refused, with the reason."""
         return {}

@@ -13,7 +13,7 @@ from typing import Any
 
 from strands_robots import settings
 from strands_robots.mesh import topics, wire
-from strands_robots.mesh.throttle import RecentKeys
+from strands_robots.mesh.scheduler import RecentKeys
 from strands_robots.mesh.transport import (
     Callback,
     Declaration,
@@ -227,6 +227,18 @@ class BridgeTransport(Transport):
             self._subscribers = [each for each in self._subscribers if not each.gone] + [subscriber]
         self._repair()
         return subscriber
+
+    @property
+    def stops_up(self) -> bool:
+        return self._local.stops_up
+
+    def open_stops(
+        self, on_stop: Callable[[str, bytes], None], on_check_in: Callback | None = None
+    ) -> Callable[[], None]:
+        return self._local.open_stops(on_stop, on_check_in)
+
+    def put_stop(self, key: str, payload: Mapping[str, Any]) -> bool:
+        return self._local.put_stop(key, payload)
 
     def refusals(self) -> Mapping[str, str]:
         return {**self._local.refusals(), **self._cloud.refusals()}

@@ -9,16 +9,16 @@ import math
 import secrets
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from itertools import count
 from typing import Any
 
 from strands_robots.mesh import topics, wire
-from strands_robots.mesh.transport import Callback, LivenessCallback, Sample, Transport, TransportError, zenoh_config
-from strands_robots.mesh.transport.zenoh_config import Posture
+from strands_robots.mesh.transport import Callback, LivenessCallback, Sample, Transport, TransportError, config
+from strands_robots.mesh.transport.config import Posture
 from strands_robots.utils import missing_extra
-from strands_robots.zenoh_session import close_in_background
+from strands_robots.zenoh_session import StopSession, close_in_background, direct
 
 logger = logging.getLogger(__name__)
 
@@ -45,7 +45,8 @@ class ZenohTransport(Transport):
 
     def __init__(self, posture: Posture | None = None) -> None:
         self._posture = posture
-        self._id = secrets.token_hex(16).lstrip("0") or "1"
+        self._id, self._stops_id = (secrets.token_hex(16).lstrip("0") or "1" for _ in range(2))
+        self._stops: StopSession | None = None
         self._session: Any = None
         self._relay: Any = None
         self._zenoh: Any = None
@@ -89,7 +90,7 @@ class ZenohTransport(Transport):
             self._closing.clear()
             self._hub, self.links_up, self._links_lost, self._cut = False, 0, 0, False
             if posture.hub is None:
-                self._session = self._open(zenoh_config.explicit(posture, self._id))
+                self._session = self._open(config.explicit(posture, self._id))
             else:
                 self._session = self._open_on_loopback(posture)
             self._watch_links(self._session, of_hub=posture.hub is not None and not self._hub)
@@ -97,6 +98,7 @@ class ZenohTransport(Transport):
                 logger.info("The mesh runs without certificates, on this machine alone or by the operator's opt-in.")
 
     def close(self) -> None:
+        self._close_stops()
         self._closing.set()
         with self._lock:
             session, relay, links = self._session, self._relay, self._links
@@ -163,6 +165,48 @@ class ZenohTransport(Transport):
             raise TransportError(f"{key}: {exc}") from None
 
     def declare_subscriber(self, key: str, callback: Callback) -> Any:
+        deliver = self._deliverer(key, callback)
+        return self._declare(lambda session, handler: session.declare_subscriber(key, handler), deliver, key)
+
+    @property
+    def stops_up(self) -> bool:
+        stops = self._stops
+        return stops is not None and stops.up
+
+    def open_stops(
+        self, on_stop: Callable[[str, bytes], None], on_check_in: Callback | None = None
+    ) -> Callable[[], None]:
+        posture = self._posture
+        if self._stops is not None or posture is None or not config.stops_through(posture):
+            return lambda: None
+        self._stops = stops = StopSession(lambda: config.stops(posture, self._stops_id))
+        most, put = topics.BY_NAME["estop"].max_bytes, self._zenoh.SampleKind.PUT
+
+        def on_message(sample: Any) -> None:
+            source, payload = sample.source_info, sample.payload
+            if sample.kind == put and len(payload) <= most:
+                on_stop("" if source is None else str(source.source_id.zid), payload.to_bytes())
+
+        keys: dict[str, Callable[[Any], None]] = {topics.estop(): on_message}
+        if on_check_in is not None:
+            keys[topics.check_in("*")] = self._deliverer(topics.check_in("*"), on_check_in)
+        stops.start(keys, lambda up: None)
+        return self._close_stops
+
+    def put_stop(self, key: str, payload: Mapping[str, Any]) -> bool:
+        stops, session = self._stops, self._session
+        if stops is None or session is None or not stops.up:
+            return False
+        source = self._zenoh.SourceInfo(session.id, next(self._numbers) & 0xFFFFFFFF)
+        data = wire.encode(payload, topics.topic_of(key).max_bytes)
+        return stops.put(key, data, answer=False, source=source)
+
+    def _close_stops(self) -> None:
+        stops, self._stops = self._stops, None
+        if stops is not None:
+            stops.close()
+
+    def _deliverer(self, key: str, callback: Callback) -> Callable[[Any], None]:
         def deliver(sample: Any) -> None:
             if sample.kind != self._zenoh.SampleKind.PUT:
                 return
@@ -176,7 +220,7 @@ class ZenohTransport(Transport):
             except Exception:
                 logger.exception("A subscriber of %s failed.", key)
 
-        return self._declare(lambda session, direct: session.declare_subscriber(key, direct), deliver, key)
+        return deliver
 
     def declare_token(self, key: str) -> Any:
         session = self._require()
@@ -192,8 +236,8 @@ class ZenohTransport(Transport):
             except Exception:
                 logger.exception("A watcher of %s failed.", key)
 
-        def declare(session: Any, direct: Any) -> Any:
-            return session.liveliness().declare_subscriber(key, direct, history=True)
+        def declare(session: Any, handler: Any) -> Any:
+            return session.liveliness().declare_subscriber(key, handler, history=True)
 
         return self._declare(declare, deliver, key)
 
@@ -209,11 +253,9 @@ class ZenohTransport(Transport):
 
     def _declare(self, declare: Any, deliver: Any, key: str) -> Any:
         session = self._require()
-        # On Zenoh's own thread. The interpreter waits for the thread of an indirect callback before it ends, so a
-        # process whose mesh is still open would never end; and a stop would overtake a motion that waits there.
-        direct = self._zenoh.handlers.Callback(deliver, indirect=False)
         try:
-            return declare(session, direct)
+            # On Zenoh's own thread: a stop must not overtake a motion that waits for another one.
+            return declare(session, direct(deliver))
         except self.errors() as exc:
             raise TransportError(f"{key}: {exc}") from None
 
@@ -259,12 +301,12 @@ class ZenohTransport(Transport):
         deadline = time.monotonic() + OPEN_S
         while True:
             with contextlib.suppress(TransportError):  # another process is the hub
-                session = self._open(zenoh_config.hub(posture, self._id))
+                session = self._open(config.hub(posture, self._id))
                 self._hub = True
                 logger.info("This process is the mesh's hub on %s.", posture.hub)
                 return session
             try:
-                session = self._open(zenoh_config.child(posture, self._id))
+                session = self._open(config.child(posture, self._id))
             except TransportError as exc:
                 if time.monotonic() < deadline:
                     continue  # the hub died in between, or is coming up
@@ -275,15 +317,17 @@ class ZenohTransport(Transport):
 
     def _dial(self, posture: Posture) -> Any:
         try:
-            return self._open(zenoh_config.child(posture, self._id, DIAL_MS))
+            return self._open(config.child(posture, self._id, DIAL_MS))
         except TransportError:
             if posture.multicast:
                 # The hubs of other machines are found later, if at all, and so is one that this machine gets.
-                return self._open(zenoh_config.explicit(replace(posture, connect=(str(posture.hub),)), self._id))
+                return self._open(config.explicit(replace(posture, connect=(str(posture.hub),)), self._id))
             raise TransportError(f"no mesh answers on {posture.hub}.") from None
 
     def _watch_links(self, session: Any, *, of_hub: bool) -> None:
         def changed(event: Any) -> None:
+            if str(event.transport.zid) == self._stops_id:
+                return  # our own second session, by which no other process is reached
             if event.kind == self._zenoh.SampleKind.PUT:
                 close_in_background()
                 self.links_up += 1
@@ -298,8 +342,7 @@ class ZenohTransport(Transport):
                 self._lost_link_at = time.monotonic()
                 threading.Thread(target=self._rescue, name="mesh-rescue", daemon=True).start()
 
-        direct = self._zenoh.handlers.Callback(changed, indirect=False)
-        self._links = session.info.declare_transport_events_listener(direct, history=True)
+        self._links = session.info.declare_transport_events_listener(direct(changed), history=True)
 
     def _rescue(self) -> None:
         """Try to become the hub until our session is linked to one again."""
@@ -312,7 +355,7 @@ class ZenohTransport(Transport):
                 steady = steady + 1 if self.linked() else 0
                 if steady == 0 and self._relay is None and not self.dials_only:
                     with contextlib.suppress(TransportError):  # another survivor was quicker
-                        self._relay = self._open(zenoh_config.hub(posture))
+                        self._relay = self._open(config.hub(posture))
                         logger.warning("The mesh's hub is gone; this process relays on %s now.", posture.hub)
                 self._closing.wait(RESCUE_EVERY_S)
         finally:

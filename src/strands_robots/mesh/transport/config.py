@@ -1,4 +1,4 @@
-"""The Zenoh configuration of a session: endpoints, TLS, access, rates, sizes.
+"""Configuration of a Zenoh session: endpoints, TLS, access rules, rates, sizes.
 
 A mesh bound to loopback alone comes up without certificates. Leaving loopback needs mutual TLS, or an opt-in
 that says in its name what it is.
@@ -6,12 +6,18 @@ that says in its name what it is.
 Measured on Zenoh 1.10: rules name keys with the namespace in front, and a downsampler keeps one clock for a whole
 rule and drops by spacing. So only telemetry is downsampled, where a dropped message is followed by the next one,
 and only on the way in, where each link has a clock of its own and a flood starves only its own sender.
+
+Access rules, with mutual TLS: every name of a subject is taken literally (``"*"`` is no wildcard), a field that is
+absent or null restricts nothing, absent ``flows`` are both, a deny wins over every allow, and ``interfaces: ["lo"]`` is
+every process of the machine.
 """
 
 from __future__ import annotations
 
+import json
 import logging
 import stat
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from ipaddress import ip_address
 from pathlib import Path
@@ -19,7 +25,171 @@ from typing import Any
 
 from strands_robots import settings
 from strands_robots.mesh import topics
-from strands_robots.mesh.transport import TransportError, access
+from strands_robots.mesh.transport import TransportError
+from strands_robots.zenoh_session import LEASE_MS, transport_config, use_tls
+
+ACL_FILE = "STRANDS_MESH_ACL_FILE"
+PERMISSIVE_ACL = "STRANDS_MESH_ACCEPT_PERMISSIVE_ACL"
+ACL_MAX_BYTES = 256 * 1024
+SHOWN = 3
+"""Open rules that a message names; the others are counted."""
+
+MESSAGES = (
+    "put",
+    "delete",
+    "declare_subscriber",
+    "liveliness_token",
+    "liveliness_query",
+    "declare_liveliness_subscriber",
+)
+
+MOVING = tuple(topics.BY_NAME[name].pattern for name in ("cmd", "broadcast", "input"))
+"""The topics on which a message can move a robot."""
+
+RESTRICTIONS = ("interfaces", "usernames", "link_protocols", "zids")
+"""Fields of a subject that no certificate proves."""
+
+
+def allow(name: str, messages: Iterable[str], flows: Iterable[str], keys: Iterable[str]) -> dict[str, Any]:
+    """Return one access rule that allows messages on key expressions."""
+    return {"id": name, "permission": "allow", "messages": [*messages], "flows": [*flows], "key_exprs": [*keys]}
+
+
+def deny_by_default(
+    rules: list[dict[str, Any]], subjects: list[dict[str, Any]], policies: list[dict[str, Any]]
+) -> dict[str, Any]:
+    """Return an access control that denies what no rule allows."""
+    parts = {"rules": rules, "subjects": subjects, "policies": policies}
+    return {"enabled": True, "default_permission": "deny", **parts}
+
+
+def certified_peers(prefix: str) -> dict[str, Any]:
+    """Return the rules used without a file: every topic for certified peers."""
+    rule = allow("mesh", MESSAGES, ["ingress", "egress"], [f"{prefix}{topics.ROOT}/**"])
+    return deny_by_default([rule], [{"id": "certified"}], [{"rules": ["mesh"], "subjects": ["certified"]}])
+
+
+def read_rules(path: Path) -> dict[str, Any]:
+    """Return the access control in a JSON5 file, as Zenoh reads it.
+
+    Raises:
+        TransportError: the file is too large, open to the writes of others, or no access control that is enabled.
+    """
+    import zenoh  # noqa: PLC0415 - the JSON5 reader is Zenoh's own
+
+    facts = path.stat()
+    if facts.st_size > ACL_MAX_BYTES:
+        raise TransportError(f"{ACL_FILE}: {path} is above {ACL_MAX_BYTES // 1024} KiB.")
+    if stat.S_IMODE(facts.st_mode) & stat.S_IWOTH:
+        raise TransportError(f"{ACL_FILE}: everyone may write {path}; run chmod o-w on it.")
+    try:
+        config = zenoh.Config()
+        config.insert_json5("access_control", path.read_text(encoding="utf-8"))
+        rules = json.loads(config.get_json("access_control"))
+    except (zenoh.ZError, ValueError) as exc:
+        raise TransportError(f"{ACL_FILE}: {path} is no access control of Zenoh's: {exc}") from None
+    if not isinstance(rules, dict) or rules.get("enabled") is not True:
+        raise TransportError(f"{ACL_FILE}: {path} must have enabled: true.")
+    return rules
+
+
+def literal_wildcard(rules: dict[str, Any]) -> str | None:
+    """Return the reason why a subject names nobody, or None.
+
+    Zenoh compares names as they are, so that a name with a wildcard is a rule for nobody.
+    """
+    for subject in rules.get("subjects") or ():
+        for field in ("cert_common_names", *RESTRICTIONS):
+            for name in subject.get(field) or ():
+                if any(sign in str(name) for sign in "*?"):
+                    return (
+                        f"subject {subject['id']!r} has {field} {name!r}, which Zenoh takes literally, as the name of "
+                        "nobody"
+                    )
+    return None
+
+
+def open_rules(rules: dict[str, Any], prefix: str) -> list[str]:
+    """Return a sentence for each rule that lets an unnamed peer move robots.
+
+    A named peer is one whose certificate a subject lists.
+
+    Args:
+        prefix: the namespace and a slash, which stand in front of every topic in a rule.
+    """
+    import zenoh  # noqa: PLC0415 - key expressions are Zenoh's own
+
+    moving = {f"{prefix}{pattern}": zenoh.KeyExpr(f"{prefix}{pattern}") for pattern in MOVING}
+    # Every peer may stop the fleet, and no peer is called safety.
+    stops = zenoh.KeyExpr(f"{prefix}{topics.ROOT}/safety/**")
+    unnamed = [(rule, subject) for rule, subject in _joined(rules) if not subject.get("cert_common_names")]
+    denied = [
+        zenoh.KeyExpr(key)
+        for rule, subject in unnamed
+        if rule["permission"] == "deny" and not any(subject.get(field) for field in RESTRICTIONS)
+        for key in rule["key_exprs"]
+    ]
+    found: dict[str, None] = {}
+    if rules.get("default_permission") != "deny" and any(not _includes(denied, key) for key in moving.values()):
+        found["default_permission is not deny"] = None
+    for rule, subject in unnamed:
+        if rule["permission"] != "allow":
+            continue
+        for text in rule["key_exprs"]:
+            key = zenoh.KeyExpr(text)
+            if stops.includes(key) or _includes(denied, key):
+                continue
+            reached = [name for name, topic in moving.items() if key.intersects(topic) and not _includes(denied, topic)]
+            if reached:
+                found[
+                    f"rule {rule['id']!r} ({text}) lets subject {subject['id']!r}{_stated(subject)}, which names no "
+                    f"certificate, publish on {', '.join(reached)}"
+                ] = None
+    return [*found]
+
+
+def stops_get_in(rules: dict[str, Any], prefix: str) -> bool:
+    """Return False where no rule lets an emergency stop of any peer in."""
+    import zenoh  # noqa: PLC0415 - key expressions are Zenoh's own
+
+    estop = zenoh.KeyExpr(f"{prefix}{topics.estop()}")
+    reaching = [(rule, subject) for rule, subject in _joined(rules) if _includes(rule["key_exprs"], estop)]
+    if any(
+        rule["permission"] == "deny" and not any(subject.get(field) for field in ("cert_common_names", *RESTRICTIONS))
+        for rule, subject in reaching
+    ):
+        return False
+    return rules.get("default_permission") != "deny" or any(rule["permission"] == "allow" for rule, _ in reaching)
+
+
+def shortened(sentences: list[str]) -> str:
+    """Return the first sentences as one, with the number of the others."""
+    more = len(sentences) - SHOWN
+    return "; ".join(sentences[:SHOWN]) + (f"; and {more} more" if more > 0 else "")
+
+
+def _joined(rules: dict[str, Any]) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
+    """Pair each rule for incoming messages with its subjects."""
+    by_id = {rule["id"]: rule for rule in rules.get("rules") or ()}
+    subjects = {subject["id"]: subject for subject in rules.get("subjects") or ()}
+    for policy in rules.get("policies") or ():
+        for rule in (by_id[name] for name in policy["rules"] if name in by_id):
+            if "put" in rule["messages"] and "ingress" in (rule["flows"] or ("ingress",)):
+                for name in policy["subjects"]:
+                    if name in subjects:
+                        yield rule, subjects[name]
+
+
+def _includes(keys: Iterable[Any], other: Any) -> bool:
+    import zenoh  # noqa: PLC0415 - key expressions are Zenoh's own
+
+    return any(zenoh.KeyExpr(str(key)).includes(other) for key in keys)
+
+
+def _stated(subject: dict[str, Any]) -> str:
+    stated = [f"{field} {subject[field]}" for field in RESTRICTIONS if subject.get(field)]
+    return f" ({', '.join(stated)})" if stated else ""
+
 
 logger = logging.getLogger(__name__)
 
@@ -27,8 +197,6 @@ KEYS_COMMAND = "strands-robots mesh keys init"
 TLS_FILES = ("STRANDS_MESH_TLS_CA", "STRANDS_MESH_TLS_CERT", "STRANDS_MESH_TLS_KEY")
 
 RETRY_MS = 250
-LEASE_MS = 4000
-HANDSHAKE_MS = 2000
 WAIT_BEFORE_DROP_US = 10_000
 _RETRY = {"period_init_ms": RETRY_MS, "period_max_ms": RETRY_MS, "period_increase_factor": 1}
 
@@ -194,25 +362,49 @@ def explicit(posture: Posture, session: str | None = None) -> dict[str, Any]:
     return config
 
 
+def stops_through(posture: Posture) -> tuple[str, ...]:
+    """Return endpoints by which a session for stops reaches the others, if any."""
+    if posture.hub is not None:
+        return (posture.hub,)
+    return posture.connect or tuple(_from_here(each) for each in posture.listen if not each.endswith(":0"))
+
+
+def stops(posture: Posture, session: str) -> dict[str, Any]:
+    """Configure the session that carries stops alone.
+
+    It is a client of the hub, of a stated endpoint, or of our own listener: it needs no port then, and stops pass on
+    links of their own.
+    """
+    config = _base(posture, session)
+    config["mode"] = "client"
+    config["listen"] = {"endpoints": []}
+    config["connect"] = {"endpoints": [*stops_through(posture)], "exit_on_failure": True}
+    config["scouting"]["multicast"]["enabled"] = False
+    return config
+
+
+def _from_here(endpoint: str) -> str:
+    """Return the endpoint at which this machine dials its own listener."""
+    address = endpoint.partition("#")[0]
+    host, _, port = address.rpartition(":")
+    scheme, _, name = host.partition("/")
+    local = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}.get(name, name)
+    return f"{scheme}/{local}:{port}" + ("#verify_name_on_connect=false" if scheme == "tls" else "")
+
+
 def _base(posture: Posture, session: str | None) -> dict[str, Any]:
     prefix = _prefix(posture.namespace)
-    # A burst of replies or stops must find room: Zenoh's own queues hold two batches and wait one millisecond.
-    queue = {
-        "size": {"real_time": 16, "interactive_high": 16, "data": 16},
-        "congestion_control": {"drop": {"wait_before_drop": WAIT_BEFORE_DROP_US}},
-    }
-    link: dict[str, Any] = {"tx": {"lease": LEASE_MS, "queue": queue}}
+    # A burst of replies or stops must find room.
+    transport = transport_config(("real_time", "interactive_high", "data"), WAIT_BEFORE_DROP_US)
+    transport["unicast"]["max_sessions"] = posture.max_sessions
+    transport["link"]["tx"]["lease"] = LEASE_MS
     config: dict[str, Any] = {
         "scouting": {
             "multicast": {"enabled": posture.multicast},
             "gossip": {"enabled": True},
         },
         "adminspace": {"enabled": False},
-        "transport": {
-            # A session does not close while it waits for the first message of a remote that is no Zenoh.
-            "unicast": {"max_sessions": posture.max_sessions, "open_timeout": HANDSHAKE_MS},
-            "link": link,
-        },
+        "transport": transport,
         "downsampling": _downsampling(prefix),
         "low_pass_filter": _low_pass(prefix),
     }
@@ -220,18 +412,10 @@ def _base(posture: Posture, session: str | None) -> dict[str, Any]:
         config["namespace"] = posture.namespace
     if session:
         config["id"] = session
-    if posture.credentials:
-        link["protocols"] = ["tls"]
-        link["tls"] = {
-            "root_ca_certificate": str(posture.credentials.ca),
-            "listen_certificate": str(posture.credentials.cert),
-            "listen_private_key": str(posture.credentials.key),
-            "connect_certificate": str(posture.credentials.cert),
-            "connect_private_key": str(posture.credentials.key),
-            "enable_mtls": True,
-            "verify_name_on_connect": True,
-            "close_link_on_expiration": True,
-        }
+    own = posture.credentials
+    if own:
+        tls = use_tls(config, ca=str(own.ca), cert=str(own.cert), key=str(own.key))
+        tls["close_link_on_expiration"] = True
         config["access_control"] = posture.access_control
     return config
 
@@ -308,31 +492,29 @@ def _access_control(prefix: str) -> dict[str, Any]:
         TransportError: rules that cannot be read, are switched off or name nobody, or that let a peer command which no
             certificate names, without the opt-in.
     """
-    stated = settings.raw(access.ACL_FILE)
+    stated = settings.raw(ACL_FILE)
     if not stated:
-        logger.info("%s is not set: every peer with a certificate of the fleet may send commands.", access.ACL_FILE)
-        return access.certified_peers(prefix)
-    path = _plain_file(access.ACL_FILE, Path(stated).expanduser())
-    rules = access.read_rules(path)
-    dead, opened = access.literal_wildcard(rules), access.open_rules(rules, prefix)
+        logger.info("%s is not set: every peer with a certificate of the fleet may send commands.", ACL_FILE)
+        return certified_peers(prefix)
+    path = _plain_file(ACL_FILE, Path(stated).expanduser())
+    rules = read_rules(path)
+    dead, opened = literal_wildcard(rules), open_rules(rules, prefix)
     if dead is not None:
-        raise TransportError(f"{access.ACL_FILE}: in {path} {dead}; leave the field out, or name each.")
-    if opened and not settings.boolean(access.PERMISSIVE_ACL):
+        raise TransportError(f"{ACL_FILE}: in {path} {dead}; leave the field out, or name each.")
+    if opened and not settings.boolean(PERMISSIVE_ACL):
         raise TransportError(
-            f"{access.ACL_FILE}: in {path} {access.shortened(opened)}. Deny by default and name who may command in "
-            f"cert_common_names ('strands-robots mesh keys acl' writes such rules) or set {access.PERMISSIVE_ACL}=true."
+            f"{ACL_FILE}: in {path} {shortened(opened)}. Deny by default and name who may command in "
+            f"cert_common_names ('strands-robots mesh keys acl' writes such rules) or set {PERMISSIVE_ACL}=true."
         )
     if opened:
-        logger.warning(
-            "%s: in %s %s; accepted by %s.", access.ACL_FILE, path, access.shortened(opened), access.PERMISSIVE_ACL
-        )
-    if not access.stops_get_in(rules, prefix):
-        logger.warning("%s: in %s no rule lets an emergency stop in; none over the mesh stops.", access.ACL_FILE, path)
+        logger.warning("%s: in %s %s; accepted by %s.", ACL_FILE, path, shortened(opened), PERMISSIVE_ACL)
+    if not stops_get_in(rules, prefix):
+        logger.warning("%s: in %s no rule lets an emergency stop in; none over the mesh stops.", ACL_FILE, path)
     return rules
 
 
 def _say_unused() -> None:
     """Log the certificates and rules that are stated and have no effect."""
-    unused = [name for name in (*TLS_FILES, access.ACL_FILE) if settings.raw(name)]
+    unused = [name for name in (*TLS_FILES, ACL_FILE) if settings.raw(name)]
     if unused:
         logger.warning("The mesh is without certificates, so that %s has no effect.", ", ".join(unused))
