@@ -116,7 +116,7 @@ class LockoutState:
 
     def engage(self, lockout: Lockout) -> LockoutState:
         """Return the state after an emergency stop; a known epoch changes nothing."""
-        if self.can_resume(lockout.epoch):
+        if any(each.epoch == lockout.epoch for each in reversed(self.lockouts)):
             return self
         if lockout.epoch != OVERFLOW and len(self.lockouts) < MAX_EPOCHS:
             return LockoutState((*self.lockouts, lockout), self.overflow)

@@ -48,6 +48,9 @@ HALT_AGAIN_S = 0.25
 TOLD_EVERY_S = 10.0
 """Seconds between two records of the stops that were counted instead of carried out one by one."""
 
+YIELD_S = 0.0002
+"""Seconds that the halts of a stop have to themselves as they begin."""
+
 KEEP_AGAIN_S = 1.0
 """Seconds between two attempts to write a lockout, or its clearing, that could not be written."""
 
@@ -423,7 +426,7 @@ class SafetyPlane:
             if len(fresh) == len(by_name):
                 # An answer takes it back, and none is in before the first halt is submitted.
                 self._begun = (order.epoch, by_name)
-            executor = self.executor
+            executor = self._executor or stop_executor()
             for entry in fresh:
                 executor.submit(
                     entry.robot,
@@ -434,6 +437,8 @@ class SafetyPlane:
                     answered=functools.partial(reporter.answer, run, entry.robot_id),
                     voided=True,
                 )
+            # Nothing of what follows is urgent, and it would keep the interpreter from the halts.
+            time.sleep(YIELD_S)
             self._note_original(order)
             reporter.begin(run)
             followed = True

@@ -65,18 +65,11 @@ class StopRun:
     done: threading.Event = field(default_factory=threading.Event)
     started: float = field(default_factory=time.monotonic)
     answers: dict[str, tuple[StopVerdict, float]] = field(default_factory=dict)
-    halting: set[str] = field(default_factory=set)
+    halted: set[str] = field(default_factory=set)
     keeping_since: float | None = None
     kept: bool | None = None
     keep_at: float = 0.0
     answer_at: float = 0.0
-
-    def __post_init__(self) -> None:
-        self.halting.update(self.robot_ids)
-        count = len(self.robot_ids)
-        pace_s = min(PACE_S * count, PACE_MAX_S) if count > UNPACED else 0.0
-        self.keep_at = self.started + pace_s
-        self.answer_at = self.started + pace_s * random.uniform(1.0, 2.0)
 
     def wait(self, timeout: float) -> bool:
         """True when every robot has been reported."""
@@ -128,12 +121,16 @@ class Reporter:
 
     def begin(self, run: StopRun) -> None:
         """Follow ``run`` to its end."""
+        count = len(run.robot_ids)
+        pace_s = min(PACE_S * count, PACE_MAX_S) if count > UNPACED else 0.0
+        run.keep_at = run.started + pace_s
+        run.answer_at = run.started + pace_s * random.uniform(1.0, 2.0)
         self._inbox.put(run)
 
     def answer(self, run: StopRun, robot_id: str, verdict: StopVerdict) -> None:
         """Record the verdict of a halt."""
-        run.halting.discard(robot_id)
-        if not run.halting:
+        run.halted.add(robot_id)
+        if len(run.halted) == len(run.robot_ids):
             # Here, because the reporting thread may be sending the answers to another stop.
             run.on_halted()
         self._inbox.put(_Answer(run, robot_id, verdict, time.monotonic()))

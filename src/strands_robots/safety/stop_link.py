@@ -102,9 +102,8 @@ class StopCodec:
         """Encode an event of this process."""
         return notification(event, fields)
 
-    def fields(self, payload: bytes | int | None) -> Mapping[str, Any]:
-        """Return the fields of a message; empty for what cannot be read."""
-        return {} if payload is None else params_of(payload)
+    fields: Callable[[bytes | int | None], Mapping[str, Any]] = staticmethod(params_of)
+    """Returns the fields of a message; empty for what is none or is too long to be read."""
 
     def epoch(self, source: str, fields: Mapping[str, Any]) -> str:
         """Return the epoch that a stop states; empty for none."""

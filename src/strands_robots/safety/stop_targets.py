@@ -207,7 +207,7 @@ def under_way_of(target: object) -> VerbsUnderWay | None:
 def void_calls(target: object) -> tuple[VerbCall, ...]:
     """Void the permits of the own verbs that run on ``target``; return their calls."""
     under_way = under_way_of(target)
-    calls = under_way.calls if under_way else ()
+    calls = () if under_way is None else under_way.calls
     for each in calls:
         each.void()
     return calls
@@ -263,7 +263,7 @@ def verbs_to_end(under_way: VerbsUnderWay) -> Callable[[], bool]:
 
     An inner halt waits for none: the outermost does.
     """
-    halts = getattr(_here, "halts", ())
+    halts: list[HaltedVerbs] = getattr(_here, "halts", [])
     if len(halts) != 1:
         return lambda: False
     halted = halts[0]
