@@ -107,7 +107,7 @@ class MotionRequest:
     @property
     def overtaken(self) -> bool:
         """True for ever once the robot was halted since, or the call was given up."""
-        return self.given_up or self.generation != self.gate._generation
+        return self.given_up or self.generation != self.gate.generation
 
     def give_up(self) -> None:
         """Void what the call began or may still begin, and nothing else."""
