@@ -328,11 +328,6 @@ class Approval:
         allow = self._read("STRANDS_ROBOT_COMMAND_ALLOW")
         return (bool(allow) and listed(verb, peer, allow, callers)) or self._bypass()
 
-    def standing(self, verb: str, peer: str, callers: Collection[str]) -> bool:
-        """Return whether ``verb`` is approved until further notice, so that nothing has to be claimed."""
-        allow = self._read("STRANDS_ROBOT_COMMAND_ALLOW")
-        return (bool(allow) and listed(verb, peer, allow, callers)) or self._bypass()
-
     def claim(self, verb: str, peer: str, callers: Collection[str] = (), arguments_digest: str = "") -> Leave | None:
         """Return leave to do ``verb`` on ``peer`` now, or None when not approved.
 

@@ -484,7 +484,7 @@ class VerbsUnderWay:
     @property
     def name(self) -> str:
         """The verb that a caller asked for; empty while none runs."""
-        return next((each.name for each in tuple(self._running)), "")
+        return next((each.name for each in self.calls), "")
 
     def observe(self, observer: CallObserver) -> Callable[[], None]:
         """Call ``observer`` at each begin and end; return a callable that ends that."""
