@@ -9,6 +9,7 @@ import inspect
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from types import MappingProxyType
 from typing import Any
 
@@ -100,19 +101,19 @@ _PEER_ASSERTION = _optional("assertion", dict, ASSERTION.meaning, ASSERTION.chec
 _DEVICE = _optional("device_name", str, "The leader's device; leader where left out", identifier)
 
 
-def start(robot: Robot, arguments: Arguments, request: MotionRequest | None = None) -> Envelope:
-    """Start a policy with a mesh peer's options, on ``robot_name`` of a world."""
+def policy_start(robot: Robot, arguments: Arguments, request: MotionRequest | None = None) -> Callable[[], Envelope]:
+    """Return the call that starts a policy with a mesh peer's options."""
     options = {name: value for name, value in arguments.items() if name != "robot_name"}
     if options.get("policy_host") == "localhost":
         del options["policy_host"]
     instruction = options.pop("instruction", "")
     if holds_robots(robot):
         name = robot_of(robot, arguments.get("robot_name"))
-        return for_request(request, robot.start_policy)(name, instruction, **options)
+        return partial(for_request(request, robot.start_policy), name, instruction, **options)
     unknown = sorted(set(options) - _accepted(robot.start_task, options))
     if unknown:
-        return error(f"start: this robot takes no {', '.join(unknown)}.")
-    return for_request(request, robot.start_task)(instruction, **options)
+        return partial(error, f"start: this robot takes no {', '.join(unknown)}.")
+    return partial(for_request(request, robot.start_task), instruction, **options)
 
 
 def run_to_end(
@@ -128,7 +129,7 @@ def run_to_end(
 
     unsubscribe = robot.subscribe(observe)
     try:
-        started = start(robot, arguments, request)
+        started = policy_start(robot, arguments, request)()
         if is_error(started):
             return started
         deadline = time.monotonic() + arguments["duration"] + EXECUTE_GRACE_S
@@ -223,7 +224,12 @@ PEER_VERBS = table(
             "execute", Kind.MOTION, "Run a policy and wait for its end.", _PEER_POLICY, lasts=True, suits=takes_tasks
         ),
         _peer_verb(
-            "start", Kind.MOTION, "Start a policy and return at once.", _PEER_POLICY, begin=start, suits=takes_tasks
+            "start",
+            Kind.MOTION,
+            "Start a policy and return at once.",
+            _PEER_POLICY,
+            begin=lambda robot, arguments, request: policy_start(robot, arguments, request)(),
+            suits=takes_tasks,
         ),
         _peer_verb(
             "step",
