@@ -221,7 +221,7 @@ def carrying(count: int) -> Row:
     heaviest = 0.0
     for _ in range(count):
         bench = Bench()
-        model = bench.world.physics.stage.model
+        model = bench.world.physics.compiled.model
         own = float(model.body_subtreemass[model.body(bench.body.parts.root).id])
         mass = float(draw.uniform(0, own))
         model.body_mass[model.site_bodyid[model.site(bench.body.parts.tip).id]] += mass

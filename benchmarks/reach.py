@@ -12,10 +12,10 @@ from benchmarks import reach_network
 from benchmarks.table import Row
 from strands_robots.kinematics import moves
 from strands_robots.kinematics.chain import built_in
-from strands_robots.kinematics.inverse import TipGoal, solve
 from strands_robots.kinematics.motion import Motion
 from strands_robots.kinematics.moves import Start
 from strands_robots.kinematics.objects import Held, SeenObject
+from strands_robots.kinematics.planner import TipGoal, solve
 from strands_robots.simulation import Simulation
 from strands_robots.utils import ValidationError
 

@@ -20,8 +20,8 @@ from benchmarks.table import Row
 from strands_robots import settings
 from strands_robots.device_connect import FleetClient, init_device_connect_sync, loopback_config, stop_device_connect
 from strands_robots.simulation import Simulation
-from strands_robots.simulation.model import compile_stage
-from strands_robots.simulation.scene import Plan, RobotPlan, find
+from strands_robots.simulation.model import compile_scene
+from strands_robots.simulation.scene import Scene, SceneRobot, find
 
 STEPS = 10_000
 FLEET = 32
@@ -40,7 +40,7 @@ def stepping(repeats: int) -> Row:
     """Compare ``Simulation.step(10_000)`` with a loop of ``mj_step`` by medians."""
     simulation = Simulation(realtime=False)
     simulation.add_robot("arm", "so100")
-    plain = compile_stage(Plan(robots=(RobotPlan("arm", find("so100")),)))
+    plain = compile_scene(Scene(robots=(SceneRobot("arm", find("so100")),)))
     data = mujoco.MjData(plain.model)
     data.qpos[:], data.ctrl[:] = plain.start_qpos, plain.start_ctrl
 

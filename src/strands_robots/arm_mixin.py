@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any, ParamSpec
 from strands_robots.contract import RUNNING, for_request
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.kinematics.arm_parts import ArmParts, StatedJoint
-from strands_robots.kinematics.arm_task import ArmTask
 from strands_robots.policies.base import Action
 from strands_robots.policies.rollout import Body, Rollout
+from strands_robots.policies.task_engine import NewTask, TaskEngine
 from strands_robots.recording.cameras import frames_of
 from strands_robots.safety.gate import MotionRequest, Permit, answered
 from strands_robots.stop_log import stop_logger
@@ -26,7 +26,7 @@ from strands_robots.utils import ValidationError, choice, identifier, missing_ex
 
 if TYPE_CHECKING:  # numpy and MuJoCo are loaded with the first motion
     from strands_robots.kinematics.arm import Arm, ArmState
-    from strands_robots.kinematics.motion import JointSpace, Motion
+    from strands_robots.kinematics.motion import ArmTask, JointSpace, Motion
     from strands_robots.kinematics.moves import Start
     from strands_robots.kinematics.objects import Asking, Held, ObjectDetector, SeenObject, Sight
 
@@ -73,6 +73,7 @@ class ArmMixin:
     """
 
     tool_name_str: str
+    tasks: TaskEngine
     detector: ObjectDetector | None = None
     """Sees the objects of a real robot; a simulation knows its own."""
 
@@ -121,7 +122,6 @@ class ArmMixin:
         """Return the targets that keep a body without a model where it was told to be."""
         return {}
 
-    @abstractmethod
     def start_motion(
         self,
         robot_name: str,
@@ -134,6 +134,14 @@ class ArmMixin:
 
         The plan's search ends when its permit is void. A halt since the request was made refuses the motion.
         """
+        from strands_robots.kinematics.motion import motion_rollout  # noqa: PLC0415 - numpy, with the first motion
+
+        def make(body: Body, permit: Permit, _: object) -> Rollout:
+            hz = self.tasks.rate()
+            motion = plan(hz, permit)
+            return motion_rollout(body, motion, permit, hz, self.tasks.observers)
+
+        return self.tasks.start(verb, robot_name, NewTask(make), request)
 
     @planned
     def arm_pose(self, robot_name: str = "") -> Envelope:
@@ -378,7 +386,7 @@ class ArmMixin:
 
         ``kept`` is false where that cannot be written: the place is then lost with this process.
         """
-        from strands_robots.kinematics.arm_task import save_places  # noqa: PLC0415 - with the first place
+        from strands_robots.kinematics.arm_parts import save_places  # noqa: PLC0415 - with the first place
 
         name, body, arm = identifier("place", place), self.body(robot_name), self.arm(robot_name).whole()
         if name == HOME:
@@ -400,7 +408,7 @@ class ArmMixin:
         return own if name == self.tool_name_str else f"{own}:{name}"
 
     def _saved_places(self, name: str) -> dict[str, dict[str, float]]:
-        from strands_robots.kinematics.arm_task import load_places  # noqa: PLC0415 - with the first place
+        from strands_robots.kinematics.arm_parts import load_places  # noqa: PLC0415 - with the first place
 
         if name not in self._places:
             self._places[name] = load_places(self._place_key(name))
@@ -559,6 +567,8 @@ class ArmMixin:
         sight: Sight | None = None,
     ) -> Envelope:
         """Plan a motion, start it, and answer at its end or at once."""
+        from strands_robots.kinematics.motion import ArmTask  # noqa: PLC0415 - numpy, with the first motion
+
         planned: list[Motion] = []
 
         def planned_at(hz: float, permit: Permit) -> Motion:

@@ -74,13 +74,14 @@ def read_joints(device: Any) -> dict[str, float]:
 
 
 def joint_reader(device: Any) -> Callable[[], dict[str, float]]:
-    """Return a :func:`read_joints` of one device, whose buses are looked for once."""
+    """Return a reader of a device's joints, as :func:`read_joints`.
+
+    The buses are looked for once.
+    """
     source = joint_read_source(device)
     if source is None:
         return dict
-    lock = bus_lock(source)
-    # A driver that tells its joints itself may have features that cannot be read yet.
-    buses = None if callable(getattr(source, "get_joints", None)) else motor_buses(source)
+    lock, buses = bus_lock(source), motor_buses(source)
 
     def read() -> dict[str, float]:
         with lock:
@@ -88,11 +89,10 @@ def joint_reader(device: Any) -> Callable[[], dict[str, float]]:
             answer = own() if callable(own) else None
             if answer is not None and "status" not in answer:
                 return numbers(answer)
-            parts = motor_buses(source) if buses is None else buses
-            if not parts:
+            if not buses:
                 return numbers(source.get_observation())
             joints: dict[str, float] = {}
-            for prefix, bus in parts:
+            for prefix, bus in buses:
                 positions = bus.sync_read("Present_Position")
                 joints |= numbers({f"{prefix}{name}.pos": positions[name] for name in bus.motors})
             return joints

@@ -188,7 +188,7 @@ def _print_to_terminal(text: str) -> None:
 
 
 def _simulated(name: str, tool_name: str | None, options: dict[str, Any]) -> Any:
-    from strands_robots.simulation import Simulation, furnish  # noqa: PLC0415 - simulation only
+    from strands_robots.simulation import Simulation, furnish  # noqa: PLC0415 - loads MuJoCo
 
     label, scene, tip = _label(name), options.pop("scene", None), options.pop("tip", "")
     simulation = _construct(_networked(Simulation), tool_name=tool_name or label, **options)

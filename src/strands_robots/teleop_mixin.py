@@ -5,16 +5,15 @@ from __future__ import annotations
 import time
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 from strands_robots.envelope import Envelope, error, success
-from strands_robots.policies.rollout import STOP_JOIN_S, Body, Rollout, RolloutObservers
-from strands_robots.safety.gate import MotionGate, Permit, Waiting, answered
+from strands_robots.policies.rollout import STOP_JOIN_S, Body, Rollout
+from strands_robots.policies.task_engine import NewTask, TaskEngine
+from strands_robots.safety.gate import Permit, answered
 from strands_robots.teleoperators.leader import FULL_RANGES_PER_S, InputSink, LeaderPolicy
 from strands_robots.utils import ValidationError, choice, flag, identifier, number, teleoperator_contract_error
-from strands_robots.utils import duration as checked_duration
 
 METHODS = ("arm", "gamepad", "keyboard", "phone")
 
@@ -22,29 +21,20 @@ METHODS = ("arm", "gamepad", "keyboard", "phone")
 class TeleopMixin:
     """Verbs of teleoperation for a host that has the members declared here.
 
-    One source drives a body at a time. The host's ``halt`` calls :meth:`void_teleoperation`, and its ``starting`` is
-    the re-entrant lock under which it checks that a body is free and starts a motion.
+    One source drives a body at a time; a session is a task of the host's engine, and ends with its halts.
     """
 
-    gate: MotionGate
-    starting: AbstractContextManager[Any]
-    observers: RolloutObservers
-    """Observers of teleoperations and of tasks."""
+    tasks: TaskEngine
     input_sink: InputSink | None = None
     """Receiver of published frames; a network that carries input streams sets it."""
-
-    def __init__(self) -> None:
-        self._teleop_leaders: dict[str, tuple[str, Callable[..., LeaderPolicy]]] = {}
-        self._teleop_waiting = Waiting()
-        self._teleop_sessions: dict[str, tuple[Rollout, LeaderPolicy]] = {}
 
     @abstractmethod
     def body(self, robot_name: str | None = None) -> Body:
         """Return the body of that name, or the first; raises :class:`ValidationError`."""
 
-    @abstractmethod
     def occupied(self, robot: str) -> str:
-        """Return the task that drives the body of that name, empty for none."""
+        """Name the task that drives the body of that name, for a refusal; empty for none."""
+        return self.tasks.occupied(robot)
 
     @answered
     def attach_teleop(
@@ -79,10 +69,10 @@ class TeleopMixin:
             keys=dict(keys or {}),
             max_speed=number("max_speed", max_speed, above=0, high=20),
         )
-        with self.starting:
+        with self.tasks.starting:
             if name in self.teleoperating():
                 return error(
-                    f"{name} teleoperates {self._teleop_sessions[name][0].robot} now; stop_teleoperate it first."
+                    f"{name} teleoperates {self.tasks.latest_sessions()[name].robot} now; stop_teleoperate it first."
                 )
             self._teleop_leaders[name] = (robot, policy)
         return success(f"{name} will lead {robot}.", name=name, robot=robot)
@@ -103,18 +93,15 @@ class TeleopMixin:
             hz: frames a second, 1 to 1000.
             publish: also carry the leader's frames on the network.
         """
-        seconds = None if duration is None else checked_duration("duration", duration)
+        seconds = None if duration is None else number("duration", duration, above=0, high=3600)
         rate = number("hz", hz, low=1, high=1000)
         sink = self._teleop_sink(flag("publish", publish))
-        permit = self.gate.permit("teleoperate")
-        with self._teleop_waiting.until_begun(permit, identifier("name", name)), self.starting:
-            permit.check()
-            session = self._lead(name, seconds, rate, sink, permit)
+        session = self._lead(identifier("name", name), seconds, rate, sink)
         return success(f"{name} leads {session.robot}.", name=name, robot=session.robot, hz=rate)
 
     def stop_teleoperate(self, name: str | None = None, timeout: float = STOP_JOIN_S) -> Envelope:
         """Stop one leader or all; ``stopped`` is false after ``timeout`` seconds."""
-        self._teleop_waiting.void(name)
+        self.tasks.waiting_leaders.void(name)
         running = self.teleoperating()
         stopping = running if name is None else {key: each for key, each in running.items() if key == name}
         if not stopping:
@@ -132,64 +119,63 @@ class TeleopMixin:
 
     def teleop_status(self) -> Envelope:
         """Answer with one row for each leader that leads or has led."""
-        rows = self._teleop_rows({name: rollout for name, (rollout, _) in self._teleop_sessions.items()})
+        rows = self._teleop_rows(self.tasks.latest_sessions())
         return success(f"{len(self.teleoperating())} leaders lead.", running=list(self.teleoperating()), leaders=rows)
 
     def teleoperating(self) -> dict[str, Rollout]:
         """Return the running sessions by leader."""
-        return {name: rollout for name, (rollout, _) in list(self._teleop_sessions.items()) if rollout.running}
+        return self.tasks.leading()
 
     def teleoperated_by(self, robot: str) -> str:
         """Return the leader that drives the body of that name; empty when none does."""
-        sessions = list(self._teleop_sessions.items())
-        return next((name for name, (each, _) in sessions if each.robot == robot and each.running), "")
+        return self.tasks.leader_of(robot)
 
     def void_leaders(self, robot: str) -> None:
         """Void the waiting starts of all leaders of the body of that name."""
         for name, (led, _) in list(self._teleop_leaders.items()):
             if led == robot:
-                self._teleop_waiting.void(name)
+                self.tasks.waiting_leaders.void(name)
 
-    def void_teleoperation(self) -> dict[str, Rollout]:
-        """Void every session; return them as a halt names them."""
-        running = self.teleoperating()
-        for session in running.values():
-            session.void()
-        return {f"teleoperation {name}": session for name, session in running.items()}
+    @cached_property
+    def _teleop_leaders(self) -> dict[str, tuple[str, Callable[..., LeaderPolicy]]]:
+        return {}
+
+    @cached_property
+    def _teleop_policies(self) -> dict[str, LeaderPolicy]:
+        return {}
 
     def _teleop_sink(self, publish: bool) -> InputSink | None:
         if publish and self.input_sink is None:
             raise ValidationError("publish must be false: no network that carries input streams is attached.")
         return self.input_sink if publish else None
 
-    def _lead(self, name: str, seconds: float | None, rate: float, sink: InputSink | None, permit: Permit) -> Rollout:
+    def _lead(self, name: str, seconds: float | None, rate: float, sink: InputSink | None) -> Rollout:
         if name not in self._teleop_leaders:
             known = ", ".join(self._teleop_leaders) or "none yet"
             raise ValidationError(f"name must be an attached leader ({known}), not {name!r}; attach_teleop it first.")
-        robot, make_policy = self._teleop_leaders[name]
-        body = self.body(robot)
-        busy = self.occupied(body.name) or self.teleoperated_by(body.name)
-        if busy:
-            raise ValidationError(f"{body.name} is driven by {busy}; stop that first.")
-        policy = make_policy(period=1 / rate, sink=sink)
-        session = Rollout(
-            body,
-            policy,
-            permit=permit,
-            instruction=f"follow {name}",
-            policy_name="teleoperation",
-            duration=seconds,
-            hz=rate,
-            observers=self.observers,
-        )
-        self._teleop_sessions[name] = (session, policy)
-        session.start()
-        return session
+        robot, make_policy = attached = self._teleop_leaders[name]
+
+        def make(body: Body, permit: Permit, _: object) -> Rollout:
+            if self._teleop_leaders[name] is not attached:
+                raise ValidationError(f"{name} was attached anew while it waited for {robot}; teleoperate it again.")
+            policy = self._teleop_policies[name] = make_policy(period=1 / rate, sink=sink)
+            return Rollout(
+                body,
+                policy,
+                permit=permit,
+                instruction=f"follow {name}",
+                policy_name="teleoperation",
+                duration=seconds,
+                hz=rate,
+                observers=self.tasks.observers,
+            )
+
+        return self.tasks.start("teleoperate", robot, NewTask(make), leader=name)
 
     def _teleop_rows(self, sessions: Mapping[str, Rollout]) -> dict[str, dict[str, Any]]:
         rows = {}
         for name, rollout in sessions.items():
-            policy = self._teleop_sessions[name][1]
+            policy = self._teleop_policies[name]
             rows[name] = {
                 **rollout.row(),
                 "state": rollout.state,

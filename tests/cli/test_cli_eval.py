@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from click.testing import Result
 
-from strands_robots.policies.mock import MockPolicy
+from strands_robots.policies.base import MockPolicy
 
 Run = Callable[..., Result]
 

@@ -12,7 +12,7 @@ from fixtures.planes import own_plane
 
 from strands_robots.device_connect.bringup import driver_for
 from strands_robots.device_connect.robot_driver import MobileBaseDeviceDriver
-from strands_robots.drivers.ros import rtps_robot, velocity_publisher
+from strands_robots.drivers.ros import rtps_robot, velocity
 from strands_robots.drivers.ros.ackermann_robot import AckermannRosRobot
 from strands_robots.drivers.ros.mobile_base import MobileBaseRobot
 from strands_robots.drivers.ros.ros_bridge import RosBridgedRobot
@@ -81,7 +81,7 @@ def plane() -> Iterator[SafetyPlane]:
 async def test_a_locked_base_of_every_class_gets_zeros_and_nothing_else_until_it_is_freed(
     kind: str, plane: SafetyPlane, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(velocity_publisher, "BLIND_HOLD_S", 0.2)
+    monkeypatch.setattr(velocity, "BLIND_HOLD_S", 0.2)
     link = Far()
     base = MAKERS[kind](link, monkeypatch)
     assert isinstance(driver_for(base, "robot"), MobileBaseDeviceDriver)

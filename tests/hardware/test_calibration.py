@@ -9,7 +9,7 @@ import pytest
 from fixtures.feetech_bus import MOTORS, arm_calibration
 
 from strands_robots.hardware.body import DeviceBody
-from strands_robots.hardware.calibration import Calibrator, calibrate_from, checked_calibration
+from strands_robots.hardware.lerobot_device import Calibrator, calibrate_from, checked_calibration
 from strands_robots.utils import ValidationError
 
 IDS = {motor: number for number, motor in enumerate(MOTORS, start=1)}

@@ -19,7 +19,7 @@ from strands_robots import policies
 from strands_robots.contract import RolloutEvent, TaskRobot
 from strands_robots.envelope import error
 from strands_robots.hardware import HardwareRobot
-from strands_robots.hardware import robot as robots
+from strands_robots.hardware import body as bodies
 from strands_robots.safety.orders import StopOrder, new_epoch
 from strands_robots.utils import ValidationError
 
@@ -321,7 +321,7 @@ def test_a_state_read_of_a_robot_that_nothing_drives_waits_for_its_turn(
     robot: HardwareRobot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with hogged(robot) as free, monkeypatch.context() as patient:
-        patient.setattr(robots, "IDLE_WAIT_S", 20.0)
+        patient.setattr(bodies, "IDLE_WAIT_S", 20.0)
         threading.Timer(0.2, free.set).start()
         state = robot.get_state()
     assert "joints_error" not in state

@@ -18,7 +18,7 @@ from fixtures.waiting import eventually
 from strands_robots.audit import flush_audit, read_audit_log
 from strands_robots.contract import RolloutEvent
 from strands_robots.hardware import HardwareRobot
-from strands_robots.hardware import robot as hardware_robot
+from strands_robots.policies import task_engine
 from strands_robots.policies.settling import RANGES_PER_S, SETTLE_HZ
 from strands_robots.safety.orders import StopOrder, new_epoch
 from strands_robots.safety.stop_executor import stop_executor
@@ -251,7 +251,7 @@ def slow(robot: HardwareRobot, monkeypatch: pytest.MonkeyPatch) -> Iterator[Slow
     """The policy of a task of ``robot`` that runs."""
     policy = SlowToInterrupt()
     with monkeypatch.context() as patched:
-        patched.setattr(hardware_robot, "create_policy", lambda name, **options: policy)
+        patched.setattr(task_engine, "create_policy", lambda name, **options: policy)
         assert robot.start_task("wave")["status"] == "success"
     assert policy.acts.wait(20)
     yield policy
@@ -266,7 +266,7 @@ def test_an_arm_that_moves_again_before_its_stop_is_judged_does_not_settle(
     assert slow.interrupted.wait(20)
     slow.act_returns.set()
     eventually(lambda: not robot.occupied("settler"))
-    monkeypatch.setattr(hardware_robot, "create_policy", lambda name, **options: ScriptedPolicy([], {"pan.pos": 9.0}))
+    monkeypatch.setattr(task_engine, "create_policy", lambda name, **options: ScriptedPolicy([], {"pan.pos": 9.0}))
     assert robot.start_task("again")["status"] == "success"
     slow.interruption_returns.set()
     assert (stop.result(20).stopped, stop.result(20).settling) == (True, False)

@@ -16,7 +16,7 @@ from fixtures.waiting import eventually
 
 from strands_robots.envelope import error
 from strands_robots.hardware import DeviceBody, HardwareRobot
-from strands_robots.hardware import robot as hardware_robot
+from strands_robots.policies import task_engine
 from strands_robots.safety.gate import MotionRequest, Permit
 from strands_robots.utils import ValidationError
 
@@ -193,7 +193,7 @@ def loading(monkeypatch: pytest.MonkeyPatch) -> Iterator[threading.Event]:
         return ScriptedPolicy([], always={"pan.pos": 90.0})
 
     ready.asked = asked  # type: ignore[attr-defined]
-    monkeypatch.setattr(hardware_robot, "create_policy", slow)
+    monkeypatch.setattr(task_engine, "create_policy", slow)
     yield ready
     ready.set()
 
@@ -287,7 +287,7 @@ def test_a_leader_that_stands_in_line_is_stopped_by_its_own_stop(robot: Hardware
     first, _ = on_a_thread(lambda: robot.start_task("wave"))
     assert loading.asked.wait(20)
     second, answers = on_a_thread(lambda: robot.teleoperate("leader"))
-    eventually(lambda: "leader" in list(robot._teleop_waiting._permits.values()), what="it stands in line")
+    eventually(lambda: "leader" in list(robot.tasks.waiting_leaders._permits.values()), what="it stands in line")
     assert robot.stop_teleoperate()["stopped"] is True
     robot.stop_task()
     loading.set()

@@ -12,10 +12,9 @@ from fixtures.devices import RecordingDevice
 from fixtures.waiting import eventually
 
 from strands_robots.hardware import HardwareRobot
-from strands_robots.hardware import robot as hardware_robot
+from strands_robots.policies import task_engine
 from strands_robots.safety.stop_executor import stop_executor
 from strands_robots.simulation import Simulation
-from strands_robots.simulation import world as world_module
 
 
 class HangingPolicy(ScriptedPolicy):
@@ -49,8 +48,7 @@ def policy(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> I
 
     def make(joint: str) -> HangingPolicy:
         made.append(HangingPolicy(joint, interrupts=request.param))
-        for module in (hardware_robot, world_module):
-            monkeypatch.setattr(module, "create_policy", lambda name, **options: made[-1])
+        monkeypatch.setattr(task_engine, "create_policy", lambda name, **options: made[-1])
         return made[-1]
 
     yield make

@@ -7,7 +7,7 @@ import pytest
 from fixtures.reach_targets import reachable
 
 from strands_robots.kinematics.chain import built_in
-from strands_robots.kinematics.inverse import TipGoal, nearest, rolled, solve
+from strands_robots.kinematics.planner import TipGoal, nearest, rolled, solve
 
 ARMS = ("so100", "so101")
 

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from strands_robots.kinematics.chain import CONTACT_BITS, MODELS, SPARES, Chain, Spares, built_in, held_body
-from strands_robots.kinematics.contacts import CLEARANCE_M, ContactCheck, beside
-from strands_robots.kinematics.objects import Held, SeenObject
+from strands_robots.kinematics.objects import CLEARANCE_M, ContactCheck, Held, SeenObject, beside
 
 
 def objects(count: int) -> list[SeenObject]:

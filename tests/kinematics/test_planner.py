@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from strands_robots.kinematics.chain import built_in
-from strands_robots.kinematics.contacts import ContactCheck
+from strands_robots.kinematics.objects import ContactCheck
 from strands_robots.kinematics.planner import Planner
 from strands_robots.utils import ValidationError
 

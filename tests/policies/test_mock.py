@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from strands_robots.policies.base import Ranges
-from strands_robots.policies.mock import MockPolicy
+from strands_robots.policies.base import MockPolicy, Ranges
 from strands_robots.utils import ValidationError
 
 ARM: Ranges = {"pan": (-1.5, 2.0), "lift": (0.0, 3.0), "grip": (-0.2, 1.7)}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from strands_robots.policies.profiled import Playback
+from strands_robots.policies.profiled import ChunkPlayer
 
 
 def chunk(first: int, count: int = 10) -> list[dict[str, float]]:
@@ -10,7 +10,7 @@ def chunk(first: int, count: int = 10) -> list[dict[str, float]]:
     return [{"a": float(first + step)} for step in range(count)]
 
 
-def steps(playback: Playback, count: int) -> list[float | None]:
+def steps(playback: ChunkPlayer, count: int) -> list[float | None]:
     values: list[float | None] = []
     for _ in range(count):
         playback.advance()
@@ -20,14 +20,14 @@ def steps(playback: Playback, count: int) -> list[float | None]:
 
 
 def test_a_chunk_is_played_one_action_a_step_and_then_there_is_none() -> None:
-    playback = Playback(rate=30, hz=30)
+    playback = ChunkPlayer(rate=30, hz=30)
     assert steps(playback, 1) == [None]
     playback.take(chunk(0, 3), 0.0, 0.0, 0.0)
     assert steps(playback, 5) == [0.0, 1.0, 2.0, None, None]
 
 
 def test_what_was_played_while_it_was_computed_is_stale() -> None:
-    playback = Playback(rate=30, hz=30)
+    playback = ChunkPlayer(rate=30, hz=30)
     playback.take(chunk(0), 0.0, 0.0, 0.1)
     assert steps(playback, 5) == [0.0, 1.0, 2.0, 3.0, 4.0]
     # The observation was made at step 2, and the answer comes in the control step of 5.
@@ -39,7 +39,7 @@ def test_what_was_played_while_it_was_computed_is_stale() -> None:
 
 
 def test_a_robot_that_waited_misses_nothing_of_the_path() -> None:
-    playback = Playback(rate=30, hz=30)
+    playback = ChunkPlayer(rate=30, hz=30)
     playback.take(chunk(0, 3), 0.0, 0.0, 0.1)
     assert steps(playback, 50)[-1] is None
     playback.take(chunk(100), 3.0, 0.0, 0.1)
@@ -47,7 +47,7 @@ def test_a_robot_that_waited_misses_nothing_of_the_path() -> None:
 
 
 def test_an_answer_that_is_stale_as_a_whole_changes_nothing() -> None:
-    playback = Playback(rate=30, hz=30, horizon=2)
+    playback = ChunkPlayer(rate=30, hz=30, horizon=2)
     playback.take(chunk(0), 0.0, 0.0, 0.1)
     assert steps(playback, 3) == [0.0, 1.0, None]
     assert playback.take(chunk(100), 0.0, 0.0, 0.1) == 2
@@ -57,13 +57,13 @@ def test_an_answer_that_is_stale_as_a_whole_changes_nothing() -> None:
 
 
 def test_a_faster_robot_interpolates_between_the_actions() -> None:
-    playback = Playback(rate=25, hz=50)
+    playback = ChunkPlayer(rate=25, hz=50)
     playback.take(chunk(0, 3), 0.0, 0.0, 0.0)
     assert steps(playback, 7) == [0.0, 0.5, 1.0, 1.5, 2.0, 2.0, None]
 
 
 def test_missed_control_steps_skip_their_actions() -> None:
-    playback = Playback(rate=30, hz=30)
+    playback = ChunkPlayer(rate=30, hz=30)
     playback.take(chunk(0), 0.0, 0.0, 0.0)
     assert steps(playback, 2) == [0.0, 1.0]
     playback.advance(1 + 3)
@@ -73,7 +73,7 @@ def test_missed_control_steps_skip_their_actions() -> None:
 
 
 def test_the_next_chunk_is_asked_for_while_as_much_is_left_as_the_worst_latency_takes() -> None:
-    playback = Playback(rate=30, hz=30, horizon=10)
+    playback = ChunkPlayer(rate=30, hz=30, horizon=10)
     assert playback.due()
     playback.take(chunk(0, 20), 0.0, 0.0, 0.1)
     assert playback.delay == 3
@@ -87,7 +87,7 @@ def test_the_next_chunk_is_asked_for_while_as_much_is_left_as_the_worst_latency_
 
 
 def test_one_slow_answer_is_forgotten_after_ten_others() -> None:
-    playback = Playback(rate=30, hz=30)
+    playback = ChunkPlayer(rate=30, hz=30)
     playback.take(chunk(0), 0.0, 0.0, 1.0)
     assert playback.latency_s == 1.0
     for _ in range(10):
@@ -96,13 +96,13 @@ def test_one_slow_answer_is_forgotten_after_ten_others() -> None:
 
 
 def test_age_is_that_of_the_observation_behind_the_chunk() -> None:
-    playback = Playback(rate=30, hz=30)
+    playback = ChunkPlayer(rate=30, hz=30)
     playback.take(chunk(0), 0.0, 5.0, 0.1)
     assert playback.age_s(7.5) == 2.5
 
 
 def test_a_chunk_shorter_than_the_latency_is_played_to_its_end_before_the_next_is_asked_for() -> None:
-    playback = Playback(rate=30, hz=30)
+    playback = ChunkPlayer(rate=30, hz=30)
     playback.take(chunk(0, 5), 0.0, 0.0, 0.5)
     asked = []
     for _ in range(6):

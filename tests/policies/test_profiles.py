@@ -18,9 +18,9 @@ from strands_robots import policies
 from strands_robots.hardware import HardwareRobot
 from strands_robots.policies.base import PolicyError, Ranges
 from strands_robots.policies.check import RobotFacts
+from strands_robots.policies.preload import PreloadedModels, require_warm
 from strands_robots.policies.profiled import ProfiledPolicy, picture
 from strands_robots.policies.profiles import CameraMap, Profile, load_profiles
-from strands_robots.policies.warm import WarmModels, require_warm
 from strands_robots.safety.gate import MotionRefused
 from strands_robots.serving.policy_arguments import known_provider, profile_list
 from strands_robots.simulation import Simulation
@@ -234,7 +234,7 @@ def test_what_is_no_rgb_picture_ends_the_task(shape: tuple[int, ...]) -> None:
 
 
 def test_a_model_is_loaded_once_on_a_thread_and_given_to_one_policy_at_a_time() -> None:
-    models, let_go, loads = WarmModels(), threading.Event(), list[int]()
+    models, let_go, loads = PreloadedModels(), threading.Event(), list[int]()
 
     def load() -> object:
         loads.append(1)
@@ -253,7 +253,7 @@ def test_a_model_is_loaded_once_on_a_thread_and_given_to_one_policy_at_a_time() 
 
 
 def test_a_policy_that_loads_is_refused_until_it_is_there_and_a_failure_is_told_once() -> None:
-    models = WarmModels()
+    models = PreloadedModels()
 
     def fail() -> object:
         raise OSError("no weights")

@@ -15,7 +15,7 @@ def test_an_inference_that_hangs_is_named_and_the_exit_code_is_kept(end: str, co
 
 def test_an_inference_that_ends_soon_is_waited_for_and_not_named() -> None:
     # It goes on when the end has begun to wait for it.
-    process = ended("warm._ending.wait(); print('done', flush=True)", "sys.exit(3)", ending_s=60, torch=True)
+    process = ended("preload._ending.wait(); print('done', flush=True)", "sys.exit(3)", ending_s=60, torch=True)
     assert (process.stdout, process.stderr, process.returncode) == ("done\n", "", 3)
 
 
@@ -25,7 +25,7 @@ def test_an_inference_without_torch_is_not_waited_for() -> None:
 
 
 def test_no_inference_begins_once_the_process_ends() -> None:
-    again = "warm._ending.wait(); worker.ask('two'); begun.clear()"
+    again = "preload._ending.wait(); worker.ask('two'); begun.clear()"
     process = ended(again, "sys.exit(3)", ending_s=60, torch=True)
     assert (process.stderr, process.returncode) == ("", 3)
 

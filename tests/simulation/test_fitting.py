@@ -93,7 +93,7 @@ def test_world_with_that_medium_takes_the_model(file: Path) -> None:
 def test_coarse_solver_of_a_model_is_not_the_worlds(world: Simulation, file: Path) -> None:
     file.write_text(mjcf('<option iterations="1" solver="PGS" tolerance="0.1"/>'))
     world.add_robot("rod", file)
-    option = world.physics.stage.model.opt
+    option = world.physics.compiled.model.opt
     assert (option.iterations, option.solver, option.tolerance) == (100, 2, 1e-8)
 
 
@@ -102,7 +102,7 @@ def test_coarse_solver_of_a_model_is_not_the_worlds(world: Simulation, file: Pat
 )
 def test_option_of_a_model_is_not_the_worlds(world: Simulation, file: Path, own: str) -> None:
     def options() -> str:
-        return str(world.physics.stage.model.opt)
+        return str(world.physics.compiled.model.opt)
 
     before = options()
     file.write_text(mjcf(f"<option {own}/>"))
@@ -132,7 +132,7 @@ def test_floor_of_a_model_carries_a_cube_like_ours(world: Simulation, file: Path
     world.add_robot("rod", file)
     world.step(1000)
     assert height_of_the_cube(world) == pytest.approx(0.02, abs=0.002)
-    model = world.physics.stage.model
+    model = world.physics.compiled.model
     (floor,) = (geom for geom in range(model.ngeom) if model.geom_type[geom] == 0 and model.geom_contype[geom])
     assert model.geom_friction[floor] == pytest.approx([1, 0.005, 0.0001])
     assert model.geom_condim[floor] == 3

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from strands_robots.kinematics import moves
-from strands_robots.kinematics.contacts import ContactCheck, beside
 from strands_robots.kinematics.moves import Start
+from strands_robots.kinematics.objects import ContactCheck, beside
 from strands_robots.simulation import Simulation
 
 SIDE = (0.22, -0.12, 0.05)

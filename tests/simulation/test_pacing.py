@@ -12,9 +12,9 @@ from fixtures.waiting import eventually
 
 from strands_robots.safety.gate import MotionGate, PermitVoidError
 from strands_robots.simulation import Simulation
-from strands_robots.simulation.model import compile_stage
+from strands_robots.simulation.model import compile_scene
 from strands_robots.simulation.physics import Physics, WorldClock
-from strands_robots.simulation.scene import Plan, RobotPlan, find
+from strands_robots.simulation.scene import Scene, SceneRobot, find
 
 
 def pacers() -> list[str]:
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.usefixtures("patient_halts")
 
 @pytest.fixture
 def physics() -> Physics:
-    return Physics(compile_stage(Plan(robots=(RobotPlan("arm", find("so100")),))))
+    return Physics(compile_scene(Scene(robots=(SceneRobot("arm", find("so100")),))))
 
 
 @pytest.fixture
@@ -90,7 +90,7 @@ def test_reads_and_commands_do_not_wait_for_a_step(physics: Physics, monkeypatch
 
     def read() -> None:
         for _ in range(50):
-            physics.snapshot.joints(physics.stage.robots["arm"])
+            physics.snapshot.joints(physics.compiled.robots["arm"])
             physics.command("arm", {"gripper": 0.1})
 
     monkeypatch.setattr("mujoco.mj_step", slow_step)

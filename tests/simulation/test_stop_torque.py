@@ -19,8 +19,7 @@ from strands_robots.safety.orders import StopOrder, new_epoch
 from strands_robots.serving.robot_verbs import world_stop_answer
 from strands_robots.serving.stops import WorldStop
 from strands_robots.simulation import Simulation
-from strands_robots.simulation.body import RobotBody
-from strands_robots.simulation.stop_torque import StopTorque
+from strands_robots.simulation.body import RobotBody, StopTorque
 from strands_robots.utils import ValidationError
 
 pytestmark = pytest.mark.usefixtures("patient_halts", "patient_settling")
@@ -244,17 +243,17 @@ def test_a_stop_that_another_one_overtook_whole_says_that_the_arm_settles(
 def test_a_robot_that_joins_changes_nothing_that_a_stop_is_reading(
     settler: Simulation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    read: list[dict[str, Any]] = []
+    read: list[Mapping[str, Any]] = []
     pose_of = StopTorque._pose_of
 
     def observed(torque: StopTorque, parts: Any) -> dict[str, float]:
-        read.append(torque._settlings)
+        read.append(torque._tasks.settlings.by_body)
         return pose_of(torque, parts)
 
     monkeypatch.setattr(StopTorque, "_pose_of", observed)
     assert settler.add_robot("other", "so100")["status"] == "success"
     assert [list(each) for each in read] == [["arm"]] * len(read)
-    assert list(settler._torque._settlings) == ["arm", "other"]
+    assert list(settler.tasks.settlings.by_body) == ["arm", "other"]
 
 
 def test_a_stop_that_cannot_note_what_moves_halts_all_the_same(

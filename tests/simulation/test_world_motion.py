@@ -15,6 +15,7 @@ from fixtures.waiting import eventually
 
 from strands_robots.contract import RolloutEvent
 from strands_robots.envelope import Envelope, error
+from strands_robots.policies import task_engine
 from strands_robots.safety.gate import MotionRequest, Permit
 from strands_robots.safety.orders import StopOrder, new_epoch
 from strands_robots.safety.stopping import Outcome, StopVerdict, grade, read_verdict
@@ -87,7 +88,7 @@ class Failing(Stuck):
 @pytest.fixture
 def stuck(monkeypatch: pytest.MonkeyPatch) -> Iterator[Stuck]:
     policy = Stuck()
-    monkeypatch.setattr(world_module, "create_policy", lambda provider, **options: policy)
+    monkeypatch.setattr(task_engine, "create_policy", lambda provider, **options: policy)
     yield policy
     policy.let_go.set()
 
@@ -211,7 +212,7 @@ def test_a_stop_while_a_policy_loads_says_stopped_and_it_never_moves_the_robot(
     world: Simulation, monkeypatch: pytest.MonkeyPatch, stop: str
 ) -> None:
     loading = Loading()
-    monkeypatch.setattr(world_module, "create_policy", lambda *_, **__: loading)
+    monkeypatch.setattr(task_engine, "create_policy", lambda *_, **__: loading)
     world.start_policy("left", "think")
     assert loading.inside.wait(20)
     answer = world.halt() if stop == "halt" else world.stop_policy("left")
@@ -255,7 +256,7 @@ def test_policy_that_raises_when_interrupted_is_stopped(
 def test_failing_policy_ends_in_error(
     world: Simulation, events: list[RolloutEvent], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(world_module, "create_policy", lambda provider, **options: Failing())
+    monkeypatch.setattr(task_engine, "create_policy", lambda provider, **options: Failing())
     answer = world.run_policy("left", "wave", duration=5)
     assert answer["status"] == "error"
     assert "ZeroDivisionError: no idea" in answer["reason"]
@@ -309,7 +310,7 @@ def test_policy_that_was_halted_while_loading_does_not_start(
         assert world.halt("meanwhile").stopped
         return Stuck()
 
-    monkeypatch.setattr(world_module, "create_policy", slow)
+    monkeypatch.setattr(task_engine, "create_policy", slow)
     assert "halted while its policy was made ready" in world.start_policy("left", "wave")["reason"]
     assert busy(world) == []
 
@@ -438,7 +439,7 @@ def test_stop_policy_voids_only_the_loading_policy_of_that_robot(
         assert ready.wait(60)
         return ScriptedPolicy([], always={"shoulder_pan": 0.5})
 
-    monkeypatch.setattr(world_module, "create_policy", slow)
+    monkeypatch.setattr(task_engine, "create_policy", slow)
     answers: dict[str, Any] = {}
     threads = [
         threading.Thread(target=lambda name=name: answers.update({name: world.start_policy(name, "wave")}))
@@ -528,13 +529,12 @@ def test_stop_policy_freezes_only_the_robot_that_runs_to_a_single_target(world: 
 def test_action_overtaken_by_a_stop_of_its_robot_sets_nothing(
     world: Simulation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def stopped_meanwhile(robot: str) -> str:
+    def stopped_meanwhile(robot: str) -> None:
         monkeypatch.undo()
         assert world.stop_policy("left")["stopped"] is True
-        return ""
 
     for robot, status in (("left", "error"), ("right", "success")):
-        monkeypatch.setattr(world, "occupied", stopped_meanwhile)
+        monkeypatch.setattr(world.tasks, "require_free", stopped_meanwhile)
         answer = world.send_action({"shoulder_pan": 1.0}, robot)
         assert answer["status"] == status
         assert (world.body(robot).targets["shoulder_pan"] == 1.0) is (status == "success")

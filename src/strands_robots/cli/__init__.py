@@ -42,7 +42,7 @@ def _leave(code: object) -> NoReturn:
     Native network threads may still release callbacks. If the interpreter shut down under them, the C library would
     abort the process, and a script would read -6 in place of the exit code.
     """
-    policies = sys.modules.get("strands_robots.policies.warm")
+    policies = sys.modules.get("strands_robots.policies.preload")
     if policies is not None:
         policies.name_unfinished()
     sightings = sys.modules.get("strands_robots.safety.sightings")

@@ -27,7 +27,7 @@ from strands_robots.utils import ValidationError, identifier, number
 
 if TYPE_CHECKING:
     from strands_robots.hardware import LeaderArm
-    from strands_robots.hardware.calibration import JointReach
+    from strands_robots.hardware.lerobot_device import JointReach
 
 MESH_PREFIX = "mesh:"
 """Prefix of the name of a leader or follower on the mesh."""
@@ -152,8 +152,7 @@ def calibrate(
     leader: Annotated[bool, typer.Option("--leader", help="It is a leader arm.")] = False,
 ) -> None:
     """Measure an arm's middle and the ends of its joints, moved by hand. Its torque goes off: hold it."""
-    from strands_robots.hardware.calibration import Calibrator  # noqa: PLC0415 - real arms only
-    from strands_robots.hardware.lerobot_device import make_device  # noqa: PLC0415
+    from strands_robots.hardware.lerobot_device import Calibrator, make_device  # noqa: PLC0415 - a real arm only
 
     made = make_device(arm, _arm_options(port, device, None), "leader" if leader else "follower", calibrated=False)
     steps = Calibrator(made)
@@ -395,7 +394,7 @@ def _check_stopped(verdict: StopVerdict) -> None:
 def _connected_leader(leader: str, robot: Any, options: dict[str, Any]) -> Iterator[Any]:
     """Yield the leader of that name, ready to lead ``robot``."""
     if leader in _MANUAL:
-        from strands_robots.teleoperators.manual import GamepadLeader, KeyboardLeader  # noqa: PLC0415 - as above
+        from strands_robots.teleoperators.leader import GamepadLeader, KeyboardLeader  # noqa: PLC0415 - as above
 
         body = robot.body()
         present = body.get_joints()

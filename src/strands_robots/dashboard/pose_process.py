@@ -31,18 +31,18 @@ class PosePainter:
     def __init__(self, model: str) -> None:
         try:
             from strands_robots.kinematics.chain import built_in  # noqa: PLC0415 - MuJoCo may be missing
-            from strands_robots.simulation.model import compile_stage  # noqa: PLC0415 - as above
+            from strands_robots.simulation.model import compile_scene  # noqa: PLC0415 - as above
             from strands_robots.simulation.physics import Physics  # noqa: PLC0415 - as above
             from strands_robots.simulation.rendering import Renderer  # noqa: PLC0415 - as above
             from strands_robots.simulation.scene import (  # noqa: PLC0415 - as above
-                Plan,
-                RobotPlan,
+                Scene,
+                SceneRobot,
                 find,
             )
         except ModuleNotFoundError as exc:
             raise missing_extra("The 3-D pose", "sim") from exc
         self._chain = built_in(model)
-        self._snapshot = Physics(compile_stage(Plan().with_robot(RobotPlan(_ARM, find(model))))).snapshot
+        self._snapshot = Physics(compile_scene(Scene().with_robot(SceneRobot(_ARM, find(model))))).snapshot
         self._renderer = Renderer()
 
     def positions(self, joints: object, gripper: object) -> dict[str, float]:
@@ -72,11 +72,11 @@ class PosePainter:
     def draw(self, joints: object, gripper: object, width: int, height: int) -> bytes:
         """Draw the arm as a JPEG, without OpenGL too. Raises as :meth:`positions`."""
         from strands_robots.recording.cameras import jpeg  # noqa: PLC0415 - as above
-        from strands_robots.simulation import projection  # noqa: PLC0415 - as above
+        from strands_robots.simulation import rendering  # noqa: PLC0415 - as above
         from strands_robots.simulation.rendering import OVERVIEW, RenderingError, camera_view  # noqa: PLC0415 - as above
 
         snapshot = self._snapshot
-        places, qpos = snapshot.stage.robots[_ARM].joints, snapshot.qpos.copy()
+        places, qpos = snapshot.compiled.robots[_ARM].joints, snapshot.qpos.copy()
         for name, position in self.positions(joints, gripper).items():
             qpos[places[name].qpos] = position
         posed = replace(snapshot, qpos=qpos)
@@ -84,7 +84,7 @@ class PosePainter:
             picture = self._renderer.render(posed, OVERVIEW, width, height, quality=False)
         except RenderingError:
             data = posed.data()
-            picture = projection.draw(posed.stage, data, camera_view(posed.stage, data, OVERVIEW), width, height)
+            picture = rendering.draw(posed.compiled, data, camera_view(posed.compiled, data, OVERVIEW), width, height)
         return jpeg(OVERVIEW, picture)
 
 

@@ -69,7 +69,7 @@ class SteppedClock(Clock):
         return self._world.physics.snapshot.time
 
     def wait(self, until: float, stop: threading.Event) -> None:
-        steps = round((until - self.now()) / self._world.physics.stage.plan.timestep)
+        steps = round((until - self.now()) / self._world.physics.compiled.scene.timestep)
         if steps > 0 and not stop.is_set():
             self._world.step(steps)
         self._stepped()
@@ -207,7 +207,7 @@ def run_episode(
 
 def _settle(world: Simulation, judge: EpisodeJudge, hz: float) -> None:
     """Look on for a moment where the policy ended by itself."""
-    steps = round(1 / (hz * world.physics.stage.plan.timestep))
+    steps = round(1 / (hz * world.physics.compiled.scene.timestep))
     for _ in range(2 * KEPT_STEPS):
         if judge.success:
             return

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from strands_robots.hardware.body import DeviceBody
-from strands_robots.hardware.lerobot_device import LeaderArm
+from strands_robots.hardware.body import DeviceBody, LeaderArm
 from strands_robots.hardware.robot import HardwareRobot
 
 __all__ = ["DeviceBody", "HardwareRobot", "LeaderArm"]

@@ -1,4 +1,4 @@
-"""Device as the body of a control loop, under its bus lock and a permit."""
+"""Device as the body of a control loop, under bus lock and permit; leader arms."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial
-from typing import Any, TypeVar
+from types import TracebackType
+from typing import Any, Self, TypeVar
 
 from strands_robots.bus_access import action_ranges, bus_lock, joint_reader, motor_buses, read_currents, write_joints
 from strands_robots.hardware._compat import drop, forget_input, stop_base, unplugged
-from strands_robots.hardware.calibration import answer_lost, write_to_servos
 from strands_robots.hardware.device_facts import default_speeds, require_port
+from strands_robots.hardware.lerobot_device import answer_lost, write_to_servos
 from strands_robots.policies.base import Action, checked_speeds, is_velocity, numbers
 from strands_robots.safety.gate import MotionsHeldError, Permit, PermitVoidError
 from strands_robots.safety.stopping import StopLevel
@@ -33,6 +34,9 @@ CONNECT_TRIES = 3
 
 A motor that does not answer its first ping is a ``RuntimeError`` of LeRobot's, one that falls silent later a
 ``ConnectionError``."""
+
+IDLE_WAIT_S = 1.0
+"""Seconds that a read of the state waits for the bus while nothing drives the robot."""
 
 HOLD_FRESH_S = 0.25
 """Greatest age, in seconds, of a joint read whose positions are held when a new one fails."""
@@ -83,8 +87,9 @@ class DeviceBody:
         self.lock = bus_lock(device)
         self.bounds = {**action_ranges(device), **_checked(joint_ranges or {}, device)}
         positions = [key for key in self.bounds if not is_velocity(key)]
-        self._speed_limit = {} if speed_limit is None else checked_speeds(speed_limit, positions)
-        self._look_at_device()
+        self._speeds = {} if speed_limit is None else checked_speeds(speed_limit, positions)
+        self._read_joints = joint_reader(device)
+        self._default_speeds = default_speeds(device)
         self._latest: tuple[float, dict[str, float]] | None = None
         self.targets: dict[str, float] = {}
         """What it was told last by an action, by key; empty once it was frozen or let go."""
@@ -92,9 +97,14 @@ class DeviceBody:
         self._was_connected = self.is_connected
         self._holds_unconnected = bool(getattr(device, "holds_unconnected", False))
         self._stops: list[object] = []
-        self._current_lost = False
+        self._current_lost, self._unread = False, ""
         self.driven = False
         """True from an action until it was frozen or let go."""
+
+    @property
+    def speeds(self) -> dict[str, float]:
+        """Greatest speed by action key: as given, else 2 rad/s for an angle."""
+        return self._default_speeds | self._speeds
 
     @property
     def lost(self) -> bool:
@@ -126,16 +136,10 @@ class DeviceBody:
             elif self.is_connected and hasattr(self.device, "is_connected"):
                 return
             self.bring_up(self.device)
-            self._look_at_device()
             self._lost, self._was_connected = False, True
+            self._default_speeds = default_speeds(self.device)
             # A driver that connects switches the torque on.
             self._limp = set()
-
-    def _look_at_device(self) -> None:
-        """Find its buses, and the speeds of its joints by its calibration."""
-        self._read_joints = joint_reader(self.device)
-        self.speeds = default_speeds(self.device) | self._speed_limit
-        """Greatest speed by action key: as given, else 2 rad/s for an angle."""
 
     @staticmethod
     def bring_up(device: Any) -> None:
@@ -162,18 +166,48 @@ class DeviceBody:
             self._latest = (began, numbers(observation))
             return observation
 
-    def get_joints(self, tries: int = READ_TRIES, *, urgent: bool = False) -> dict[str, float]:
+    def get_joints(self, tries: int = READ_TRIES) -> dict[str, float]:
         """Read the joints; repeat after a lost answer unless a stop waits for the bus.
-
-        Args:
-            urgent: repeat all the same, for this is the stop.
 
         Raises what the device raises.
         """
         with self.lock:
-            joints = self._exchange(self._read_joints, tries, urgent=urgent)
-            self._latest = (time.monotonic(), joints)
-            return dict(joints)
+            return self._joints(tries)
+
+    def refresh(self, *, led: bool, rate: float) -> str:
+        """Read the joints unless they are fresh; return why they were not read, or "".
+
+        Args:
+            led: a loop drives the robot and reads them itself.
+            rate: of that loop, in Hz.
+        """
+        if not self.is_connected:
+            return "The device is not connected."
+        if self.lost:
+            return "The device's port is gone; these are the joints of the last read."
+        age, _ = self.latest_joints or (math.inf, {})
+        # Two, because at one the loop itself is about to read, and would be held up.
+        if led and age <= 2 / rate:
+            return ""
+        within_s = 1 / rate if led else IDLE_WAIT_S
+        if not self.lock.acquire(timeout=within_s):
+            return f"The bus was busy for {within_s:g} s; these are the joints of the last read."
+        try:
+            if self.stop_waits:
+                return "A stop waits for the bus; these are the joints of the last read."
+            # The driving loop waits meanwhile: for one lost answer, not for three.
+            self.get_joints(1 if self.driven else READ_TRIES)
+        except Exception as exc:  # noqa: BLE001 - a device may raise anything; the answer says what
+            problem = f"The joints could not be read: {type(exc).__name__}: {exc}"
+            if problem != self._unread:
+                # A caller may ask fifty times a second.
+                logger.warning("%s: %s", self.name, problem)
+            self._unread = problem
+            return problem
+        finally:
+            self.lock.release()
+        self._unread = ""
+        return ""
 
     def get_positions(self) -> dict[str, float]:
         """Read the joints, which are called as the action keys are."""
@@ -314,6 +348,11 @@ class DeviceBody:
     def running(self) -> AbstractContextManager[None]:
         return nullcontext()
 
+    def _joints(self, tries: int, *, urgent: bool = False) -> dict[str, float]:
+        joints = self._exchange(self._read_joints, tries, urgent=urgent)
+        self._latest = (time.monotonic(), joints)
+        return dict(joints)
+
     def _exchange(self, exchange: Callable[[], T], tries: int = READ_TRIES, *, urgent: bool = False) -> T:
         """Repeat an exchange after a lost answer unless a stop waits for the bus."""
         for left in reversed(range(tries)):
@@ -345,19 +384,19 @@ class DeviceBody:
             self._stop_base(still)
         age, known = self.latest_joints or (math.inf, {})
         try:
-            present = self.get_joints(1)
+            present = self._joints(1)
         except ConnectionError:
             # One silent motor must not leave the others running to their goals while it is asked again.
             if age <= HOLD_FRESH_S and (targets := still | self._targets(known)):
                 write_joints(self.device, targets)
-            present = self.get_joints(READ_TRIES, urgent=urgent)
+            present = self._joints(READ_TRIES, urgent=urgent)
         targets = still | self._targets(present)
         if targets:
             # LeRobot cannot send an action to an arm of which no motor is in it.
             write = partial(write_joints, self.device) if self._limp else self.device.send_action
             self._exchange(lambda: write(targets), urgent=urgent)
         # A bus does not confirm targets; what it answers after them shows that it took them.
-        self.get_joints(READ_TRIES, urgent=urgent)
+        self._joints(READ_TRIES, urgent=urgent)
 
     def _stop_base(self, still: Mapping[str, float]) -> None:
         """Stop the wheels before the arm is read, which one silent motor fails."""
@@ -393,7 +432,7 @@ class DeviceBody:
 
     def _stiffen(self) -> None:
         """Switch the torque on again for a motion, with the present position as target."""
-        present, limp = self.get_joints(READ_TRIES), self._limp
+        present, limp = self._joints(READ_TRIES), self._limp
         self._limp = set()
         try:
             targets = self._targets(present)
@@ -407,6 +446,54 @@ class DeviceBody:
         except BaseException:
             self._limp = limp
             raise
+
+
+class LeaderArm:
+    """A LeRobot leader, connected without a prompt while it is entered as a context.
+
+    Args:
+        device: has ``connect``, ``disconnect`` and ``get_action``; its joints are moved by hand.
+    """
+
+    def __init__(self, device: Any) -> None:
+        self.device = device
+        self._lock = bus_lock(device)
+
+    @property
+    def is_connected(self) -> bool:
+        """The device's own state; a device without one counts as connected."""
+        return bool(getattr(self.device, "is_connected", True))
+
+    def __enter__(self) -> Self:
+        DeviceBody.bring_up(self.device)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, exc: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            self.device.disconnect()
+        except OSError:
+            # Its cable is out, or a servo does not answer.
+            drop(self.device)
+
+    def get_action(self) -> Action:
+        """Read the joints by action key; raise after three lost answers."""
+        with self._lock:
+            for left in reversed(range(READ_TRIES)):
+                # A late answer would be taken for this one's, and every read after it would be old.
+                forget_input(self.device)
+                try:
+                    return dict(self.device.get_action())
+                except ConnectionError:
+                    if not left:
+                        raise
+        raise AssertionError  # the last try returns or raises
+
+    def get_teleop_events(self) -> dict[str, Any] | None:
+        """Read the device's events besides its joints; None for a device without any."""
+        read = getattr(self.device, "get_teleop_events", None)
+        return dict(read()) if callable(read) else None
 
 
 def _torque_buses(device: Any) -> dict[str, tuple[Any, str | None]]:

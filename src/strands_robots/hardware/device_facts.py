@@ -1,4 +1,4 @@
-"""Facts of a LeRobot device: port, identity, units, speeds, joints, arm.
+"""Port, identity, units, speeds, joints and parts of an arm of a LeRobot device.
 
 Neither MuJoCo nor numpy is loaded: a robot says what it can do before its first motion. The model decides then; a
 calibration that does not fit it is found with the first motion.

@@ -23,12 +23,12 @@ import tempfile
 import threading
 import time
 import tty
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 HEADER = b"\xff\xff"
 BROADCAST = 0xFE
@@ -324,37 +324,6 @@ _POLL_S = 0.05
 _CHUNK = 4096
 
 
-@dataclass(frozen=True, slots=True)
-class Write:
-    """One register write that reached one servo, in monotonic seconds."""
-
-    at: float
-    servo: int
-    address: int
-    data: bytes
-
-    def is_for(self, register: str) -> bool:
-        """True when it begins at that register."""
-        return REGISTERS[register][0] == self.address
-
-
-class Plant(Protocol):
-    """Mechanism that the servos turn; without one each turns by itself."""
-
-    def advance(self, servos: Sequence[Servo], seconds: float) -> None:
-        """Let ``seconds`` pass and put every servo's shaft where it is then."""
-
-
-class BytesHandled(Protocol):
-    """Receiver of how far the servos have come, for a driver that waits for them."""
-
-    def tell(self, count: int | None) -> None:
-        """Take the number of bytes handled; None while the servos mean to be silent."""
-
-    def remove(self) -> None:
-        """End: the port is gone."""
-
-
 class ServoBus:
     """Servos on one line, which answer from :meth:`plug` to :meth:`unplug`.
 
@@ -363,34 +332,11 @@ class ServoBus:
     Args:
         servos: in the order of the line.
         link: path of a symbolic link to the port, which stays the same when it is plugged in again.
-        latency_s: how long each answer takes.
-        plant: what the servos turn.
-        log_writes: keep every write, for :attr:`writes`.
-        progress: makes what is told how far the servos have come, by the port's path.
     """
 
-    def __init__(
-        self,
-        servos: Iterable[Servo],
-        *,
-        link: Path | None = None,
-        latency_s: float = 0.0,
-        plant: Plant | None = None,
-        log_writes: bool = False,
-        progress: Callable[[str], BytesHandled] | None = None,
-    ) -> None:
+    def __init__(self, servos: Iterable[Servo], *, link: Path | None = None) -> None:
         self.servos = {servo.number: servo for servo in servos}
-        self.latency_s = latency_s
-        self.drop_every = 0
-        """Of so many exchanges the last one's answers are never sent; 0 for none."""
-        self.answers = 0
         self._link = link
-        self._plant = plant
-        self._progress = progress
-        self._exchanges = 0
-        self._log_writes = log_writes
-        self._writes: list[Write] = []
-        self._wedged_until = 0.0
         self._moved_at = time.monotonic()
         self._lock = threading.Lock()
         self._master: int | None = None
@@ -403,11 +349,6 @@ class ServoBus:
         """The path that a driver opens."""
         return str(self._link or self._port)
 
-    @property
-    def writes(self) -> list[Write]:
-        """Every write so far."""
-        return list(self._writes)
-
     def __enter__(self) -> Self:
         self.plug()
         return self
@@ -419,17 +360,20 @@ class ServoBus:
         """Let the port appear; servos keep what they had."""
         if self._master is not None:
             return
+        self._master = self._open()
+        self._ending.clear()
+        self._thread = threading.Thread(target=self._serve, args=(self._master,), name="servo-bus", daemon=True)
+        self._thread.start()
+
+    def _open(self) -> int:
         master, slave = pty.openpty()
         tty.setraw(slave)
-        self._master, self._port = master, os.ttyname(slave)
+        self._port = os.ttyname(slave)
         os.close(slave)
         if self._link is not None:
             self._link.unlink(missing_ok=True)
             self._link.symlink_to(self._port)
-        self._ending.clear()
-        progress = None if self._progress is None else self._progress(self._port)
-        self._thread = threading.Thread(target=self._serve, args=(master, progress), name="servo-bus", daemon=True)
-        self._thread.start()
+        return master
 
     def unplug(self) -> None:
         """Let the port vanish like a pulled cable; its users get input and output errors."""
@@ -443,87 +387,53 @@ class ServoBus:
         if self._link is not None:
             self._link.unlink(missing_ok=True)
 
-    def wedge(self, seconds: float) -> None:
-        """Neither hear nor answer anything for so long."""
-        self._wedged_until = time.monotonic() + seconds
-
-    def release(self) -> None:
-        """End a wedge."""
-        self._wedged_until = 0.0
-
-    def forget(self) -> None:
-        """Empty the log of writes."""
-        self._writes = []
-
-    def written_after(self, moment: float, register: str = "goal_position") -> list[Write]:
-        """Writes to ``register`` later than ``moment``, in monotonic seconds."""
-        return [write for write in self.writes if write.at > moment and write.is_for(register)]
-
-    def shafts(self) -> dict[int, float]:
-        """Present position of every shaft, in encoder counts."""
-        with self._lock:
-            self._advance()
-            return {number: servo.shaft for number, servo in self.servos.items()}
-
-    def _serve(self, master: int, progress: BytesHandled | None) -> None:
-        tell = progress.tell if progress is not None else lambda _count: None
-        parser, count = Parser(), 0
+    def _serve(self, master: int) -> None:
+        parser = Parser()
         while not self._ending.is_set():
-            if time.monotonic() < self._wedged_until:
-                tell(None)
-                self._ending.wait(0.001)
-                continue
-            readable, _, _ = select.select([master], [], [], _POLL_S)
-            if not readable:
-                continue
-            try:
-                data = os.read(master, _CHUNK)
-            except OSError:
-                # No process has the port open.
-                self._ending.wait(0.002)
-                continue
-            count += len(data)
-            if time.monotonic() < self._wedged_until:
-                continue
-            if self.latency_s:
-                # The answers are late on purpose.
-                tell(None)
-            for packet in parser.feed(data):
+            for packet in parser.feed(self._read(master)):
                 answers: list[Packet] = []
                 self._obey(packet, answers.append)
-                self._answer(master, answers)
-            tell(count)
-        if progress is not None:
-            progress.remove()
+                if answers:
+                    self._answer(master, [answer.encoded() for answer in answers])
+
+    def _read(self, master: int) -> bytes:
+        """Return what has come within a moment; empty for nothing."""
+        readable, _, _ = select.select([master], [], [], _POLL_S)
+        try:
+            return os.read(master, _CHUNK) if readable else b""
+        except OSError:
+            # No process has the port open.
+            self._ending.wait(0.002)
+            return b""
 
     def _obey(self, packet: Packet, answer: Callable[[Packet], None]) -> None:
-        at = time.monotonic()
         given = packet.parameters
         with self._lock:
             self._advance()
             if packet.instruction == SYNC_READ and len(given) >= 2:
                 for number in given[2:]:
-                    for servo in self._readable(number, given[0]):
-                        answer(Packet(number, servo.error, servo.read(given[0], given[1])))
+                    for servo in self._alive(number):
+                        if servo.answers(given[0]):
+                            answer(Packet(number, servo.error, servo.read(given[0], given[1])))
             elif packet.instruction == SYNC_WRITE and len(given) >= 2:
                 step = given[1] + 1
                 for start in range(2, len(given) - given[1], step):
                     for servo in self._alive(given[start]):
-                        self._write(at, servo, given[0], given[start + 1 : start + step])
+                        self._write(servo, given[0], given[start + 1 : start + step])
             else:
                 for servo in self._alive(packet.servo):
-                    reply = self._one(at, servo, packet)
+                    reply = self._one(servo, packet)
                     if reply is not None and (packet.servo != BROADCAST or packet.instruction == PING):
                         answer(reply)
 
-    def _one(self, at: float, servo: Servo, packet: Packet) -> Packet | None:
+    def _one(self, servo: Servo, packet: Packet) -> Packet | None:
         given = packet.parameters
         if packet.instruction == PING:
             return Packet(servo.number, servo.error)
         if packet.instruction == READ and len(given) == 2 and servo.answers(given[0]):
             return Packet(servo.number, servo.error, servo.read(given[0], given[1]))
         if packet.instruction == WRITE and given:
-            self._write(at, servo, given[0], given[1:])
+            self._write(servo, given[0], given[1:])
             return Packet(servo.number, servo.error)
         return None
 
@@ -531,35 +441,23 @@ class ServoBus:
         asked = self.servos.values() if number == BROADCAST else [self.servos[number]] if number in self.servos else []
         return [servo for servo in asked if not servo.dead]
 
-    def _readable(self, number: int, address: int) -> list[Servo]:
-        return [servo for servo in self._alive(number) if servo.answers(address)]
-
-    def _write(self, at: float, servo: Servo, address: int, data: bytes) -> None:
+    def _write(self, servo: Servo, address: int, data: bytes) -> None:
         servo.write(address, data)
-        if self._log_writes:
-            self._writes.append(Write(at, servo.number, address, data))
 
     def _advance(self) -> None:
+        """Let the time pass since the last call."""
         now = time.monotonic()
         seconds, self._moved_at = now - self._moved_at, now
-        if self._plant is not None:
-            self._plant.advance(list(self.servos.values()), seconds)
-            return
+        self._turn(seconds)
+
+    def _turn(self, seconds: float) -> None:
         for servo in self.servos.values():
             servo.advance(seconds)
 
-    def _answer(self, master: int, answers: list[Packet]) -> None:
-        if self.latency_s:
-            time.sleep(self.latency_s * len(answers))
-        self._exchanges += bool(answers)
-        if self.drop_every and self._exchanges % self.drop_every == 0:
-            return
-        sent = [answer.encoded() for answer in answers]
+    def _answer(self, master: int, answers: list[bytes]) -> None:
         # A driver that closed its port takes no answer.
         with contextlib.suppress(OSError):
-            if sent:
-                os.write(master, b"".join(sent))
-                self.answers += len(sent)
+            os.write(master, b"".join(answers))
 
 
 @contextmanager

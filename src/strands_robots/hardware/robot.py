@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import math
 import threading
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
 from strands_robots import settings
 from strands_robots.arm_mixin import ArmMixin
 from strands_robots.audit import queue_safety_event
-from strands_robots.bus_access import joint_read_source
 from strands_robots.contract import Observer, Unsubscribe
 from strands_robots.envelope import Envelope, error, is_error, success
-from strands_robots.hardware.body import READ_TRIES, DeviceBody
+from strands_robots.hardware.body import DeviceBody
 from strands_robots.hardware.device_facts import (
     arm_parts,
     feature_type,
@@ -30,31 +27,24 @@ from strands_robots.hardware.device_facts import (
     still_action,
     temperatures,
 )
-from strands_robots.hardware.stops import TaskStop, TorqueRelease, failure, unfrozen
 from strands_robots.kinematics.arm_parts import ArmParts, StatedJoint
-from strands_robots.kinematics.arm_task import motion_rollout
-from strands_robots.policies import create_policy, resolve_provider
 from strands_robots.policies.base import Action, checked_action, is_velocity, numbers
 from strands_robots.policies.check import RobotFacts
-from strands_robots.policies.profiled import ProfiledPolicy
-from strands_robots.policies.profiles import profiles
-from strands_robots.policies.rollout import Rollout, RolloutObservers, RolloutsEnd, rollout_options, unfollowed
+from strands_robots.policies.rollout import Rollout, unfollowed
 from strands_robots.policies.settling import Settling, checked_rest_pose
+from strands_robots.policies.task_engine import RolloutsEnd, TaskEngine, failure, unfrozen
 from strands_robots.recording.cameras import LazyFrames
 from strands_robots.safety.gate import (
     REFUSALS,
-    MotionGate,
     MotionRefused,
     MotionRequest,
-    Permit,
     PermitVoidError,
-    Waiting,
     answered,
     refusal_envelope,
 )
 from strands_robots.safety.persistence import hardware_key
 from strands_robots.safety.stop_executor import stop_executor
-from strands_robots.safety.stop_targets import note_motion, verbs_to_end
+from strands_robots.safety.stop_targets import StopOfRobot, note_motion
 from strands_robots.safety.stopping import PendingVerdict, StopLevel, StopVerdict, checked_level, halts_in_parts
 from strands_robots.stop_log import stop_logger
 from strands_robots.teleop_mixin import TeleopMixin
@@ -62,15 +52,11 @@ from strands_robots.utils import ValidationError, choice, number, text
 
 if TYPE_CHECKING:  # numpy and MuJoCo are loaded with the first motion
     from strands_robots.kinematics.arm import Arm
-    from strands_robots.kinematics.motion import Motion
 
 logger = stop_logger(__name__)
 
 WIND_DOWN_S = 5.0
 """Seconds beyond its duration that :meth:`HardwareRobot.run_task` waits for a task."""
-
-IDLE_WAIT_S = 1.0
-"""Seconds that a read of the state waits for the bus while nothing drives the robot."""
 
 
 class HardwareRobot(ArmMixin, TeleopMixin):
@@ -111,27 +97,21 @@ class HardwareRobot(ArmMixin, TeleopMixin):
         model: str | None = None,
         speed_limit: float | Mapping[str, float] | None = None,
     ) -> None:
-        super().__init__()
         name = text("tool_name", tool_name, longest=128)
         rate = settings.number("STRANDS_CONTROL_HZ") if control_hz is None else control_hz
         level = checked_level(stop_level, rest_pose)
         self.tool_name_str = name
         self.control_hz = number("control_hz", rate, low=1, high=2000)
         self.device = device
-        self.gate = MotionGate()
-        self.starting = threading.RLock()
-        self.observers = RolloutObservers()
         self._body = DeviceBody(name, device, joint_ranges, level, speed_limit)
-        self._settling = self._made_to_settle(level, rest_pose)
+        self.tasks = TaskEngine(
+            name, self.body, facts=lambda _: self.policy_facts(), rate=lambda: self.control_hz, ready=self._make_ready
+        )
+        self.gate, self.starting, self.observers = self.tasks.gate, self.tasks.starting, self.tasks.observers
+        self._settling = _settling_of(self._body, self.tasks, level, rest_pose)
         self._arm: Arm | None = None
         self._model = None if model is None else text("model", model)
-        self._task: Rollout | None = None
-        self._waiting = Waiting()
-        self._sends: set[Permit] = set()
-        self._unread = ""
         self._ready, self._readying = False, threading.Lock()
-        self._moved: dict[str, None] = {}
-        self._halting: dict[str, None] = {}
         self._frozen_at = -1
         self._latest_halt: StopVerdict | PendingVerdict = StopVerdict()
 
@@ -179,7 +159,8 @@ class HardwareRobot(ArmMixin, TeleopMixin):
         Where no turn comes, or a stop waits for the bus, they are those of the last read, and ``joints_error`` says
         why. A camera that fails does not touch them.
         """
-        problem = self._refresh()
+        led = bool(self.tasks.leading() or self.tasks.running())
+        problem = self._body.refresh(led=led, rate=self.control_hz)
         age, joints = self._body.latest_joints or (None, {})
         fields: dict[str, Any] = {"joints": joints, "task": self._task_fields()}
         fields["joints_age_s"] = None if age is None else round(age, 4)
@@ -235,15 +216,12 @@ class HardwareRobot(ArmMixin, TeleopMixin):
         """Set targets once; ``sent`` has the values taken. Refused while it is driven."""
         try:
             permit = self.gate.permit("send_action", request)
-            with self.starting:
+            with self.tasks.line(self.tool_name_str):
                 self._stand_by()
-                self._free()
+                self.tasks.require_free(self.tool_name_str)
                 targets = checked_action(dict(action) if isinstance(action, Mapping) else action, self._body.bounds)
-            self._sends.add(permit)
-            try:
+            with self.tasks.sending(permit):
                 sent = self._body.send_action(targets, permit)
-            finally:
-                self._sends.discard(permit)
         except MotionRefused as refused:
             return refused.envelope
         except PermitVoidError as void:
@@ -340,11 +318,8 @@ class HardwareRobot(ArmMixin, TeleopMixin):
                 and ``n_steps`` (actions after which it ends).
         """
         try:
-            task = self._start(
-                "start_task",
-                self._task_of(instruction, policy_provider, duration, {"policy_port": policy_port, **policy}),
-                request,
-            )
+            new = self.tasks.of_policy(instruction, policy_provider, duration, {"policy_port": policy_port, **policy})
+            task = self.tasks.start("start_task", self.tool_name_str, new, request)
         except REFUSALS as refused:
             return refusal_envelope("start_task", refused)
         problem = task.not_begun()
@@ -369,10 +344,8 @@ class HardwareRobot(ArmMixin, TeleopMixin):
         **policy: Any,
     ) -> Envelope:
         """Run a task to its end; an error when the policy failed or ran too long."""
-        task = self._start(
-            "start_task",
-            self._task_of(instruction, policy_provider, duration, {"policy_port": policy_port, **policy}),
-        )
+        new = self.tasks.of_policy(instruction, policy_provider, duration, {"policy_port": policy_port, **policy})
+        task = self.tasks.start("start_task", self.tool_name_str, new)
         if not task.join((task.duration or 0.0) + WIND_DOWN_S):
             task.request_stop()
             return error(f"The task was still running {WIND_DOWN_S:g} s after its time.", **self._task_fields())
@@ -382,10 +355,10 @@ class HardwareRobot(ArmMixin, TeleopMixin):
 
     def stop_task(self) -> Envelope:
         """Stop the task and freeze the robot, within the halt deadline."""
-        self._waiting.void()
+        self.tasks.waiting.void()
         if self.gate.under_way:
             return self.halt("stop_task").envelope()
-        task = self._task
+        task = self.tasks.latest(self.tool_name_str)
         if task is None or not task.running:
             return success("No task runs.", stopped=True, was_running=False, **self._task_fields())
         task.void()
@@ -401,11 +374,6 @@ class HardwareRobot(ArmMixin, TeleopMixin):
         fields = self._task_fields()
         return success(f"Task {fields['task_status']} after {fields['step_count']} steps.", **fields)
 
-    def occupied(self, robot: str) -> str:
-        """The running task, for a refusal; empty when none runs."""
-        task = self._task
-        return f"the task {task.instruction!r}" if task is not None and task.running else ""
-
     @halts_in_parts
     def halt(self, reason: str = "") -> StopVerdict:
         """Stop every motion and freeze, within ``STRANDS_HALT_DEADLINE_S``.
@@ -418,7 +386,7 @@ class HardwareRobot(ArmMixin, TeleopMixin):
 
     def halt_ordered(self) -> None:
         """Note what moves; a loop whose permit is void counts as halted."""
-        self._moved.update(dict.fromkeys(self._moving()))
+        self.tasks.note_motion()
         # A device that asks a daemon to stop does so at once, though a halt before this one still waits for it.
         note_motion(self.device)
 
@@ -429,51 +397,27 @@ class HardwareRobot(ArmMixin, TeleopMixin):
         if ordered == self._frozen_at and (settles or not self._body.driven):
             # A halt that waited for the bus when this one was ordered has frozen the robot for both.
             return self._latest_halt
-        # Counted before the wait for the bus: a motion that is allowed meanwhile goes on after the freeze.
-        given, at = self.gate.given, [ordered]
-        with self._halted(deadline, lambda verdict: self._settled_after(at[0], given, verdict)) as verdicts:
-            at[0] = self.gate.generation
+        with self.tasks.halting(deadline) as halt, self._body.stopping():
+            # A halt that was ordered while this one waited for the bus is served by this freeze.
+            halt.generation = self.gate.generation
             self._body.stop()
-            self._frozen_at = at[0]
-        self._latest_halt = verdicts[0]
-        return self._latest_halt
+            self._frozen_at = halt.generation
+        self._latest_halt = halt.verdict
+        return halt.verdict
 
     def release_here(self, motors: Collection[str], deadline: float) -> StopVerdict | PendingVerdict:
         """Halt and switch torque off on the stop executor's thread."""
         if self._settling is not None:
             self._settling.take()
-        with self._halted(deadline) as verdicts:
+        with self.tasks.halting(deadline, settles=False) as halt:
             self._body.release(motors)
-        return verdicts[0]
-
-    @contextmanager
-    def _halted(
-        self, deadline: float, then: Callable[[StopVerdict], StopVerdict] = lambda verdict: verdict
-    ) -> Iterator[list[StopVerdict | PendingVerdict]]:
-        """Void every permit and loop; inside, the body is frozen.
-
-        Yields a list that has the verdict afterwards, which ``then`` makes of the halt's own.
-        """
-        verdicts: list[StopVerdict | PendingVerdict] = []
-        moved = self._halting = dict.fromkeys([*self._moved, *self._moving()])
-        self._moved = {}
-        self.gate.revoke()
-        loops = self._voided_loops()
-        try:
-            with self._body.stopping():
-                yield verdicts
-        except Exception as exc:  # noqa: BLE001 - a device may raise anything; the verdict says what
-            verdicts.append(unfrozen(failure(self.tool_name_str, exc), moved))
-        else:
-            verdicts.append(RolloutsEnd(moved, loops, deadline, then, verbs_to_end(self.gate.under_way)).at_once())
-        finally:
-            self._halting = {}
+        return halt.verdict
 
     def unanswered(self, why: str) -> StopVerdict:
         """Return the verdict while the bus does not answer."""
         if self._frozen_at == self.gate.generation:
-            return RolloutsEnd((), self._voided_loops(), 0.0).unread(why)
-        return unfrozen(why, dict.fromkeys([*self._halting, *self._moved, *self._moving()]))
+            return RolloutsEnd((), self.tasks.void(), 0.0).unread(why)
+        return unfrozen(why, self.tasks.noted())
 
     @answered
     def release_torque(self, motor_ids: str = "") -> Envelope:
@@ -499,25 +443,9 @@ class HardwareRobot(ArmMixin, TeleopMixin):
         fields = {name: value for name, value in answer.items() if name not in ("status", "content")}
         return success(f"Torque is off: {', '.join(answer['released'])}.", **fields)
 
-    def _settled_after(self, generation: int, given: int, verdict: StopVerdict) -> StopVerdict:
-        """Let a frozen robot settle, unless another stop or a motion came since."""
-        settling = self._settling
-        if settling is None or self.gate.under_way:
-            return verdict
-        if generation != self.gate.generation:
-            # The two stops are one, and the later one lets the arm settle.
-            return replace(verdict, settling=settling.running)
-        if not settling.take() or not verdict.stopped:
-            return verdict
-        return replace(verdict, settling=settling.begin(generation, given))
-
     def wait_settled(self) -> str:
         """Wait for the end of a settling, at most 6 s; return a sentence on it."""
-        if self._settling is None:
-            return ""
-        self._settling.wait()
-        end = self._settling.ending()
-        return end and f"{self.tool_name_str} {end}."
+        return self.tasks.settlings.wait()
 
     def cleanup(self) -> Envelope:
         """Halt and disconnect; a robot that did not stop or settle stays connected.
@@ -553,103 +481,23 @@ class HardwareRobot(ArmMixin, TeleopMixin):
                 stop_executor().attach(self, self.tool_name_str)
                 self._ready = True
 
-    def _made_to_settle(self, level: StopLevel, rest_pose: object) -> Settling | None:
-        if rest_pose is None:
-            return None
-        ranges = {key: each for key, each in self._body.bounds.items() if not is_velocity(key)}
-        pose = checked_rest_pose(rest_pose, ranges)
-        if level != "settle":
-            return None
-        settling = Settling(self._body, self.gate, pose, ranges, self.observers)
-        self.gate.watch(settling.note_motion)
-        return settling
-
-    def _moving(self) -> list[str]:
-        task, settling = self._task, self._settling
-        moving = ["task"] if task is not None and task.running else []
-        moving += ["settling"] if settling is not None and settling.running else []
-        return moving + [f"teleoperation {name}" for name in self.teleoperating()] + ["send_action"] * bool(self._sends)
-
-    def _voided_loops(self) -> dict[str, Rollout]:
-        """Void every running loop; return them as a verdict names them."""
-        loops: dict[str, Rollout] = {}
-        task = self._task
-        if task is not None and task.running:
-            task.void()
-            loops["task"] = task
-        return loops | self.void_teleoperation()
-
-    def _task_of(
-        self, instruction: str, provider: str, duration: float, options: dict[str, Any]
-    ) -> Callable[[Permit], Rollout]:
-        """Check a task, and return the callable that makes its rollout."""
-        name = resolve_provider(provider)
-        profile = profiles().get(name)
-        if profile is not None:
-            options = profile.loop_options(options, self.control_hz)
-        chosen = rollout_options(instruction, duration, options, self.control_hz)
-
-        def made(permit: Permit) -> Rollout:
-            policy = create_policy(name, **options)
-            if isinstance(policy, ProfiledPolicy):
-                policy.fit(self.policy_facts())
-            permit.check()
-            return Rollout(self._body, policy, permit=permit, policy_name=name, observers=self.observers, **chosen)
-
-        return made
-
-    def start_motion(
-        self,
-        robot_name: str,
-        verb: str,
-        plan: Callable[[float, Permit], Motion],
-        *,
-        request: MotionRequest | None = None,
-    ) -> Rollout:
-        """Plan and start a motion of the arm."""
-        self.body(robot_name)
-
-        def made(permit: Permit) -> Rollout:
-            motion = plan(self.control_hz, permit)
-            permit.check()
-            return motion_rollout(self._body, motion, permit, self.control_hz, self.observers)
-
-        return self._start(verb, made, request)
-
-    def _start(self, verb: str, made: Callable[[Permit], Rollout], request: MotionRequest | None = None) -> Rollout:
-        # Before the wait for the robot: a stop that comes while this waits, connects or loads is newer.
-        permit = self.gate.permit(verb, request)
-        with self._waiting.until_begun(permit), self.starting:
-            permit.check()
-            if not self._ready:
-                self._stand_by()
-            self._free()
-            if self._body.lost:
-                self._reconnect()
-            if not self._body.is_connected:
-                raise ValidationError(f"{self.tool_name_str} is not connected; connect() it first.")
-            task = self._task = made(permit)
-            task.start()
-            return task
-
-    def _reconnect(self) -> None:
-        """Connect again before a motion, if the port is back."""
-        try:
-            self._body.connect()
-        except Exception as exc:
-            raise ValidationError(
-                f"{self.tool_name_str} lost its port and could not be connected again: {type(exc).__name__}: {exc}."
-            ) from exc
-        logger.warning("%s lost its port and is connected again.", self.tool_name_str)
-
-    def _free(self) -> None:
-        leader = self.teleoperated_by(self.tool_name_str) if self._teleop_sessions else ""
-        busy = (self._task and self.occupied(self.tool_name_str)) or (leader and f"the leader {leader}")
-        if busy:
-            raise ValidationError(f"{self.tool_name_str} is driven by {busy}; stop that first.")
+    def _make_ready(self) -> None:
+        """Connect again if the port is back, and have a thread ready for a stop."""
+        if not self._ready:
+            self._stand_by()
+        if self._body.lost:
+            try:
+                self._body.connect()
+            except Exception as exc:
+                raise ValidationError(
+                    f"{self.tool_name_str} lost its port and could not be connected again: {type(exc).__name__}: {exc}."
+                ) from exc
+            logger.warning("%s lost its port and is connected again.", self.tool_name_str)
+        if not self._body.is_connected:
+            raise ValidationError(f"{self.tool_name_str} is not connected; connect() it first.")
 
     def _task_fields(self) -> dict[str, Any]:
-        task = self._task
+        task = self.tasks.latest(self.tool_name_str)
         return {
             "task_status": "idle" if task is None else task.state,
             "instruction": "" if task is None else task.instruction,
@@ -663,38 +511,65 @@ class HardwareRobot(ArmMixin, TeleopMixin):
             **({} if self._settling is None else {"settling": self._settling.state}),
         }
 
-    def _refresh(self) -> str:
-        if joint_read_source(self) is None or not self._body.is_connected:
-            return "The device is not connected."
-        if self._body.lost:
-            return "The device's port is gone; these are the joints of the last read."
-        age, _ = self._body.latest_joints or (math.inf, {})
-        led = bool(self.teleoperating()) or (self._task is not None and self._task.running)
-        # Two, because at one the loop itself is about to read, and would be held up.
-        if led and age <= 2 / self.control_hz:
-            return ""
-        within_s = 1 / self.control_hz if led else IDLE_WAIT_S
-        if not self._body.lock.acquire(timeout=within_s):
-            return f"The bus was busy for {within_s:g} s; these are the joints of the last read."
-        try:
-            if self._body.stop_waits:
-                return "A stop waits for the bus; these are the joints of the last read."
-            # The driving loop waits meanwhile: for one lost answer, not for three.
-            self._body.get_joints(1 if self._body.driven else READ_TRIES)
-        except Exception as exc:  # noqa: BLE001 - a device may raise anything; the answer says what
-            problem = f"The joints could not be read: {type(exc).__name__}: {exc}"
-            if problem != self._unread:
-                # A caller may ask fifty times a second.
-                logger.warning("%s: %s", self.tool_name_str, problem)
-            self._unread = problem
-            return problem
-        finally:
-            self._body.lock.release()
-        self._unread = ""
-        return ""
-
 
 def _picture(camera: Any) -> Any:
     """Return the newest picture; older LeRobot cameras only give new ones."""
     newest = getattr(camera, "read_latest", None)
     return newest() if callable(newest) else camera.async_read()
+
+
+@dataclass(frozen=True)
+class TaskStop:
+    """Stops a task that was asked to end, and leaves what waits to start."""
+
+    body: DeviceBody
+    task: Rollout
+
+    def halt_ordered(self) -> None:
+        """The caller has noted the task."""
+
+    def halt_here(self, reason: str, deadline: float) -> StopVerdict | PendingVerdict:
+        try:
+            self.body.stop()
+        except Exception as exc:  # noqa: BLE001 - a device may raise anything; the verdict says what
+            return self.unanswered(failure(self.body.name, exc))
+        return RolloutsEnd((), {"task": self.task}, deadline)
+
+    def unanswered(self, why: str) -> StopVerdict:
+        return StopVerdict(not_stopped={"task": why})
+
+
+@dataclass(frozen=True)
+class TorqueRelease(StopOfRobot):
+    """Stops a robot and takes the torque of some motors, or all, away."""
+
+    robot: HardwareRobot
+    motors: str
+
+    def stopped_robot(self) -> object:
+        """Return the robot, whose own verbs it stops as well."""
+        return self.robot
+
+    def halt_ordered(self) -> None:
+        """Note what moves."""
+        self.robot.halt_ordered()
+
+    def halt_here(self, reason: str, deadline: float) -> StopVerdict | PendingVerdict:
+        return self.robot.release_here(self.motors.split(",") if self.motors else (), deadline)
+
+    def unanswered(self, why: str) -> StopVerdict:
+        return self.robot.unanswered(why)
+
+
+def _settling_of(body: DeviceBody, tasks: TaskEngine, level: StopLevel, rest_pose: object) -> Settling | None:
+    """Return the settling that a stop level asks for; check the pose in any case."""
+    if rest_pose is None:
+        return None
+    ranges = {key: each for key, each in body.bounds.items() if not is_velocity(key)}
+    pose = checked_rest_pose(rest_pose, ranges)
+    if level != "settle":
+        return None
+    settling = Settling(body, tasks.gate, pose, ranges, tasks.observers)
+    tasks.gate.watch(settling.note_motion)
+    tasks.settlings.by_body = {body.name: settling}
+    return settling

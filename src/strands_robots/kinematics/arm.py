@@ -1,4 +1,4 @@
-"""An arm of a body: its joints, and trajectories of them from rest to rest."""
+"""An arm of a body: its joints by the body's numbers, and joint trajectories."""
 
 from __future__ import annotations
 

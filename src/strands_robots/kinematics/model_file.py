@@ -1,4 +1,4 @@
-"""A robot model's file, loaded within bounds; its servos and its tip.
+"""A robot model's file: loaded within bounds, its position servos, its tip.
 
 A file of a few kilobytes may ask for a million bodies, a mesh or a picture of gigabytes, or a depth at which the
 parser's stack ends and the process with it. All of that is counted in the XML and in the sizes of the files that it

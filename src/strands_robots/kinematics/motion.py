@@ -10,6 +10,7 @@ Of a robot that only states its joints no shape is known, so the way of its moti
 
 from __future__ import annotations
 
+import threading
 import time
 from bisect import bisect_right
 from collections import deque
@@ -31,10 +32,13 @@ from strands_robots.kinematics.arm import (
 )
 from strands_robots.kinematics.arm_parts import StatedJoint
 from strands_robots.policies.base import JOINT_SPEED_RAD_S, PolicyError, Ranges, numbers
+from strands_robots.policies.rollout import Body, Rollout, RolloutObservers
+from strands_robots.safety.gate import Permit
 from strands_robots.utils import ValidationError, shown
 
 if TYPE_CHECKING:  # MuJoCo is not needed to watch joints
     from strands_robots.kinematics.chain import Floats
+    from strands_robots.kinematics.objects import Sight
 
 WINDOWS_S = (0.12, 0.22)
 """Times over which a joint is compared with its setpoints; the longer one is for slow motions."""
@@ -515,4 +519,58 @@ def move_joints(
         hz,
         end_joints=goal,
         wanted={joint.name: at for joint, at in goals.items()},
+    )
+
+
+POLICY_NAME = "motion"
+"""What a planned motion is called where a policy's name stands."""
+
+
+@dataclass
+class ArmTask:
+    """One motion, running or ended.
+
+    Attributes:
+        outcome: how it ended, once it was asked for; it stays as it was then.
+        sight: the objects before and after it; None where none can be seen.
+        looked: set once the objects were looked at after it.
+    """
+
+    task_id: str
+    rollout: Rollout
+    motion: Motion
+    outcome: dict[str, Any] | None = None
+    sight: Sight | None = None
+    looked: threading.Event = field(default_factory=threading.Event)
+
+    @property
+    def running(self) -> bool:
+        """True until the motion has ended; a look at its end does not count."""
+        return self.rollout.running
+
+    @property
+    def unseen(self) -> bool:
+        """True while the end of a completed motion is looked at."""
+        return self.rollout.state == "completed" and self.sight is not None and not self.looked.is_set()
+
+    def join(self, seconds: float) -> None:
+        """Wait for the end and the look at it."""
+        until = time.monotonic() + seconds
+        self.rollout.join(seconds)
+        if self.unseen:
+            self.looked.wait(max(0.0, until - time.monotonic()))
+
+
+def motion_rollout(body: Body, motion: Motion, permit: Permit, hz: float, observers: RolloutObservers) -> Rollout:
+    """Return the rollout that plays a motion; what it grips in the end it keeps."""
+    return Rollout(
+        body,
+        motion,
+        permit=permit,
+        instruction=motion.instruction,
+        policy_name=POLICY_NAME,
+        duration=motion.duration,
+        hz=hz,
+        observers=observers,
+        ends_at_rest=True,
     )

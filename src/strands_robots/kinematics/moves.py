@@ -1,4 +1,4 @@
-"""Motions of an arm: to joints or a point, along a line, picks and places.
+"""Motions of an arm to joints, a point, along a line, to pick and to place.
 
 Each function raises :class:`~strands_robots.utils.ValidationError` with the reason why the motion cannot be.
 
@@ -18,11 +18,9 @@ import numpy as np
 
 from strands_robots.kinematics.arm import Action, Arm, ArmState, Bounds, joined, timed
 from strands_robots.kinematics.chain import Chain, Floats
-from strands_robots.kinematics.contacts import beside
-from strands_robots.kinematics.inverse import rolled
 from strands_robots.kinematics.motion import Motion, Segment
-from strands_robots.kinematics.objects import Held, SeenObject
-from strands_robots.kinematics.planner import APPROACH_STEP_DEG, Planner
+from strands_robots.kinematics.objects import Held, SeenObject, beside
+from strands_robots.kinematics.planner import APPROACH_STEP_DEG, Planner, rolled
 from strands_robots.utils import ValidationError
 
 JAW_S = 0.8

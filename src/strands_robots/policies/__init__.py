@@ -21,7 +21,7 @@ ENTRY_POINT_GROUP = "strands_robots.policies"
 ALIASES = {"lerobot": "lerobot_local"}
 
 _BUILT_IN = {
-    "mock": ("strands_robots.policies.mock", "MockPolicy"),
+    "mock": ("strands_robots.policies.base", "MockPolicy"),
     "remote": ("strands_robots.policies.remote", "RemotePolicy"),
     "openpi": ("strands_robots.policies.openpi", "OpenPiPolicy"),
     "groot": ("strands_robots.policies.groot", "GrootPolicy"),
@@ -47,10 +47,8 @@ def resolve_provider(provider: object) -> str:
         ValidationError: no such provider; the message names similar ones.
     """
     name = ALIASES.get(provider, provider) if isinstance(provider, str) else ""
-    # Plug-ins come last: to find them reads the disk.
-    if name in _BUILT_IN or name in profiles() or name in _plug_ins():
+    if name in _BUILT_IN or name in (names := policy_names()):
         return name
-    names = policy_names()
     similar = alike(str(name), names)
     hint = f" Did you mean {' or '.join(similar)}?" if similar else ""
     raise ValidationError(f"policy_provider must be one of {', '.join(names)}, not {shown(provider)}.{hint}")

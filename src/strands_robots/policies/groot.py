@@ -40,8 +40,8 @@ from strands_robots.policies.policy_server import (
     picture_key,
     wait_for_answer,
 )
+from strands_robots.policies.preload import PreloadedModels
 from strands_robots.policies.profiles import Profile
-from strands_robots.policies.warm import WarmModels
 from strands_robots.utils import ValidationError, optional_module, shown
 
 _GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + bytes(32)
@@ -259,7 +259,7 @@ class GrootPolicy(ServedPolicy):
     """
 
     provider = "groot"
-    connections = WarmModels()
+    connections = PreloadedModels()
 
     def __init__(self, profile: Profile | None = None) -> None:
         super().__init__(profile)

@@ -38,8 +38,8 @@ from strands_robots.policies.policy_server import (
     picture_key,
     wait_for_answer,
 )
+from strands_robots.policies.preload import PreloadedModels
 from strands_robots.policies.profiles import Profile
-from strands_robots.policies.warm import WarmModels
 from strands_robots.utils import ValidationError, is_loopback_host, optional_module, shown
 
 HELPERS = "lerobot.async_inference.helpers"
@@ -507,7 +507,7 @@ class LeRobotAsyncPolicy(ServedPolicy):
     """
 
     provider = "lerobot_async"
-    connections = WarmModels()
+    connections = PreloadedModels()
 
     def __init__(self, profile: Profile | None = None) -> None:
         super().__init__(profile)

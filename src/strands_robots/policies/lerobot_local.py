@@ -20,8 +20,8 @@ from typing import Any
 
 from strands_robots.policies.base import Action, PolicyError, Ranges
 from strands_robots.policies.decoding import read_json
+from strands_robots.policies.preload import PreloadedModels
 from strands_robots.policies.profiles import Profile
-from strands_robots.policies.warm import WarmModels
 from strands_robots.utils import ValidationError, missing_extra, shown
 
 LEROBOT_IMPORTS = threading.RLock()
@@ -40,7 +40,7 @@ def lerobot_import(name: str) -> ModuleType:
 
 STATE, ENVIRONMENT, IMAGES = "observation.state", "observation.environment_state", "observation.images."
 
-_MODELS = WarmModels()
+_MODELS = PreloadedModels()
 """Loaded checkpoints by path and device."""
 
 

@@ -30,8 +30,8 @@ from strands_robots.policies.policy_server import (
     picture_key,
     wait_for_answer,
 )
+from strands_robots.policies.preload import PreloadedModels
 from strands_robots.policies.profiles import Profile
-from strands_robots.policies.warm import WarmModels
 from strands_robots.utils import ValidationError, optional_module, shown
 
 _module = partial(optional_module, what="The openpi policy", extra="remote")
@@ -114,7 +114,7 @@ class OpenPiPolicy(ServedPolicy):
     """
 
     provider = "openpi"
-    connections = WarmModels()
+    connections = PreloadedModels()
 
     def __init__(self, profile: Profile | None = None) -> None:
         super().__init__(profile)

@@ -12,8 +12,8 @@ from typing import Any, ClassVar, Protocol
 
 from strands_robots.policies.base import Action, PolicyError, Ranges
 from strands_robots.policies.decoding import MESSAGE_MAX
+from strands_robots.policies.preload import PreloadedModels
 from strands_robots.policies.profiles import CameraMap, Profile
-from strands_robots.policies.warm import WarmModels
 from strands_robots.utils import ValidationError, choice, optional_module, shown
 
 CHUNK_MAX = 10_000
@@ -68,7 +68,7 @@ class ServedPolicy:
     """
 
     provider: ClassVar[str]
-    connections: ClassVar[WarmModels]
+    connections: ClassVar[PreloadedModels]
     """Connections on which an inference was made, by profile and server."""
 
     def __init__(self, profile: Profile | None = None) -> None:

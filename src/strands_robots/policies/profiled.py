@@ -1,4 +1,4 @@
-"""A policy as its profile describes it: order, units, pictures, chunks.
+"""A policy as its profile describes it: order, units, speed, chunks in time.
 
 A position counts the policy's own steps, of which there are ``rate`` in a second. It goes on only while an action is
 played, so a robot that waits for its policy misses nothing of the path. A chunk begins at the position of its
@@ -29,8 +29,8 @@ from strands_robots.policies.base import (
     speeds_across,
 )
 from strands_robots.policies.check import CONVERTIBLE, PolicyCheckError, RobotFacts, check_policy, statements_of
+from strands_robots.policies.preload import Warmable, computing, require_warm
 from strands_robots.policies.profiles import CameraMap, Profile
-from strands_robots.policies.warm import Warmable, computing, require_warm
 from strands_robots.safety.gate import MotionRefused
 from strands_robots.utils import ValidationError, missing_extra, number, shown
 
@@ -41,7 +41,7 @@ _EXACT = 1e-6
 """Part of a step that is none: 50 Hz and 25 Hz meet at every second tick."""
 
 
-class Playback:
+class ChunkPlayer:
     """Position in a policy's steps, and the chunk that is played there.
 
     Args:
@@ -378,7 +378,7 @@ class ProfiledPolicy:
 
     The inner policy gets the state keys of the profile in its order and unit, and pictures by their keys; it answers
     with actions of exactly the profile's keys, or chunks of them. It computes on a thread of its own while
-    :meth:`act`, which never waits, plays the last chunk: see :class:`Playback`. An inner policy with ``every_tick``
+    :meth:`act`, which never waits, plays the last chunk: see :class:`ChunkPlayer`. An inner policy with ``every_tick``
     true, which needs every observation, computes in :meth:`act`.
 
     Args:
@@ -405,7 +405,7 @@ class ProfiledPolicy:
         self._inference: Inference = InferenceWorker(profile.name, self._infer, inner.close)
         if getattr(inner, "every_tick", False):
             self.compute_inline()
-        self._playback = Playback(rate=1.0, hz=1.0)
+        self._player = ChunkPlayer(rate=1.0, hz=1.0)
         self._asked: tuple[float, float] = (0.0, 0.0)
         self._counts = LoopCounts()
         self._missed = 0
@@ -471,7 +471,7 @@ class ProfiledPolicy:
         self._speeds = {} if fastest is None else speeds_across(ranges, fastest, UNBOUNDED_PER_S)
         self._last = {}
         horizon = 1 if getattr(self._inner, "every_tick", False) else profile.horizon
-        self._playback = Playback(rate=profile.rate or self._hz, hz=self._hz, horizon=horizon)
+        self._player = ChunkPlayer(rate=profile.rate or self._hz, hz=self._hz, horizon=horizon)
         self._inner.reset(profile.task or instruction, inner)
 
     def act(self, observation: Mapping[str, Any]) -> Action | tuple[()] | None:
@@ -482,19 +482,19 @@ class ProfiledPolicy:
         """
         if self._interrupted.is_set():
             return ()
-        now, playback = self._now(), self._playback
-        playback.advance(1 + self._missed)
+        now, player = self._now(), self._player
+        player.advance(1 + self._missed)
         self._missed = 0
         self._take(observation)
-        if self._inference.waited_s is None and not self._done and playback.due():
+        if self._inference.waited_s is None and not self._done and player.due():
             self._ask(observation, now)
             self._take(observation)
-        action = playback.play()
-        self.uses_cameras = bool(self.profile.cameras) and self._inference.waited_s is None and playback.due(ahead=1)
+        action = player.play()
+        self.uses_cameras = bool(self.profile.cameras) and self._inference.waited_s is None and player.due(ahead=1)
         if action is None:
             return None if self._done else self._keep_place()
         self._dry = False
-        self._counts.aged(playback.age_s(now))
+        self._counts.aged(player.age_s(now))
         return self._limited(action)
 
     def miss(self, ticks: int) -> None:
@@ -503,7 +503,7 @@ class ProfiledPolicy:
 
     def counts(self) -> dict[str, float]:
         """Return the figures of the loop, as :class:`LoopCounts` names them."""
-        return {**self._counts.as_dict(), "stale_actions": self._playback.stale}
+        return {**self._counts.as_dict(), "stale_actions": self._player.stale}
 
     def interrupt(self) -> None:
         self._interrupted.set()
@@ -511,7 +511,7 @@ class ProfiledPolicy:
 
     def close(self) -> None:
         self._inference.close()
-        self._playback.clear()
+        self._player.clear()
 
     def _ask(self, observation: Mapping[str, Any], now: float) -> None:
         profile = self.profile
@@ -524,8 +524,8 @@ class ProfiledPolicy:
             return
         seen: dict[str, Any] = {key: present[key] * self._scale[key] for key in (*profile.state, *profile.environment)}
         pictures = {camera: observation.get(camera.camera) for camera in profile.cameras}
-        self._asked = (self._playback.position, now)
-        self._inference.ask((seen, pictures, self._playback.played, self._playback.delay))
+        self._asked = (self._player.position, now)
+        self._inference.ask((seen, pictures, self._player.played, self._player.delay))
 
     def _infer(self, request: tuple[dict[str, Any], dict[CameraMap, object], int, int]) -> list[Action] | None:
         """Return the chunk for a request, in the robot's units."""
@@ -561,7 +561,7 @@ class ProfiledPolicy:
         elif answer.value:
             present = numbers(observation)
             self._last = self._last or {key: present[key] for key in self.profile.action if key in present}
-            self._playback.take(answer.value, *self._asked, answer.latency_s)
+            self._player.take(answer.value, *self._asked, answer.latency_s)
 
     def _keep_place(self) -> Action | tuple[()]:
         """Count a step without an action; a velocity is told to be zero."""

@@ -11,9 +11,8 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Mapping
 from contextlib import AbstractContextManager
-from functools import partial
 from typing import Any, Literal, Protocol, TypedDict
 
 from strands_robots.contract import Observers, RolloutEvent
@@ -32,7 +31,6 @@ from strands_robots.policies.base import (
 )
 from strands_robots.safety.gate import Permit, PermitVoidError
 from strands_robots.safety.process import shorten_time_slices
-from strands_robots.safety.stopping import READ_EVERY_S, PendingVerdict, StopVerdict, halt_each
 from strands_robots.stop_log import stop_logger
 from strands_robots.utils import ValidationError, number, text, whole
 from strands_robots.utils import duration as checked_duration
@@ -172,6 +170,7 @@ class Rollout:
         clock: Clock | None = None,
         ends_at_rest: bool = False,
     ) -> None:
+        self.robot = body.name
         self.instruction = instruction
         self.policy_name = policy_name
         self.duration = duration
@@ -207,11 +206,6 @@ class Rollout:
         self._thread = threading.Thread(target=self.run, name=f"rollout-{body.name}", daemon=True)
         self.start = self._thread.start
         """Run on the rollout's own thread; returns at once."""
-
-    @property
-    def robot(self) -> str:
-        """Name of the body."""
-        return self._body.name
 
     @property
     def running(self) -> bool:
@@ -349,8 +343,7 @@ class Rollout:
                 return "completed"
             if self._steps is not None and self.step_count >= self._steps:
                 return "completed"
-            body = self._body
-            observation = body.get_observation() if self._policy.uses_cameras else dict(body.get_joints())
+            observation = self._body.get_observation() if self._policy.uses_cameras else dict(self._body.get_joints())
             if not chunk:
                 actions = self._policy.act(observation)
                 if actions is None:
@@ -435,7 +428,7 @@ class Rollout:
         self._observers.notify(
             RolloutEvent(
                 kind=kind,
-                robot=self._body.name,
+                robot=self.robot,
                 instruction=self.instruction,
                 policy=self.policy_name,
                 step=self.step_count,
@@ -446,63 +439,3 @@ class Rollout:
                 **more,
             )
         )
-
-
-class RolloutsEnd(PendingVerdict):
-    """Verdict of a halt that has voided loops, and does not wait for their ends.
-
-    Args:
-        moved: what has moved and was frozen.
-        loops: the voided rollouts, by what a verdict calls them.
-        until: the moment, in monotonic s, until which their ends are waited for.
-        then: makes the final verdict.
-        moves: returns True while something else of the robot has to end; at last the verdict is without ``then``.
-    """
-
-    def __init__(
-        self,
-        moved: Iterable[str],
-        loops: Mapping[str, Rollout],
-        until: float,
-        then: Callable[[StopVerdict], StopVerdict] = lambda verdict: verdict,
-        moves: Callable[[], bool] = lambda: False,
-    ) -> None:
-        self._moves = moves
-        # The reading itself waits for the end of a loop.
-        super().__init__(until, pause_s=0.0)
-        self._moved, self._loops, self._then = tuple(moved), loops, then
-        self._final: StopVerdict | None = None
-        self._interrupted = self._answered_for = False
-
-    def at_once(self) -> StopVerdict | PendingVerdict:
-        """Return the verdict where nothing has to end, else this."""
-        return self if self._loops or self._moves() else self._then(self._found())
-
-    def known(self) -> StopVerdict | None:
-        return self.judged(None, last=False)
-
-    def read(self) -> None:
-        if not self._interrupted:
-            self._interrupted = True
-            for each in self._loops.values():
-                each.interrupt()
-        for each in self._loops.values():
-            if each.running:
-                each.join(READ_EVERY_S)
-                return
-
-    def judged(self, reading: object, *, last: bool) -> StopVerdict | None:
-        found, moves = self._found(), self._moves()
-        if self._final is None and ((found.stopped and not moves) or last):
-            # Once, and in time: it may have the robot settle, of which the answer must say so.
-            self._final = found if self._answered_for or moves else self._then(found)
-        return self._final
-
-    def unread(self, why: str) -> StopVerdict:
-        self._answered_for = True
-        return self._found()
-
-    def _found(self) -> StopVerdict:
-        still = success("Stopped.", stopped=True)
-        ends = {name: partial(each.ended_by, time.monotonic()) for name, each in self._loops.items()}
-        return halt_each({**{name: lambda: still for name in self._moved}, **ends})

@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from typing import Any, Literal, Protocol
 
 from strands_robots.audit import queue_safety_event
@@ -21,6 +22,7 @@ from strands_robots.errors import StrandsRobotsError
 from strands_robots.policies.base import Action, Ranges
 from strands_robots.policies.rollout import RolloutObservers
 from strands_robots.safety.gate import MotionGate, Permit, PermitVoidError
+from strands_robots.safety.stopping import StopVerdict
 from strands_robots.stop_log import stop_logger
 from strands_robots.utils import ValidationError, mapping, number, shown
 
@@ -290,3 +292,43 @@ class Settling:
                 error=problem if state == "error" else "",
             )
         )
+
+
+class Settlings:
+    """Settling of each arm of a robot or of a world, by the name of its body."""
+
+    def __init__(self) -> None:
+        # A halt may be reading the present map, so that a new one takes its place as a whole.
+        self.by_body: Mapping[str, Settling] = {}
+
+    def running(self) -> list[str]:
+        """Return the names of the bodies that settle."""
+        return [name for name, each in self.by_body.items() if each.running]
+
+    def after(self, gate: MotionGate, generation: int, given: int, verdict: StopVerdict) -> StopVerdict:
+        """Let the arms settle that moved since the last stop, if everything stopped.
+
+        Args:
+            gate: of the robot.
+            generation: of the halt that has frozen every body.
+            given: the gate's count of permits at that halt.
+            verdict: of that halt.
+        """
+        if not self.by_body or gate.under_way:
+            # A verb of the robot's own goes on, or halts its own robot.
+            return verdict
+        if generation != gate.generation:
+            # Another stop came meanwhile: the two are one, and the later one lets the arms settle.
+            return replace(verdict, settling=bool(self.running()))
+        due = [each for each in self.by_body.values() if each.take()]
+        if not due or not verdict.stopped:
+            return verdict
+        begun = [each.begin(generation, given) for each in due]
+        return replace(verdict, settling=any(begun))
+
+    def wait(self) -> str:
+        """Wait for the end of every settling under way; return a sentence on each."""
+        for each in self.by_body.values():
+            each.wait()
+        ends = {name: each.ending() for name, each in self.by_body.items()}
+        return " ".join(f"{name} {end}." for name, end in ends.items() if end)

@@ -1,4 +1,4 @@
-"""One robot of a simulated world: observations, actions, base, objects."""
+"""One robot of a simulated world: observations, actions, base, objects, torque."""
 
 from __future__ import annotations
 
@@ -16,11 +16,14 @@ from strands_robots.kinematics.arm_parts import ArmParts
 from strands_robots.kinematics.chain import Chain, Floats
 from strands_robots.kinematics.objects import SeenObject
 from strands_robots.policies.base import Observation, checked_speeds
+from strands_robots.policies.settling import Settling, checked_rest_pose
+from strands_robots.policies.task_engine import TaskEngine
 from strands_robots.safety.gate import Permit
+from strands_robots.safety.stopping import checked_level
 from strands_robots.simulation.engine import mujoco
 from strands_robots.simulation.model import Actuator, RobotParts, load_named
 from strands_robots.simulation.physics import Physics, Snapshot, WorldClock
-from strands_robots.simulation.scene import ModelSource, ObjectPlan
+from strands_robots.simulation.scene import ModelSource, SceneObject
 from strands_robots.utils import ValidationError, mapping, number, w_positive, yaw_of
 
 
@@ -31,7 +34,7 @@ def targets_of(snapshot: Snapshot, base: dict[str, Any]) -> list[SeenObject]:
     into_base = np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])
     origin = np.array([base["x"], base["y"], base["z"]])
     found = []
-    for item in snapshot.stage.plan.objects:
+    for item in snapshot.compiled.scene.objects:
         body = data.body(item.name)
         position = into_base @ (body.xpos - origin)
         yaw = yaw_of([float(v) for v in body.xquat]) - float(base["theta"])
@@ -40,7 +43,7 @@ def targets_of(snapshot: Snapshot, base: dict[str, Any]) -> list[SeenObject]:
     return found
 
 
-def _extents(item: ObjectPlan) -> Floats:
+def _extents(item: SceneObject) -> Floats:
     """Return the extents of an upright object along its own axes (m)."""
     x, y, z = item.size
     if item.shape == "box":
@@ -140,14 +143,14 @@ class RobotBody:
 
     @property
     def _source(self) -> tuple[ModelSource, float, str]:
-        plan = next(each for each in self._present()[0].stage.plan.robots if each.name == self.name)
-        return plan.source, plan.position[2], plan.tip
+        scene = next(each for each in self._present()[0].compiled.scene.robots if each.name == self.name)
+        return scene.source, scene.position[2], scene.tip
 
     @property
     def joint_units(self) -> dict[str, str]:
         """``radians`` or ``metres`` of each position servo commanded in its joint's unit."""
         snapshot, parts = self._present()
-        units = {key: _unit(snapshot.stage.model, actuator) for key, actuator in parts.actuators.items()}
+        units = {key: _unit(snapshot.compiled.model, actuator) for key, actuator in parts.actuators.items()}
         return {key: unit for key, unit in units.items() if unit}
 
     def clock(self) -> float:
@@ -224,8 +227,8 @@ class RobotBody:
             base = snapshot.data().body(parts.root)
             position, quat = [float(v) for v in base.xpos], [float(v) for v in base.xquat]
         else:
-            plan = next(each for each in snapshot.stage.plan.robots if each.name == self.name)
-            position, quat = list(plan.position), [math.cos(plan.yaw / 2), 0.0, 0.0, math.sin(plan.yaw / 2)]
+            scene = next(each for each in snapshot.compiled.scene.robots if each.name == self.name)
+            position, quat = list(scene.position), [math.cos(scene.yaw / 2), 0.0, 0.0, math.sin(scene.yaw / 2)]
         x, y, z = position
         return {"x": x, "y": y, "z": z, "theta": yaw_of(quat), "quat": w_positive(quat)}
 
@@ -237,7 +240,7 @@ class RobotBody:
         snapshot, parts = self._present()
         if not _mobile(snapshot, parts):
             return None
-        model, data = snapshot.stage.model, snapshot.data()
+        model, data = snapshot.compiled.model, snapshot.data()
         mujoco.mj_comVel(model, data)
         velocity = np.zeros(6)
         mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, model.body(parts.root).id, velocity, 1)
@@ -246,7 +249,7 @@ class RobotBody:
 
     def _present(self) -> tuple[Snapshot, RobotParts]:
         snapshot = self._physics.snapshot
-        parts = snapshot.stage.robots.get(self.name)
+        parts = snapshot.compiled.robots.get(self.name)
         if parts is None:
             raise ValidationError(f"robot {self.name} is not in the world any more.")
         return snapshot, parts
@@ -274,7 +277,7 @@ def _mobile(snapshot: Snapshot, robot: RobotParts) -> bool:
     """Return True for a robot whose base is free, or slides in a plane."""
     if robot.base is not None:
         return True
-    model = snapshot.stage.model
+    model = snapshot.compiled.model
     body = model.body(robot.root).id
     first = int(model.body_jntadr[body])
     joints = range(first, first + int(model.body_jntnum[body]))
@@ -292,3 +295,68 @@ def _unit(model: Any, actuator: Actuator) -> str:
         return ""
     joint = int(model.jnt_type[int(model.actuator_trnid[index][0])])
     return {mujoco.mjtJoint.mjJNT_HINGE.value: "radians", mujoco.mjtJoint.mjJNT_SLIDE.value: "metres"}.get(joint, "")
+
+
+class StopTorque:
+    """Stop level of a world and, with ``settle``, the settling of each of its arms.
+
+    Args:
+        level: ``hold``, ``limp`` or ``settle``; None asks ``STRANDS_ESTOP_TORQUE``.
+        rest_pose: targets of every robot by action key, or those by robot.
+        tasks: of the world.
+
+    Raises:
+        ValidationError: no such level, or ``settle`` without a pose.
+    """
+
+    def __init__(self, level: object, rest_pose: object, tasks: TaskEngine) -> None:
+        self._level = checked_level(level, rest_pose)
+        self._pose = None if rest_pose is None else mapping("rest_pose", rest_pose)
+        self._tasks = tasks
+
+    def check(self, robots: Mapping[str, RobotParts]) -> None:
+        """Raise :class:`ValidationError` unless the rest pose fits every robot."""
+        for parts in robots.values():
+            self._pose_of(parts)
+
+    def fit(self, bodies: Mapping[str, RobotBody]) -> None:
+        """Make the settling of each robot that joined, and forget that of others."""
+        tasks = self._tasks
+        settlings = {name: each for name, each in tasks.settlings.by_body.items() if name in bodies}
+        for name, body in bodies.items():
+            pose = self._pose_of(body.parts)
+            if self._level == "settle" and pose and name not in settlings:
+                ranges = {key: body.bounds[key] for key in pose}
+                settling = Settling(body, tasks.gate, pose, ranges, tasks.observers, clock=body.clock)
+                settlings[name], body.on_motion = settling, settling.note_motion
+        tasks.settlings.by_body = settlings
+
+    def freeze(self, physics: Physics, clock: WorldClock) -> None:
+        """Freeze every robot of a world, and let it go where the level says so."""
+        physics.hold()
+        if self._level == "limp":
+            physics.release()
+            clock.commanded()
+
+    def freeze_one(self, body: RobotBody) -> None:
+        """Freeze one robot for good, also one that settles, or let it go."""
+        settling = self._tasks.settlings.by_body.get(body.name)
+        if settling is not None:
+            settling.give_up()
+            # It has stopped: the next halt finds it at rest.
+            settling.take()
+        body.hold()
+        if self._level == "limp":
+            body.let_go()
+
+    def _pose_of(self, parts: RobotParts) -> dict[str, float]:
+        """Return the checked rest pose of a robot; empty for none, or without servos."""
+        servos = {key: (each.low, each.high) for key, each in parts.actuators.items() if each.servo}
+        if self._pose is None or not servos:
+            return {}
+        pose: object = self._pose
+        if any(isinstance(each, Mapping) for each in self._pose.values()):
+            if parts.name not in self._pose:
+                raise ValidationError(f"rest_pose must have a pose of {parts.name}; it has {', '.join(self._pose)}.")
+            pose = self._pose[parts.name]
+        return dict(checked_rest_pose(pose, servos))

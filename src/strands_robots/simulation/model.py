@@ -1,10 +1,11 @@
-"""The MuJoCo model of a world's contents, and each robot's parts in it.
+"""The MuJoCo model compiled from a scene, and each robot's parts in it.
 
 MuJoCo has one set of options for a whole world. What a file sets there is confined to the model's own parts, refused
 by name, or left at the world's value, so that no model changes the physics of its neighbours.
 
-A :class:`Stage` never changes: adding or removing something makes a new plan and a new stage. Inside the model the
-names of a robot's parts start with its own name and a slash (``left/elbow_flex``); outside, its keys are without it.
+A :class:`CompiledScene` never changes: adding or removing something makes a new scene, which is compiled anew. Inside
+the model the names of a robot's parts start with its own name and a slash (``left/elbow_flex``); outside, its keys are
+without it.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 
 from strands_robots.kinematics.model_file import is_servo, mark_tip, servo_line
 from strands_robots.simulation.engine import mujoco
-from strands_robots.simulation.scene import ModelSource, ObjectPlan, Plan, RobotPlan
+from strands_robots.simulation.scene import ModelSource, Scene, SceneObject, SceneRobot
 from strands_robots.utils import ValidationError, shown
 
 _UNLIMITED = mujoco.mjtLimited.mjLIMITED_FALSE
@@ -48,15 +49,15 @@ _BUFFERS = ("memory", "njmax", "nconmax", "nstack")
 """Sizes of buffers: what is enough for a model alone is not beside others."""
 
 
-def load_fitted(robot: RobotPlan, plan: Plan) -> Any:
-    """Return the ``MjSpec`` of a robot's model, fit for the world of ``plan``.
+def load_fitted(robot: SceneRobot, scene: Scene) -> Any:
+    """Return the ``MjSpec`` of a robot's model, fit for the world of ``scene``.
 
     Raises:
         ValidationError: the file cannot be loaded, or needs what a shared world cannot give.
     """
     child = load_named(robot.source)
     try:
-        _require_medium(child.option, plan)
+        _require_medium(child.option, scene)
         _confine_flags(child)
     except ValidationError as exc:
         raise ValidationError(f"model {shown(robot.source.label)} cannot share a world: {exc}") from exc
@@ -81,7 +82,7 @@ def load_named(source: ModelSource) -> Any:
     return child
 
 
-def set_options(world: Any, models: Sequence[Any], plan: Plan) -> None:
+def set_options(world: Any, models: Sequence[Any], scene: Scene) -> None:
     """Give the world and every model in it the options of the world.
 
     A file may make the solver more exact, never less; the world decides everything else.
@@ -89,9 +90,9 @@ def set_options(world: Any, models: Sequence[Any], plan: Plan) -> None:
     option = mujoco.MjSpec().option
     for name in _EXACTNESS:
         setattr(option, name, max(getattr(spec.option, name) for spec in (world, *models)))
-    option.timestep = plan.timestep
-    option.gravity = [0, 0, plan.gravity]
-    option.density, option.viscosity = plan.density, plan.viscosity
+    option.timestep = scene.timestep
+    option.gravity = [0, 0, scene.gravity]
+    option.density, option.viscosity = scene.density, scene.viscosity
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     for spec in (world, *models):
         for name in (name for name in dir(option) if not name.startswith("_")):
@@ -147,10 +148,10 @@ def _add_servos(child: Any) -> None:
         servo.ctrllimited = True
 
 
-def _require_medium(option: Any, plan: Plan) -> None:
+def _require_medium(option: Any, scene: Scene) -> None:
     """Refuse a medium that is not the world's, wind, and disabled actuators."""
     own = {"density": float(option.density), "viscosity": float(option.viscosity)}
-    if any(own.values()) and own != {"density": plan.density, "viscosity": plan.viscosity}:
+    if any(own.values()) and own != {"density": scene.density, "viscosity": scene.viscosity}:
         wanted = ", ".join(f"{key}={value:g}" for key, value in own.items())
         raise ValidationError(
             f"its medium ({wanted}) would slow everything in it. Give the world that medium: Simulation({wanted})."
@@ -294,18 +295,18 @@ class RobotParts:
 
 
 @dataclass(frozen=True, slots=True)
-class Stage:
-    """A compiled plan: the model, the parts of each robot in it, and its start state."""
+class CompiledScene:
+    """A compiled scene: the model, the parts of each robot, and its start state."""
 
-    plan: Plan
+    scene: Scene
     model: Any
     robots: dict[str, RobotParts]
     start_qpos: Floats
     start_ctrl: Floats
 
 
-def compile_stage(plan: Plan) -> Stage:
-    """Build and compile ``plan``.
+def compile_scene(scene: Scene) -> CompiledScene:
+    """Build and compile ``scene``.
 
     Raises:
         ValidationError: naming the robot whose model does not fit, or MuJoCo's reason.
@@ -319,26 +320,26 @@ def compile_stage(plan: Plan) -> Stage:
         # Sizes of user data that only a robot's file sets are taken over.
         spec.compiler.conflict = mujoco.mjtConflict.mjCONFLICT_MERGE
     own_floor = own_lights = True
-    children = [load_fitted(robot, plan) for robot in plan.robots]
-    set_options(spec, children, plan)
-    for robot, child in zip(plan.robots, children, strict=True):
+    children = [load_fitted(robot, scene) for robot in scene.robots]
+    set_options(spec, children, scene)
+    for robot, child in zip(scene.robots, children, strict=True):
         tips[robot.name] = mark_tip(child, robot.tip)
         own_floor = own_floor and not any(map(is_floor, child.worldbody.geoms))
         own_lights = own_lights and not child.lights
         home, control = _attach(spec, robot, child)
         homes.update(home)
         controls.update(control)
-    for item in plan.objects:
+    for item in scene.objects:
         _place(spec, item)
     _furnish(spec, floor=own_floor, lights=own_lights)
     try:
         model = spec.compile()
     except (ValueError, mujoco.FatalError) as exc:
         raise ValidationError(f"the world does not compile: {' '.join(str(exc).split())[:300]}") from exc
-    model.opt.timestep = plan.timestep
-    robots = {r.name: _map_robot(model, r.name, r.source.label, tips[r.name]) for r in plan.robots}
+    model.opt.timestep = scene.timestep
+    robots = {r.name: _map_robot(model, r.name, r.source.label, tips[r.name]) for r in scene.robots}
     qpos, ctrl = _start(model, homes, controls)
-    return Stage(plan, model, robots, qpos, ctrl)
+    return CompiledScene(scene, model, robots, qpos, ctrl)
 
 
 def in_floor(data: Any, owner: str) -> dict[str, float]:
@@ -369,7 +370,7 @@ def sunk_sentence(depths: dict[str, float]) -> str:
     return f" In the floor: {deep}; place it higher."
 
 
-def _attach(spec: Any, robot: RobotPlan, child: Any) -> tuple[dict[str, Floats], dict[str, float]]:
+def _attach(spec: Any, robot: SceneRobot, child: Any) -> tuple[dict[str, Floats], dict[str, float]]:
     """Put ``child`` into ``spec``; return its home pose and controls by full name."""
     try:
         home, control = _home(robot) if child.keys else ({}, {})
@@ -385,7 +386,7 @@ def _attach(spec: Any, robot: RobotPlan, child: Any) -> tuple[dict[str, Floats],
     return home, control
 
 
-def _home(robot: RobotPlan) -> tuple[dict[str, Floats], dict[str, float]]:
+def _home(robot: SceneRobot) -> tuple[dict[str, Floats], dict[str, float]]:
     """Return the pose named home of a robot's file, else its first, by full name."""
     alone, prefix = robot.source.load(), f"{robot.name}/"
     name_parts(alone)
@@ -404,7 +405,7 @@ def _home(robot: RobotPlan) -> tuple[dict[str, Floats], dict[str, float]]:
     return pose, controls
 
 
-def _place(spec: Any, item: ObjectPlan) -> None:
+def _place(spec: Any, item: SceneObject) -> None:
     turned = [float(np.cos(item.yaw / 2)), 0, 0, float(np.sin(item.yaw / 2))]
     body = spec.worldbody.add_body(name=item.name, pos=list(item.position), quat=turned)
     if not item.fixed:

@@ -1,4 +1,4 @@
-"""The physics of one world in real time, and the discipline of its locks.
+"""Physics of one world in real time, and the lock discipline of simulations.
 
 This is the only place that documents it. A world has three locks, always taken in this order, and one published value:
 
@@ -33,7 +33,7 @@ from typing import Any, TypeVar
 
 from strands_robots.safety.gate import Permit, PermitVoidError
 from strands_robots.simulation.engine import mujoco
-from strands_robots.simulation.model import Floats, RobotParts, Stage
+from strands_robots.simulation.model import CompiledScene, Floats, RobotParts
 from strands_robots.stop_log import stop_logger
 from strands_robots.utils import ValidationError, shown, yaw_of
 
@@ -51,7 +51,7 @@ _QVEL = {0: 6, 1: 3, 2: 1, 3: 1}
 class Snapshot:
     """State after a step: time in seconds, steps since the start; it never changes."""
 
-    stage: Stage
+    compiled: CompiledScene
     time: float
     steps: int
     qpos: Floats
@@ -72,7 +72,7 @@ class Snapshot:
 
     def pose(self, data: Any) -> None:
         """Put this state into ``data``, and compute bodies, sites, cameras and lights."""
-        model = self.stage.model
+        model = self.compiled.model
         data.qpos[:] = self.qpos
         data.qvel[:] = self.qvel
         mujoco.mj_kinematics(model, data)
@@ -81,7 +81,7 @@ class Snapshot:
 
     def data(self) -> Any:
         """Return fresh MuJoCo data in this state; physics' own data is not touched."""
-        data = mujoco.MjData(self.stage.model)
+        data = mujoco.MjData(self.compiled.model)
         self.pose(data)
         return data
 
@@ -89,21 +89,21 @@ class Snapshot:
 class Physics:
     """Model, data and setpoints of one world; thread-safe as the module says."""
 
-    def __init__(self, stage: Stage) -> None:
+    def __init__(self, compiled: CompiledScene) -> None:
         self._step_lock = threading.Lock()
         self._command_lock = threading.Lock()
         self._steps = 0
-        self._model = stage.model
-        self._data = mujoco.MjData(stage.model)
-        self._setpoints = stage.start_ctrl.copy()
+        self._model = compiled.model
+        self._data = mujoco.MjData(compiled.model)
+        self._setpoints = compiled.start_ctrl.copy()
         self._limp: frozenset[str] = frozenset()
         self._without_torque: frozenset[str] = frozenset()
-        self.snapshot = self._start(stage)
+        self.snapshot = self._start(compiled)
 
     @property
-    def stage(self) -> Stage:
+    def compiled(self) -> CompiledScene:
         """The compiled world of the last snapshot."""
-        return self.snapshot.stage
+        return self.snapshot.compiled
 
     @property
     def setpoints(self) -> Floats:
@@ -118,10 +118,10 @@ class Physics:
                 self._data.ctrl[:] = self._setpoints
                 limp = self._limp
             if limp != self._without_torque:
-                self._without_torque, self._model = limp, _without_torque(self.stage, limp)
+                self._without_torque, self._model = limp, _without_torque(self.compiled, limp)
             mujoco.mj_step(self._model, self._data, nstep=steps)
             self._steps += steps
-            self.snapshot = self._copy_state(self.stage)
+            self.snapshot = self._copy_state(self.compiled)
             if limp:
                 with self._command_lock:
                     # The targets go along, so that torque that comes back keeps the robot where it is.
@@ -162,7 +162,7 @@ class Physics:
             if permit is not None and permit.revoked:
                 return
             robots: Iterable[RobotParts] = (
-                self.stage.robots.values() if robot_name is None else (self._robot(robot_name),)
+                self.compiled.robots.values() if robot_name is None else (self._robot(robot_name),)
             )
             self._keep_present(robots)
 
@@ -176,7 +176,7 @@ class Physics:
         def write() -> None:
             if permit is not None and not permit.valid:
                 raise PermitVoidError(f"{robot_name} was halted")
-            self._limp |= frozenset(self.stage.robots if robot_name is None else (self._robot(robot_name).name,))
+            self._limp |= frozenset(self.compiled.robots if robot_name is None else (self._robot(robot_name).name,))
 
         _written(self._command_lock, write, permit)
 
@@ -194,22 +194,22 @@ class Physics:
         permit.wait()
         with self._step_lock, self._command_lock:
             permit.check()
-            self.snapshot = self._start(self.stage)
+            self.snapshot = self._start(self.compiled)
 
-    def replace(self, stage: Stage) -> None:
-        """Switch to another stage; what both have by name keeps its state and setpoint."""
+    def replace(self, compiled: CompiledScene) -> None:
+        """Switch to another scene; what both have by name keeps state and setpoint."""
         with self._step_lock, self._command_lock:
             old_model, old_data, old_setpoints = self._model, self._data, self._setpoints
-            self._model, self._without_torque = stage.model, frozenset()
-            self._limp &= frozenset(stage.robots)
-            self._data = mujoco.MjData(stage.model)
-            self._setpoints = stage.start_ctrl.copy()
-            self._data.qpos[:] = stage.start_qpos
+            self._model, self._without_torque = compiled.model, frozenset()
+            self._limp &= frozenset(compiled.robots)
+            self._data = mujoco.MjData(compiled.model)
+            self._setpoints = compiled.start_ctrl.copy()
+            self._data.qpos[:] = compiled.start_qpos
             self._data.time = old_data.time
             _carry_state(old_model, old_data, self._model, self._data)
             _carry_setpoints(old_model, old_setpoints, self._model, self._setpoints)
             mujoco.mj_forward(self._model, self._data)
-            self.snapshot = self._copy_state(stage)
+            self.snapshot = self._copy_state(compiled)
 
     @property
     def diverged(self) -> bool:
@@ -219,9 +219,9 @@ class Physics:
         return any(warnings[kind].number for kind in kinds)
 
     def _robot(self, name: str) -> RobotParts:
-        robot = self.stage.robots.get(name)
+        robot = self.compiled.robots.get(name)
         if robot is None:
-            raise ValidationError(f"robot_name must be one of {list(self.stage.robots)}, not {shown(name)}.")
+            raise ValidationError(f"robot_name must be one of {list(self.compiled.robots)}, not {shown(name)}.")
         return robot
 
     def _keep_present(self, robots: Iterable[RobotParts]) -> None:
@@ -230,19 +230,19 @@ class Physics:
             for actuator in robot.actuators.values():
                 self._setpoints[actuator.index] = actuator.still(float(lengths[actuator.index]))
 
-    def _start(self, stage: Stage) -> Snapshot:
+    def _start(self, compiled: CompiledScene) -> Snapshot:
         self._limp = frozenset()
         mujoco.mj_resetData(self._model, self._data)
-        self._data.qpos[:] = stage.start_qpos
-        self._data.ctrl[:] = stage.start_ctrl
-        self._setpoints = stage.start_ctrl.copy()
+        self._data.qpos[:] = compiled.start_qpos
+        self._data.ctrl[:] = compiled.start_ctrl
+        self._setpoints = compiled.start_ctrl.copy()
         mujoco.mj_forward(self._model, self._data)
-        return self._copy_state(stage)
+        return self._copy_state(compiled)
 
-    def _copy_state(self, stage: Stage) -> Snapshot:
+    def _copy_state(self, compiled: CompiledScene) -> Snapshot:
         data = self._data
         lengths = data.actuator_length.copy()
-        return Snapshot(stage, data.time, self._steps, data.qpos.copy(), data.qvel.copy(), lengths)
+        return Snapshot(compiled, data.time, self._steps, data.qpos.copy(), data.qvel.copy(), lengths)
 
 
 def _written(lock: threading.Lock, write: Callable[[], T], permit: Permit | None) -> T:
@@ -253,13 +253,13 @@ def _written(lock: threading.Lock, write: Callable[[], T], permit: Permit | None
         return write()
 
 
-def _without_torque(stage: Stage, robots: Iterable[str]) -> Any:
-    """Return the model of a stage with actuators of ``robots`` that exert no force."""
+def _without_torque(compiled: CompiledScene, robots: Iterable[str]) -> Any:
+    """Return the model with actuators of ``robots`` that exert no force."""
     if not robots:
-        return stage.model
-    model = copy.copy(stage.model)
+        return compiled.model
+    model = copy.copy(compiled.model)
     for name in robots:
-        for actuator in stage.robots[name].actuators.values():
+        for actuator in compiled.robots[name].actuators.values():
             at = actuator.index
             model.actuator_gaintype[at] = mujoco.mjtGain.mjGAIN_FIXED
             model.actuator_biastype[at] = mujoco.mjtBias.mjBIAS_NONE
@@ -380,7 +380,7 @@ class WorldClock:
 
     def tick(self, now: float) -> None:
         """Catch up with ``now``; called by the pacing thread alone."""
-        timestep = self._physics.stage.plan.timestep
+        timestep = self._physics.compiled.scene.timestep
         if self._due is None or self._held():
             self._due = now
             return

@@ -1,4 +1,4 @@
-"""Pictures of a simulated world, with or without OpenGL; its recordings."""
+"""Pictures of a simulated world, with or without OpenGL, and files of motions."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from PIL import Image
 
-from strands_robots.simulation import projection
+from strands_robots.simulation import rendering
 from strands_robots.simulation.body import PICTURE
 from strands_robots.simulation.physics import Physics, Snapshot
 from strands_robots.simulation.rendering import (
@@ -65,7 +65,7 @@ class PicturesMixin:
         size = picture_size(width, height)
         snapshot = self.physics.snapshot
         data = snapshot.data()
-        return projection.draw(snapshot.stage, data, camera_view(snapshot.stage, data, camera), *size)
+        return rendering.draw(snapshot.compiled, data, camera_view(snapshot.compiled, data, camera), *size)
 
     def picture(
         self,
@@ -99,12 +99,12 @@ class PicturesMixin:
             return self._renderer.render(snapshot, camera, width, height, quality=False)
         except RenderingError:
             data = snapshot.data()
-            return projection.draw(snapshot.stage, data, camera_view(snapshot.stage, data, camera), width, height)
+            return rendering.draw(snapshot.compiled, data, camera_view(snapshot.compiled, data, camera), width, height)
 
     def view(self, camera: str = OVERVIEW) -> CameraView:
         """Return the present view of ``camera``, which puts world points into a picture."""
         snapshot = self.physics.snapshot
-        return camera_view(snapshot.stage, snapshot.data(), camera)
+        return camera_view(snapshot.compiled, snapshot.data(), camera)
 
 
 def save_picture(picture: Picture, path: str | Path) -> Path:

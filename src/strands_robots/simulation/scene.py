@@ -112,7 +112,7 @@ _RESERVED = ("floor", "world")
 
 
 @dataclass(frozen=True, slots=True)
-class RobotPlan:
+class SceneRobot:
     """One robot: ``position`` in m, ``yaw`` in rad, ``tip`` a site or a body."""
 
     name: str
@@ -124,7 +124,7 @@ class RobotPlan:
     @classmethod
     def checked(
         cls, name: object, model: str | Path | None, position: object, yaw: object, tip: object = ""
-    ) -> RobotPlan:
+    ) -> SceneRobot:
         """Check a robot, and find its model, which may be fetched.
 
         :meth:`Simulation.add_robot` has the domains.
@@ -140,7 +140,7 @@ class RobotPlan:
 
 
 @dataclass(frozen=True, slots=True)
-class ObjectPlan:
+class SceneObject:
     """One object of primitive shape: metres, kilograms, radians, colour from 0 to 1."""
 
     name: str
@@ -164,7 +164,7 @@ class ObjectPlan:
         mass: object,
         fixed: object,
         yaw: object = 0.0,
-    ) -> ObjectPlan:
+    ) -> SceneObject:
         """Check an object; see :meth:`Simulation.add_object` for the domains.
 
         Raises:
@@ -184,7 +184,7 @@ class ObjectPlan:
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class Scene:
     """Everything in the world.
 
     ``timestep`` in seconds, ``gravity`` in m/s² along z, ``density`` in kg/m³ and ``viscosity`` in Pa·s of the medium.
@@ -194,12 +194,12 @@ class Plan:
     gravity: float = -9.81
     density: float = 0.0
     viscosity: float = 0.0
-    robots: tuple[RobotPlan, ...] = ()
-    objects: tuple[ObjectPlan, ...] = ()
+    robots: tuple[SceneRobot, ...] = ()
+    objects: tuple[SceneObject, ...] = ()
 
     @classmethod
-    def checked(cls, timestep: object, gravity: object, density: object, viscosity: object) -> Plan:
-        """Return an empty plan. Raises :class:`ValidationError`."""
+    def checked(cls, timestep: object, gravity: object, density: object, viscosity: object) -> Scene:
+        """Return an empty scene. Raises :class:`ValidationError`."""
         return cls(
             number("timestep", timestep, low=1e-4, high=2e-2),
             number("gravity", gravity, low=-100, high=100),
@@ -207,8 +207,8 @@ class Plan:
             number("viscosity", viscosity, low=0, high=1000),
         )
 
-    def with_robot(self, robot: RobotPlan, *, beside: bool = False) -> Plan:
-        """Add a robot, ``beside`` those that are there or where its plan says.
+    def with_robot(self, robot: SceneRobot, *, beside: bool = False) -> Scene:
+        """Add a robot, ``beside`` those that are there or where its scene says.
 
         Raises:
             ValidationError: its name is taken.
@@ -217,16 +217,16 @@ class Plan:
         placed = replace(robot, position=(0.0, -SPACING_M * len(self.robots), 0.0)) if beside else robot
         return replace(self, robots=(*self.robots, placed))
 
-    def without_robot(self, name: str) -> Plan:
+    def without_robot(self, name: str) -> Scene:
         """Remove a robot."""
         return replace(self, robots=tuple(r for r in self.robots if r.name != name))
 
-    def with_object(self, item: ObjectPlan) -> Plan:
+    def with_object(self, item: SceneObject) -> Scene:
         """Add an object. Raises :class:`ValidationError` where its name is taken."""
         self._require_free(item.name)
         return replace(self, objects=(*self.objects, item))
 
-    def without_object(self, name: object) -> Plan:
+    def without_object(self, name: object) -> Scene:
         """Remove an object. Raises :class:`ValidationError` for an unknown name."""
         names = [o.name for o in self.objects]
         if name not in names:

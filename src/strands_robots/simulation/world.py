@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import AbstractContextManager
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,32 +13,24 @@ from strands_robots.contract import Observer, Unsubscribe
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.kinematics.arm import Arm
 from strands_robots.kinematics.arm_parts import ArmParts
-from strands_robots.kinematics.arm_task import motion_rollout
-from strands_robots.kinematics.motion import Motion
 from strands_robots.kinematics.objects import SeenObject
-from strands_robots.policies import create_policy
 from strands_robots.policies.base import SPEED_MAX
 from strands_robots.policies.check import RobotFacts
-from strands_robots.policies.profiled import ProfiledPolicy
-from strands_robots.policies.profiles import profiles
 from strands_robots.policies.rollout import (
     STOP_JOIN_S,
     Rollout,
-    RolloutObservers,
-    RolloutsEnd,
-    rollout_options,
     unfollowed,
 )
-from strands_robots.safety.gate import MotionGate, MotionRequest, Permit, Waiting, answered
-from strands_robots.safety.stop_targets import halted_with_verbs, note_motion, verbs_to_end
+from strands_robots.policies.task_engine import TaskEngine
+from strands_robots.safety.gate import MotionRequest, answered
+from strands_robots.safety.stop_targets import halted_with_verbs
 from strands_robots.safety.stopping import PendingVerdict, StopLevel, StopVerdict, halts_in_parts, read_verdict
-from strands_robots.simulation.body import PICTURE, RobotBody, targets_of
-from strands_robots.simulation.model import compile_stage, in_floor, sunk_sentence
+from strands_robots.simulation.body import PICTURE, RobotBody, StopTorque, targets_of
+from strands_robots.simulation.model import compile_scene, in_floor, sunk_sentence
 from strands_robots.simulation.physics import CHUNK, Physics, WorldClock
 from strands_robots.simulation.pictures import PicturesMixin
 from strands_robots.simulation.rendering import Renderer, camera_names
-from strands_robots.simulation.scene import ObjectPlan, Plan, RobotPlan
-from strands_robots.simulation.stop_torque import StopTorque
+from strands_robots.simulation.scene import Scene, SceneObject, SceneRobot
 from strands_robots.stop_log import stop_logger
 from strands_robots.teleop_mixin import TeleopMixin
 from strands_robots.utils import ValidationError, choice, flag, identifier, number, shown, text, whole
@@ -101,17 +91,20 @@ class Simulation(PicturesMixin, ArmMixin, TeleopMixin):
     ) -> None:
         super().__init__()
         self.tool_name_str = text("tool_name", tool_name, longest=128)
-        self.gate = MotionGate()
-        self.starting: AbstractContextManager[Any] = threading.RLock()
-        self.observers = RolloutObservers()
-        self._torque = StopTorque(stop_level, rest_pose, self.gate, self.observers)
-        self.physics = Physics(compile_stage(Plan.checked(timestep, gravity, density, viscosity)))
+        self.tasks = TaskEngine(
+            self.tool_name_str,
+            self.body,
+            facts=self.policy_facts,
+            rate=lambda: settings.number("STRANDS_CONTROL_HZ"),
+            ready=self._require_open,
+            of_world=True,
+        )
+        self.gate, self.starting, self.observers = self.tasks.gate, self.tasks.starting, self.tasks.observers
+        self._torque = StopTorque(stop_level, rest_pose, self.tasks)
+        self.physics = Physics(compile_scene(Scene.checked(timestep, gravity, density, viscosity)))
         self._clock = WorldClock(self.physics, on_command=flag("realtime", realtime), held=lambda: self.gate.held)
         self._speed_limit = None if speed_limit is None else number("speed_limit", speed_limit, above=0, high=SPEED_MAX)
         self._bodies: dict[str, RobotBody] = {}
-        self._rollouts: dict[str, Rollout] = {}
-        self._moved: dict[str, None] = {}
-        self._waiting = Waiting()
         self._renderer = Renderer()
         self._closed = False
 
@@ -151,13 +144,13 @@ class Simulation(PicturesMixin, ArmMixin, TeleopMixin):
             density: of the medium, 0 to 20,000 kg/m³.
             viscosity: of the medium, 0 to 1000 Pa·s.
         """
-        plan = Plan.checked(timestep, gravity, density, viscosity)
+        scene = Scene.checked(timestep, gravity, density, viscosity)
         with self.starting:
             self._require_idle("create_world")
             permit = self.gate.permit("create_world")
-            self._rebuild(plan)
+            self._rebuild(scene)
             self.physics.reset(permit)
-        return success("An empty world with a floor.", timestep=plan.timestep, gravity=plan.gravity)
+        return success("An empty world with a floor.", timestep=scene.timestep, gravity=scene.gravity)
 
     @answered
     def add_robot(
@@ -182,10 +175,10 @@ class Simulation(PicturesMixin, ArmMixin, TeleopMixin):
 
         ``in_floor`` of the answer has the depth of each body that starts in the floor, metres.
         """
-        robot = RobotPlan.checked(name, model, position, yaw, tip)
+        robot = SceneRobot.checked(name, model, position, yaw, tip)
         with self.starting:
             self._require_idle("add_robot")
-            self._rebuild(self.physics.stage.plan.with_robot(robot, beside=position is None))
+            self._rebuild(self.physics.compiled.scene.with_robot(robot, beside=position is None))
             parts = self.body(robot.name).parts
             sunk = self._in_floor(robot.name)
         return success(
@@ -204,7 +197,7 @@ class Simulation(PicturesMixin, ArmMixin, TeleopMixin):
         with self.starting:
             self._require_idle("remove_robot")
             label = self.body(identifier("name", name)).name
-            self._rebuild(self.physics.stage.plan.without_robot(label))
+            self._rebuild(self.physics.compiled.scene.without_robot(label))
         return success(f"Removed {label}.", robot=label, robots=self.list_robots())
 
     @answered
@@ -232,12 +225,12 @@ class Simulation(PicturesMixin, ArmMixin, TeleopMixin):
             fixed: true for an object that never moves.
             yaw: its turn about z, radians from -2π to 2π.
         """
-        item = ObjectPlan.checked(
+        item = SceneObject.checked(
             name=name, shape=shape, size=size, position=position, color=color, mass=mass, fixed=fixed, yaw=yaw
         )
         with self.starting:
             self._require_idle("add_object")
-            self._rebuild(self.physics.stage.plan.with_object(item))
+            self._rebuild(self.physics.compiled.scene.with_object(item))
             sunk = {} if item.fixed else self._in_floor(item.name)
         summary = f"Added {item.shape} {item.name}.{sunk_sentence(sunk)}"
         return success(summary, object=item.name, position=list(item.position), in_floor=sunk)
@@ -247,7 +240,7 @@ class Simulation(PicturesMixin, ArmMixin, TeleopMixin):
         """Take an object out of the world."""
         with self.starting:
             self._require_idle("remove_object")
-            self._rebuild(self.physics.stage.plan.without_object(name))
+            self._rebuild(self.physics.compiled.scene.without_object(name))
         return success(f"Removed {name}.", object=name)
 
     @answered
@@ -276,7 +269,10 @@ class Simulation(PicturesMixin, ArmMixin, TeleopMixin):
         with self.starting:
             # Nothing starts a rollout while this lock is held; a stop that comes meanwhile voids the fresh permit.
             permit = self.gate.renew(permit)
-            verdict = read_verdict(self._freeze(time.monotonic() + settings.number("STRANDS_HALT_DEADLINE_S")))
+            deadline = time.monotonic() + settings.number("STRANDS_HALT_DEADLINE_S")
+            with self.tasks.halting(deadline, revoke=False, settles=False) as halt:
+                self._torque.freeze(self.physics, self._clock)
+            verdict = read_verdict(halt.verdict)
             if not verdict.stopped:
                 return verdict.envelope()
             self.physics.reset(permit)
@@ -291,14 +287,15 @@ class Simulation(PicturesMixin, ArmMixin, TeleopMixin):
         robot ended, until its next one), ``real_time_factor`` and ``diverged``.
         """
         snapshot = self.physics.snapshot
-        robots = {name: snapshot.observation(parts) for name, parts in snapshot.stage.robots.items()}
+        robots = {name: snapshot.observation(parts) for name, parts in snapshot.compiled.robots.items()}
+        latest = self.tasks.latest_of_all()
         return success(
             f"{_count(robots)} at {snapshot.time:.3f} s of simulated time.",
             sim_time=snapshot.time,
             step_count=snapshot.steps,
             robots=robots,
             running_policies={row["robot"]: row for row in self.list_policies_running()},
-            failed_policies=self.failed_policies(),
+            failed_policies={name: each.error for name, each in latest.items() if each.state == "error"},
             outcomes=self.outcomes(),
             real_time_factor=round(self._clock.real_time_factor, 4),
             diverged=self.physics.diverged,
@@ -308,7 +305,7 @@ class Simulation(PicturesMixin, ArmMixin, TeleopMixin):
     def get_features(self) -> Envelope:
         """Return joints, actuators and cameras by robot; a range is null without limit."""
         snapshot = self.physics.snapshot
-        stage = snapshot.stage
+        compiled = snapshot.compiled
         robots: dict[str, Any] = {
             name: {
                 "model": parts.model,
@@ -319,14 +316,14 @@ class Simulation(PicturesMixin, ArmMixin, TeleopMixin):
                 "observation_features": list(snapshot.observation(parts)),
                 "action_features": list(parts.actuators),
             }
-            for name, parts in stage.robots.items()
+            for name, parts in compiled.robots.items()
         }
         return success(
             f"{_count(robots)}.",
             robots=robots,
-            cameras=camera_names(stage),
-            objects=[o.name for o in stage.plan.objects],
-            timestep=stage.plan.timestep,
+            cameras=camera_names(compiled),
+            objects=[o.name for o in compiled.scene.objects],
+            timestep=compiled.scene.timestep,
         )
 
     def get_observation(self, robot_name: str | None = None, cameras: Iterable[str] = ()) -> dict[str, Any]:
@@ -368,8 +365,8 @@ class Simulation(PicturesMixin, ArmMixin, TeleopMixin):
         self._require_open()
         body = self.body(robot_name)
         permit = self.gate.permit("send_action", request)
-        with self._waiting.until_begun(permit, body.name):
-            self._require_undriven(body.name)
+        with self.tasks.waiting.until_begun(permit, body.name):
+            self.tasks.require_free(body.name)
             sent = body.send_action(action, permit)
         return success(f"Sent {len(sent)} targets to {body.name}.", robot=body.name, sent=sent)
 
@@ -395,7 +392,8 @@ class Simulation(PicturesMixin, ArmMixin, TeleopMixin):
             policy: arguments of that policy's constructor; besides, ``control_frequency`` (Hz, at most the robot's
                 rate) and ``n_steps`` (actions after which it ends).
         """
-        rollout = self._start_rollout(robot_name, instruction, policy_provider, duration, policy, request=request)
+        new = self.tasks.of_policy(instruction, policy_provider, duration, policy)
+        rollout = self.tasks.start("start_policy", robot_name, new, request)
         problem = rollout.not_begun()
         if problem:
             return error(f"start_policy: {problem}.", **_row(rollout))
@@ -418,7 +416,8 @@ class Simulation(PicturesMixin, ArmMixin, TeleopMixin):
         **policy: Any,
     ) -> Envelope:
         """Run a rollout as :meth:`start_policy` does, and wait for its end."""
-        rollout = self._start_rollout(robot_name, instruction, policy_provider, duration, policy)
+        new = self.tasks.of_policy(instruction, policy_provider, duration, policy)
+        rollout = self.tasks.start("start_policy", robot_name, new)
         if not rollout.join((rollout.duration or 0.0) + TEARDOWN_S):
             rollout.request_stop()
             return error(f"{rollout.robot} was still running {TEARDOWN_S:g} s after its time.", **_row(rollout))
@@ -434,9 +433,9 @@ class Simulation(PicturesMixin, ArmMixin, TeleopMixin):
         targets of a single action are given up.
         """
         body = self.body(robot_name)
-        self._waiting.void(body.name)
+        self.tasks.waiting.void(body.name)
         self.void_leaders(body.name)
-        rollout = self._running().get(body.name) or self.teleoperating().get(self.teleoperated_by(body.name))
+        rollout = self.tasks.running().get(body.name) or self.teleoperating().get(self.teleoperated_by(body.name))
         if rollout is None:
             # After a single action the servos go on to its targets.
             self._torque.freeze_one(body)
@@ -452,15 +451,11 @@ class Simulation(PicturesMixin, ArmMixin, TeleopMixin):
 
     def list_policies_running(self) -> list[dict[str, Any]]:
         """Return one row for each running rollout, as :meth:`Rollout.row`."""
-        return [rollout.row() for rollout in self._running().values()]
-
-    def failed_policies(self) -> dict[str, str]:
-        """Return why the last policy of a robot failed, by robot, until its next one."""
-        return {name: rollout.error for name, rollout in list(self._rollouts.items()) if rollout.state == "error"}
+        return [rollout.row() for rollout in self.tasks.running().values()]
 
     def outcomes(self) -> dict[str, dict[str, Any]]:
         """Return how the last rollout of each robot ended, until its next one."""
-        ended = {name: self.outcome_of(rollout) for name, rollout in list(self._rollouts.items())}
+        ended = {name: self.outcome_of(each) for name, each in self.tasks.latest_of_all().items()}
         return {name: outcome for name, outcome in ended.items() if outcome is not None and name in self._bodies}
 
     def policy_facts(self, robot_name: str | None = None) -> RobotFacts:
@@ -470,11 +465,6 @@ class Simulation(PicturesMixin, ArmMixin, TeleopMixin):
         facts = (body.get_joints(), list(body.bounds), body.joint_units, pictures, rate)
         return RobotFacts(body.name, *facts, body.bounds, body.parts.model)
 
-    def occupied(self, robot: str) -> str:
-        """Name the rollout that drives this robot, for a refusal; empty without one."""
-        one = self._running().get(robot)
-        return f"the policy {one.policy_name} ({one.instruction!r})" if one else ""
-
     @halts_in_parts
     def halt(self, reason: str = "") -> StopVerdict:
         """Stop everything that moves a robot, freeze all; then as the stop level says."""
@@ -483,20 +473,17 @@ class Simulation(PicturesMixin, ArmMixin, TeleopMixin):
 
     def halt_here(self, reason: str, deadline: float) -> StopVerdict | PendingVerdict:
         """Void every permit, freeze, and leave the ends of the loops to be read."""
-        given = self.gate.given
-        note_motion(self)
-        halt = self.gate.revoke()
-        return self._freeze(deadline, lambda verdict: self._torque.after(verdict, halt, given))
+        with self.tasks.halting(deadline) as halt:
+            self._torque.freeze(self.physics, self._clock)
+        return halt.verdict
 
     def halt_ordered(self) -> None:
         """Note what moves; a loop whose permit is void counts as halted."""
-        leaders = (f"teleoperation {name}" for name in self.teleoperating())
-        settling = (f"settling {name}" for name in self._torque.settling)
-        self._moved.update(dict.fromkeys([*self._running(), *leaders, *settling]))
+        self.tasks.note_motion()
 
     def wait_settled(self) -> str:
         """Wait for the end of every settling; return a sentence on each arm."""
-        return self._torque.wait()
+        return self.tasks.settlings.wait()
 
     def cleanup(self) -> Envelope:
         """Halt, let settle, stop the clock and free the pictures, once."""
@@ -539,32 +526,6 @@ class Simulation(PicturesMixin, ArmMixin, TeleopMixin):
         """Return the objects of the world in the base frame of one robot."""
         return targets_of(self.physics.snapshot, self.body(robot_name).base_pose())
 
-    def start_motion(
-        self,
-        robot_name: str,
-        verb: str,
-        plan: Callable[[float, Permit], Motion],
-        *,
-        request: MotionRequest | None = None,
-    ) -> Rollout:
-        """Plan and start a motion of one robot."""
-        hz = settings.number("STRANDS_CONTROL_HZ")
-        permit = self.gate.permit(verb, request)
-        with self._waiting.until_begun(permit, robot_name), self.starting:
-            body = self._free_body(robot_name)
-            motion = plan(hz, permit)
-            permit.check()
-            rollout = motion_rollout(body, motion, permit, hz, self.observers)
-            self._rollouts[body.name] = rollout
-            rollout.start()
-            return rollout
-
-    def _free_body(self, robot_name: str) -> RobotBody:
-        self._require_open()
-        body = self.body(robot_name)
-        self._require_undriven(body.name)
-        return body
-
     def _require_open(self) -> None:
         if self._closed:
             raise ValidationError("this simulation was cleaned up; make a new one.")
@@ -572,30 +533,25 @@ class Simulation(PicturesMixin, ArmMixin, TeleopMixin):
     def _require_idle(self, verb: str) -> None:
         self._require_open()
         leaders = [f"{leader} leading {session.robot}" for leader, session in self.teleoperating().items()]
-        moving = [f"policy on {name}" for name in self._running()] + leaders
-        moving += [f"{name}, which settles" for name in self._torque.settling]
+        moving = [f"policy on {name}" for name in self.tasks.running()] + leaders
+        moving += [f"{name}, which settles" for name in self.tasks.settlings.running()]
         if moving:
             raise ValidationError(f"{verb} is refused while something moves: {', '.join(moving)}. Stop it first.")
-
-    def _require_undriven(self, name: str) -> None:
-        driver = self.occupied(name) or self.teleoperated_by(name)
-        if driver:
-            raise ValidationError(f"{name} is driven by {driver}; stop that first.")
 
     def _only(self, robot_name: str | None) -> RobotBody:
         if not robot_name and len(self._bodies) != 1:
             raise ValidationError(f"robot_name must be one of {self.list_robots()}, not {shown(robot_name)}.")
         return self.body(robot_name)
 
-    def _rebuild(self, plan: Plan) -> None:
-        """Compile ``plan`` and switch to it; nothing changes when it does not compile."""
-        stage = compile_stage(plan)
-        self._torque.check(stage.robots)
-        self.physics.replace(stage)
+    def _rebuild(self, scene: Scene) -> None:
+        """Compile ``scene`` and switch to it; nothing changes when it does not compile."""
+        compiled = compile_scene(scene)
+        self._torque.check(compiled.robots)
+        self.physics.replace(compiled)
         self._bodies = {
             r.name: self._bodies.get(r.name)
             or RobotBody(r.name, self.physics, self._clock, self._speed_limit, self._draw)
-            for r in plan.robots
+            for r in scene.robots
         }
         self._torque.fit(self._bodies)
 
@@ -605,48 +561,6 @@ class Simulation(PicturesMixin, ArmMixin, TeleopMixin):
         if sunk:
             logger.warning("%s:%s", owner, sunk_sentence(sunk))
         return sunk
-
-    def _running(self) -> dict[str, Rollout]:
-        return {name: rollout for name, rollout in list(self._rollouts.items()) if rollout.running}
-
-    def _start_rollout(
-        self,
-        robot_name: str,
-        instruction: str,
-        provider: str,
-        duration: float,
-        options: dict[str, Any],
-        *,
-        request: MotionRequest | None = None,
-    ) -> Rollout:
-        profile, hz = profiles().get(provider), settings.number("STRANDS_CONTROL_HZ")
-        if profile is not None:
-            options = profile.loop_options(options, hz)
-        chosen = rollout_options(instruction, duration, options, hz)
-        permit = self.gate.permit("start_policy", request)
-        with self._waiting.until_begun(permit, self.body(robot_name).name):
-            policy = create_policy(provider, **options)
-            with self.starting:
-                body = self._free_body(robot_name)
-                if isinstance(policy, ProfiledPolicy):
-                    policy.fit(self.policy_facts(body.name))
-                if not permit.valid:
-                    raise ValidationError(f"start_policy: {body.name} was halted while its policy was made ready.")
-                rollout = Rollout(body, policy, permit=permit, policy_name=provider, observers=self.observers, **chosen)
-                self._rollouts[body.name] = rollout
-                rollout.start()
-                return rollout
-
-    def _freeze(
-        self, deadline: float, then: Callable[[StopVerdict], StopVerdict] = lambda verdict: verdict
-    ) -> StopVerdict | PendingVerdict:
-        self._torque.freeze(self.physics, self._clock)
-        moved, self._moved = self._moved, {}
-        for rollout in (running := self._running()).values():
-            rollout.void()
-        return RolloutsEnd(
-            moved, running | self.void_teleoperation(), deadline, then, verbs_to_end(self.gate.under_way)
-        ).at_once()
 
 
 def _row(rollout: Rollout) -> dict[str, Any]:

@@ -21,8 +21,8 @@ from strands_robots.safety.stopping import Outcome, grade
 def holding_by_count(monkeypatch: pytest.MonkeyPatch, held: int, count: Callable[[], int]) -> SimpleNamespace:
     """A hold's clock that goes by ``count`` instead of seconds: blind, it lasts for ``held`` of them."""
     clock = SimpleNamespace(monotonic=lambda: float(count()))
-    monkeypatch.setattr("strands_robots.drivers.ros.velocity_publisher.time", clock)
-    monkeypatch.setattr("strands_robots.drivers.ros.velocity_publisher.BLIND_HOLD_S", float(held))
+    monkeypatch.setattr("strands_robots.drivers.ros.velocity.time", clock)
+    monkeypatch.setattr("strands_robots.drivers.ros.velocity.BLIND_HOLD_S", float(held))
     return clock
 
 
@@ -104,7 +104,7 @@ def test_link_that_drops_out_during_a_hold_restarts_the_hold_time(made: Made, mo
 
 
 def test_hold_on_a_dead_link_ends_when_the_base_disconnects(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("strands_robots.drivers.ros.velocity_publisher.BLIND_HOLD_S", 0.05)
+    monkeypatch.setattr("strands_robots.drivers.ros.velocity.BLIND_HOLD_S", 0.05)
     monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.1")
     robot = made(FaultyLink(tuple(range(1, 10_000))), publish_rate=50.0)
     robot.halt()
@@ -120,8 +120,8 @@ def test_hold_time_restarts_at_the_last_odometry_sample_of_a_moving_base(
     monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.1")
     link, speaks_until = MemoryLink(), 40
     clock = holding_by_count(monkeypatch, 15, lambda: len(velocities(link)))
-    monkeypatch.setattr("strands_robots.drivers.ros.odometry.time", clock)
-    monkeypatch.setattr("strands_robots.drivers.ros.odometry.FRESH_S", 5.0)
+    monkeypatch.setattr("strands_robots.drivers.ros.velocity.time", clock)
+    monkeypatch.setattr("strands_robots.drivers.ros.velocity.FRESH_S", 5.0)
     robot = made(link, odom_topic="/odom", publish_rate=100.0)
     link.watch(TOPIC, None, lambda _: tell_speed(link, 1.0) if len(velocities(link)) <= speaks_until else None)
     robot.drive(1.0)
@@ -270,7 +270,7 @@ def test_stop_with_odometry_waits_until_the_base_is_still(made: Made) -> None:
 
 def test_rolling_base_did_not_stop_and_silent_odometry_is_unknown(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
     passes_while_looking(monkeypatch)
-    monkeypatch.setattr("strands_robots.drivers.ros.odometry.FRESH_S", 60.0)
+    monkeypatch.setattr("strands_robots.drivers.ros.velocity.FRESH_S", 60.0)
     link = MemoryLink()
     link.watch(TOPIC, None, lambda _: tell_speed(link, 1.0))
     robot = made(link, odom_topic="/odom", publish_rate=50.0)

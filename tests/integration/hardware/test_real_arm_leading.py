@@ -20,8 +20,7 @@ from fixtures.waiting import eventually
 from typer.testing import CliRunner
 
 from strands_robots.cli.app import build
-from strands_robots.hardware.calibration import Calibrator, JointReach
-from strands_robots.hardware.lerobot_device import make_device
+from strands_robots.hardware.lerobot_device import Calibrator, JointReach, make_device
 from strands_robots.utils import ValidationError
 
 pytestmark = pytest.mark.system

@@ -13,7 +13,7 @@ from fixtures.ros_bases import OPEN
 from fixtures.rosbridge_server import RosbridgeServer
 from fixtures.waiting import eventually, free_port
 
-from strands_robots.drivers.ros import velocity_publisher
+from strands_robots.drivers.ros import velocity
 from strands_robots.drivers.ros.rosbridge_robot import RosbridgeRobot
 from strands_robots.ros.link import RosError, run_goal
 from strands_robots.ros.rosbridge import RosbridgeLink
@@ -261,7 +261,7 @@ def test_drive_whose_server_is_killed_says_that_the_base_may_still_move(
 def test_server_that_returns_under_the_lockout_gets_only_zeros_for_the_whole_hold_time(
     server: RosbridgeServer, rover: RosbridgeRobot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(velocity_publisher, "BLIND_HOLD_S", 1.0)
+    monkeypatch.setattr(velocity, "BLIND_HOLD_S", 1.0)
     plane = SafetyPlane(deadline_s=1.0)
     entry = plane.register("rover-1", rover)
     try:
@@ -271,16 +271,14 @@ def test_server_that_returns_under_the_lockout_gets_only_zeros_for_the_whole_hol
         report = plane.emergency_stop(StopOrder("e" * 32, "console", "test"))["rover-1"]
         assert report.verdict.stopped is False
         down = time.monotonic()
-        eventually(
-            lambda: time.monotonic() > down + 3 * velocity_publisher.BLIND_HOLD_S, what="longer than a blind hold"
-        )
+        eventually(lambda: time.monotonic() > down + 3 * velocity.BLIND_HOLD_S, what="longer than a blind hold")
         assert rover.holding
         server.published.clear()
         taken: list[float] = []
         server.on_publish = lambda topic, message: taken.append(time.monotonic())
         server.start()
         eventually(lambda: not rover.holding, what="the end of the hold on the new connection")
-        assert taken[-1] - taken[0] > 0.5 * velocity_publisher.BLIND_HOLD_S
+        assert taken[-1] - taken[0] > 0.5 * velocity.BLIND_HOLD_S
         assert {message["linear"]["x"] for _, message in server.published} == {0.0}
         assert "e" * 32 in rover.drive(0.5)["reason"]
         assert "rover-1" in plane.clear_local("test")

@@ -14,8 +14,7 @@ from typing import Any, TypeVar
 from strands_robots import settings
 from strands_robots.contract import Observer, Unsubscribe, for_request
 from strands_robots.drivers.ros.motion import COUNT_MAX, BaseMotion, Drive, DriveOrder, messages_for
-from strands_robots.drivers.ros.odometry import OdometryMonitor
-from strands_robots.drivers.ros.velocity_publisher import CurrentHold, VelocityPublisher, ZeroVelocityHold
+from strands_robots.drivers.ros.velocity import CurrentHold, OdometryMonitor, VelocityPublisher, ZeroVelocityHold
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.policies.rollout import RolloutObservers
 from strands_robots.ros.gate import CommandGate

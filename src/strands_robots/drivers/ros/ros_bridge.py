@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from strands_robots.drivers.ros.mobile_base import TWIST, AgentVerb, PosedBaseRobot
-from strands_robots.drivers.ros.navigation import Destination, Navigation
+from strands_robots.drivers.ros.motion import Destination, Navigation
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.ros.gate import CommandGate
 from strands_robots.ros.link import RosLink

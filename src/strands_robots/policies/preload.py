@@ -1,4 +1,4 @@
-"""Models that are loaded before a motion, and the end of their process.
+"""Models loaded before a motion, and the end of a process that still computes.
 
 While the interpreter shuts down, Python ends every thread that comes back to it from native code. glibc does that by
 unwinding the native code, which torch's does not allow: the process would abort. So where torch is loaded the end waits
@@ -92,7 +92,7 @@ class Warmable(Protocol):
         """
 
 
-class WarmModels:
+class PreloadedModels:
     """Loaded models by key. Thread-safe; a model in use is given to no second policy."""
 
     def __init__(self) -> None:
