@@ -133,7 +133,7 @@ class TaskEngine:
         permit = self.gate.permit(verb, request)
         label = self._body(name).name
         waiting = self.waiting_leaders if leader else self.waiting
-        with waiting.until_begun(permit, leader or label), self._lines.setdefault(label, threading.RLock()):
+        with waiting.until_begun(permit, leader or label), self.line(label):
             policy = None
             if new.load is not None:
                 self._free_body(label, permit)
