@@ -27,11 +27,9 @@ from mcp.client.client import Client
 from benchmarks.table import Row
 from strands_robots.device_connect import FleetClient, loopback_config
 from strands_robots.fleet.adapter import FoundRobot
-from strands_robots.mcp.access import ClientAccess
 from strands_robots.mcp.approval import Approvals
-from strands_robots.mcp.caller import SILENCE_S, Caller
-from strands_robots.mcp.resources import RobotResources
-from strands_robots.mcp.server import build
+from strands_robots.mcp.caller import SILENCE_S, Caller, ClientAccess
+from strands_robots.mcp.server import RobotResources, build
 from strands_robots.mcp.standing import StandingController
 
 HZ = 200.0

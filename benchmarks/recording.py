@@ -17,8 +17,14 @@ from mcap.writer import Writer
 from benchmarks.table import Row
 from strands_robots.hardware import HardwareRobot
 from strands_robots.recording.cameras import jpeg
-from strands_robots.recording.file import RecordedEvent, RecordedJoints, RecordedPicture, Recorder, read_items
-from strands_robots.recording.sampling import RobotRecording
+from strands_robots.recording.file import (
+    RecordedEvent,
+    RecordedJoints,
+    RecordedPicture,
+    Recorder,
+    RobotRecording,
+    read_items,
+)
 
 ARMS, HZ, CAMERA_HZ = 8, 50.0, 15.0
 WIDTH, HEIGHT = 320, 240

@@ -95,16 +95,18 @@ def _surroundings() -> Iterator[None]:
 
 def _round_trips(bare: Bare, repeats: int) -> list[float]:
     """Seconds from a bare write to the bare echo of it."""
-    from strands_robots.ros.dds_types import JointState  # noqa: PLC0415 - in the surroundings of the benchmark
+    from strands_robots.ros.dds_types import KINDS  # noqa: PLC0415 - in the surroundings of the benchmark
 
-    writer, reader = bare.writer("rt/bench/ask", JointState), bare.reader("rt/bench/answer", JointState)
+    joint_state_type = KINDS["sensor_msgs/JointState"]
+
+    writer, reader = bare.writer("rt/bench/ask", joint_state_type), bare.reader("rt/bench/answer", joint_state_type)
     answers = bare.samples(reader, threading.Event())
     eventually(lambda: writer.get_matched_subscriptions() and reader.get_matched_publications(), 10, "the echo")
     time.sleep(0.2)
     found = []
     for number in range(repeats):
         began = time.monotonic()
-        writer.write(JointState(name=["joint.pos"], position=[float(number)]))
+        writer.write(joint_state_type(name=["joint.pos"], position=[float(number)]))
         next(answers)
         found.append(time.monotonic() - began)
         time.sleep(0.002)
@@ -112,17 +114,19 @@ def _round_trips(bare: Bare, repeats: int) -> list[float]:
 
 
 def _joint_command(stack: ExitStack, bare: Bare, trips: list[float], repeats: int) -> Row:
-    from strands_robots.ros.dds_types import JointState  # noqa: PLC0415 - in the surroundings of the benchmark
+    from strands_robots.ros.dds_types import KINDS  # noqa: PLC0415 - in the surroundings of the benchmark
+
+    joint_state_type = KINDS["sensor_msgs/JointState"]
 
     child = _Child("bridge", str(DOMAIN))
     stack.callback(child.close)
-    writer = bare.writer("rt/bench/joint_command", JointState)
+    writer = bare.writer("rt/bench/joint_command", joint_state_type)
     eventually(writer.get_matched_subscriptions, 10, "the bridge")
     time.sleep(0.2)
     written = {}
     for number in range(repeats):
         written[float(number)] = time.monotonic()
-        writer.write(JointState(name=["joint.pos"], position=[float(number)]))
+        writer.write(joint_state_type(name=["joint.pos"], position=[float(number)]))
         # Not a multiple of the poll period, so that every phase of it is met.
         time.sleep(0.0313)
     delays = [at - written[number] for number, at in child.ask()]
@@ -169,13 +173,15 @@ def _first_message(echo: _Child, trips: list[float], repeats: int) -> Row:
 
 def _images(seconds: float) -> Row:
     """The share of a core that pictures at 30 Hz take, with a reader in this process; ours and bare in turns."""
-    from strands_robots.ros.dds_types import Image  # noqa: PLC0415 - in the surroundings of the benchmark
+    from strands_robots.ros.dds_types import KINDS  # noqa: PLC0415 - in the surroundings of the benchmark
+
+    image_type = KINDS["sensor_msgs/Image"]
 
     reader = Bare(DOMAIN + 1)
     taken, ended = [0], threading.Event()
 
     def take() -> None:
-        for _ in reader.samples(reader.reader("rt/bench/front/image_raw", Image), ended):
+        for _ in reader.samples(reader.reader("rt/bench/front/image_raw", image_type), ended):
             taken[0] += 1
 
     thread = threading.Thread(target=take)

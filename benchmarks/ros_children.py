@@ -62,11 +62,13 @@ class Bare:
 
 def echo(domain: str) -> None:
     """Answers each joint command on another topic, and tells when each velocity came."""
-    from strands_robots.ros.dds_types import JointState, Twist  # noqa: PLC0415 - likewise
+    from strands_robots.ros.dds_types import KINDS  # noqa: PLC0415 - likewise
+
+    joint_state_type, twist_type = KINDS["sensor_msgs/JointState"], KINDS["geometry_msgs/Twist"]
 
     bare, ended = Bare(int(domain)), threading.Event()
-    answers = bare.writer("rt/bench/answer", JointState)
-    asked, velocities = bare.reader("rt/bench/ask", JointState), bare.reader(TWIST_TOPIC, Twist)
+    answers = bare.writer("rt/bench/answer", joint_state_type)
+    asked, velocities = bare.reader("rt/bench/ask", joint_state_type), bare.reader(TWIST_TOPIC, twist_type)
     arrivals: list[tuple[float, float]] = []
 
     def answer() -> None:
@@ -117,19 +119,23 @@ def images(domain: str, ours: str) -> None:
     import numpy as np  # noqa: PLC0415 - likewise
 
     from strands_robots.hardware_rtps_bridge import HardwareRtpsBridge  # noqa: PLC0415 - likewise
-    from strands_robots.ros.dds_types import Image  # noqa: PLC0415 - likewise
+    from strands_robots.ros.dds_types import KINDS  # noqa: PLC0415 - likewise
+
+    image_type = KINDS["sensor_msgs/Image"]
 
     picture = np.zeros(SHAPE, np.uint8)
     made = HardwareRtpsBridge(domain_id=int(domain)) if ours == "ours" else None
     bare = Bare(int(domain)) if made is None else None
-    writer = bare.writer("rt/bench/front/image_raw", Image) if bare is not None else None
+    writer = bare.writer("rt/bench/front/image_raw", image_type) if bare is not None else None
 
     def publish() -> None:
         if made is not None:
             made.publish_image("bench", "front", picture)
         elif writer is not None:
             height, width, depth = SHAPE
-            writer.write(Image(height=height, width=width, encoding="rgb8", step=width * depth, data=picture.tobytes()))
+            writer.write(
+                image_type(height=height, width=width, encoding="rgb8", step=width * depth, data=picture.tobytes())
+            )
 
     publish()
     answer_line("ready")

@@ -22,7 +22,7 @@ from fixtures.feetech_bus import FeetechBus, arm_servos, write_calibration
 from fixtures.feetech_bus.twin import ArmTwin
 
 from strands_robots.device_connect import init_device_connect_sync, stop_device_connect
-from strands_robots.device_connect.links import usual_link
+from strands_robots.device_connect.backends.config import usual_link
 from strands_robots.robot import Robot
 from strands_robots.simulation.pictures import Recording
 

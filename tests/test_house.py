@@ -54,7 +54,7 @@ FLOORS: list[set[str]] = [
     {"serving"},
     {"device_connect", "mesh", "mesh_session"},
     {"fleet"},
-    {"cli", "tools", "mcp", "dashboard", "evaluation", "robot"},
+    {"cli", "tools", "mcp", "dashboard", "evaluation", "robot", "http_access"},
 ]
 
 ASKS_KINDS = {"contract"}

@@ -5,12 +5,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fixtures.ros_memory import MemoryLink
 from fixtures.waiting import eventually
 from hypothesis import given
 from hypothesis import strategies as st
 
 from strands_robots.envelope import Envelope, success
-from strands_robots.ros.memory import MemoryLink
 from strands_robots.ros_telemetry import RosTelemetryBase
 from strands_robots.safety.gate import MotionGate
 from strands_robots.utils import ValidationError

@@ -5,8 +5,7 @@ from __future__ import annotations
 from importlib.util import find_spec
 from typing import Any
 
-from strands_robots.ros.dds import DdsLink
-from strands_robots.ros.dds_security import DdsCredentials, checked_credentials, governance_gap
+from strands_robots.ros.dds import DdsCredentials, DdsLink, checked_credentials, governance_gap
 from strands_robots.ros_telemetry import JOINT_SPEED, RosTelemetryBase, refuse_unsecured
 from strands_robots.utils import missing_extra
 

@@ -143,7 +143,7 @@ def run(
         DuplicateDeviceError: another device of this id is served.
     """
     from strands_robots import device_connect  # noqa: PLC0415 - the network is loaded when it is used
-    from strands_robots.device_connect.links import usual_link  # noqa: PLC0415
+    from strands_robots.device_connect.backends.config import usual_link  # noqa: PLC0415
 
     if peer_id is not None:
         own_device_id("peer_id", peer_id)

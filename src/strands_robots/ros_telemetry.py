@@ -15,9 +15,8 @@ from typing import Any
 from strands_robots import settings
 from strands_robots.envelope import is_error, text_of
 from strands_robots.policies.base import limited, numbers
-from strands_robots.ros.link import BroadcastLink, Message
-from strands_robots.ros.names import DOMAIN_MAX
-from strands_robots.ros.names import node_name as checked_node_name
+from strands_robots.ros.link import DOMAIN_MAX, BroadcastLink, Message
+from strands_robots.ros.link import node_name as checked_node_name
 from strands_robots.ros.rclpy import MAX_QOS_HISTORY_DEPTH, RclpyLink
 from strands_robots.safety.gate import MotionGate
 from strands_robots.utils import ValidationError, flag, number, shown, text, whole
@@ -119,8 +118,8 @@ class RosTelemetryBase:
         if command_robot_name is not None:
             command_robot_name = text("command_robot_name", command_robot_name, longest=128)
         self._robot = robot
-        own = str(getattr(robot, "tool_name_str", "") or "robot")
-        self.command_topic = f"/{segment(own if command_robot_name is None else command_robot_name)}/joint_command"
+        named = str(getattr(robot, "tool_name_str", "") or "robot")
+        self.command_topic = f"/{segment(named if command_robot_name is None else command_robot_name)}/joint_command"
         self._limits = checked_limits(joint_limits)
         self._max_speed = number("max_joint_speed", max_joint_speed, above=0)
         self._sent: dict[str, float] = {}

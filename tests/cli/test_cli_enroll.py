@@ -14,8 +14,8 @@ from strands_robots.audit import read_audit_log
 from strands_robots.cli.output import Exit
 from strands_robots.cli.stop_report import exit_code, report_rows, style_of, summary
 from strands_robots.device_connect.backends import loopback_config
+from strands_robots.device_connect.backends.config import network_of
 from strands_robots.device_connect.client import Peer
-from strands_robots.device_connect.links import network_of
 from strands_robots.envelope import Envelope, success
 from strands_robots.fleet.lockout_report import LockoutReport
 from strands_robots.fleet.networks import Networks

@@ -13,9 +13,9 @@ from strands_robots.cli import resume
 from strands_robots.cli.network import Network
 from strands_robots.cli.output import CliError, Exit
 from strands_robots.device_connect.backends import loopback_config
+from strands_robots.device_connect.backends.config import network_of
 from strands_robots.device_connect.client import DeviceTimeoutError
 from strands_robots.device_connect.discovery import Peer
-from strands_robots.device_connect.links import network_of
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.safety.authorization import Grants
 from strands_robots.safety.ed25519 import keygen

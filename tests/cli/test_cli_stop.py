@@ -21,8 +21,8 @@ from strands_robots.cli.stop import show_resume
 from strands_robots.cli.stop_report import exit_code, progress_rows, report_rows, summary
 from strands_robots.device_connect import safety_controller
 from strands_robots.device_connect.backends import loopback_config
+from strands_robots.device_connect.backends.config import network_of
 from strands_robots.device_connect.discovery import Peer, RegistryError
-from strands_robots.device_connect.links import network_of
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.errors import UnreachableError
 from strands_robots.fleet.device_connect.network import DeviceConnectNetwork

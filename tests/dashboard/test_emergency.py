@@ -11,9 +11,9 @@ from fixtures.page_feed import page_feeds
 from fixtures.waiting import eventually
 from tests.fleet.scripted import OURS, ScriptedNetwork
 
-from strands_robots.dashboard.emergency import FleetStop, verdict_of
 from strands_robots.dashboard.feeds import Feeds
 from strands_robots.dashboard.fleet_model import FleetModel
+from strands_robots.dashboard.page_robots import FleetStop, verdict_of
 from strands_robots.fleet import stop_button
 from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
 from strands_robots.fleet.networks import Networks

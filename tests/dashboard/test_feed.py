@@ -12,9 +12,10 @@ import pytest
 from fixtures.waiting import eventually
 from tests.fleet.scripted import OURS, ScriptedNetwork, function
 
-from strands_robots.dashboard import feed as feeds
-from strands_robots.dashboard.feed import FleetFeed
-from strands_robots.dashboard.fleet_model import FleetModel, RobotRow
+from strands_robots.dashboard import feeds
+from strands_robots.dashboard.feeds import FleetFeed
+from strands_robots.dashboard.fleet_model import FleetModel
+from strands_robots.dashboard.history import RobotRow
 from strands_robots.envelope import error, success
 from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
 

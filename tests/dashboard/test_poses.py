@@ -18,9 +18,9 @@ from fixtures.page_feed import PageFeed
 from fixtures.waiting import eventually
 from PIL import Image
 
-from strands_robots.dashboard import poses
+from strands_robots.dashboard import pictures as module
+from strands_robots.dashboard.pictures import Poses
 from strands_robots.dashboard.pose_process import PosePainter, main
-from strands_robots.dashboard.poses import Poses
 from strands_robots.envelope import error, success
 from strands_robots.hardware.robot import HardwareRobot
 from strands_robots.kinematics.chain import built_in
@@ -31,7 +31,7 @@ COUNTS = (796, 3299)
 """Ends of every joint's calibration: 220 degrees, as the model turns; 100 of the driver's units are half of it."""
 
 UNIT_RAD = math.radians((COUNTS[1] - COUNTS[0]) / 2 * 360 / 4095) / 100
-PROGRAM = poses.PROGRAM
+PROGRAM = module.PROGRAM
 
 
 class Follower:
@@ -137,7 +137,7 @@ def test_pose_is_drawn_by_another_process_and_follows_the_arm(arm: HardwareRobot
 
 
 def test_process_ends_when_nobody_looks_and_comes_back(arm: HardwareRobot, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(poses, "IDLE_S", 0.1)
+    monkeypatch.setattr(module, "IDLE_S", 0.1)
 
     async def looked() -> None:
         pictures, feed = Poses(), ArmFeed(arm)
@@ -157,11 +157,11 @@ def refused(feed: PageFeed, *program: str) -> str:
         finally:
             pictures.close()
 
-    poses.PROGRAM = program or PROGRAM
+    module.PROGRAM = program or PROGRAM
     try:
         answer = asyncio.run(looked())
     finally:
-        poses.PROGRAM = PROGRAM
+        module.PROGRAM = PROGRAM
     assert answer["status"] == "error"
     return str(answer["reason"])
 
@@ -189,8 +189,8 @@ POSED = success("here", model="so101", joints={}, gripper=0.5)
 
 
 def test_close_ends_a_process_that_is_stuck_and_starts_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(poses, "PROGRAM", (sys.executable, "-c", "import sys; sys.stdin.read()"))
-    monkeypatch.setattr(poses, "DRAW_S", 3600.0)
+    monkeypatch.setattr(module, "PROGRAM", (sys.executable, "-c", "import sys; sys.stdin.read()"))
+    monkeypatch.setattr(module, "DRAW_S", 3600.0)
 
     async def looked() -> list[Any]:
         pictures, feed = Poses(), PageFeed()
@@ -216,7 +216,7 @@ def test_robot_that_answers_after_the_close_is_not_drawn() -> None:
         feed.slow["getPose"].set()
         return await waiting
 
-    assert asyncio.run(looked())["reason"] == poses.CLOSED
+    assert asyncio.run(looked())["reason"] == module.CLOSED
 
 
 def test_robot_without_a_model_says_why() -> None:

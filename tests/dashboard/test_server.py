@@ -16,11 +16,9 @@ from starlette.testclient import TestClient, WebSocketTestSession
 from starlette.websockets import WebSocketDisconnect
 
 from strands_robots.dashboard import page_session, server
-from strands_robots.dashboard.access import OPERATOR, VIEWER, Access, loopback_origins
+from strands_robots.dashboard.access import OPERATOR, VIEWER, Access, KeyRefusedError, OperatorKey, loopback_origins
 from strands_robots.dashboard.fleet_model import FleetModel
-from strands_robots.dashboard.operator_key import KeyRefusedError, OperatorKey
-from strands_robots.dashboard.pictures import Pictures
-from strands_robots.dashboard.poses import Poses
+from strands_robots.dashboard.pictures import Pictures, Poses
 from strands_robots.dashboard.server import STATIC, Dashboard
 from strands_robots.envelope import error, success
 from strands_robots.safety.answers import Answer

@@ -6,8 +6,8 @@ import json
 from typing import Any
 
 import pytest
+from fixtures.page_feed import forms_of
 
-from strands_robots.dashboard.verb_forms import forms_of
 from strands_robots.serving.arm_verbs import ARM_MOTION_VERBS
 from strands_robots.serving.verbs import described
 

@@ -15,7 +15,7 @@ from fixtures.waiting import free_port
 
 from strands_robots.device_connect import connect_agent, init_device_connect_sync
 from strands_robots.device_connect.backends import LinkConfig, loopback_config
-from strands_robots.device_connect.links import insecure_opt_in, link_for
+from strands_robots.device_connect.backends.config import insecure_opt_in, link_for
 from strands_robots.utils import ValidationError
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from fixtures.driver_bench import DriverBench
 from fixtures.planes import own_plane
+from fixtures.ros_memory import MemoryLink
 
 from strands_robots.device_connect.bringup import driver_for
 from strands_robots.device_connect.robot_driver import MobileBaseDeviceDriver
@@ -18,7 +19,6 @@ from strands_robots.drivers.ros.mobile_base import MobileBaseRobot
 from strands_robots.drivers.ros.ros_bridge import RosBridgedRobot
 from strands_robots.drivers.ros.rosbridge_robot import RosbridgeRobot
 from strands_robots.ros.gate import CommandGate
-from strands_robots.ros.memory import MemoryLink
 from strands_robots.safety.authorization import Approval, Authorization
 from strands_robots.safety.orders import StopOrder
 from strands_robots.safety.plane import SafetyPlane

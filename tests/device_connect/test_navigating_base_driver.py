@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 from fixtures.driver_bench import DriverBench
+from fixtures.ros_memory import MemoryLink
 from fixtures.waiting import until
 
 from strands_robots.device_connect.bringup import driver_for
@@ -14,7 +15,6 @@ from strands_robots.device_connect.robot_driver import MobileBaseDeviceDriver, N
 from strands_robots.drivers.ros.ros_bridge import RosBridgedRobot
 from strands_robots.ros.gate import CommandGate
 from strands_robots.ros.link import Goal
-from strands_robots.ros.memory import MemoryLink
 from strands_robots.safety.authorization import Approval, Authorization
 
 NAV = "/navigate_to_pose"

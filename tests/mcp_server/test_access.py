@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from urllib.parse import urlparse
 
-from strands_robots.mcp.access import PictureFiles
+from strands_robots.mcp.caller import PictureFiles
 
 
 def open_files() -> set[str]:

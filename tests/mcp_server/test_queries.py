@@ -12,9 +12,8 @@ from tests.fleet.scripted import ScriptedNetwork
 from strands_robots.envelope import Envelope, is_error, success, text_of
 from strands_robots.fleet.networks import Networks
 from strands_robots.mcp import caller as calls
-from strands_robots.mcp import queries as module
-from strands_robots.mcp.caller import Caller
-from strands_robots.mcp.queries import AT_ONCE, NoTurnError, Queries
+from strands_robots.mcp import caller as module
+from strands_robots.mcp.caller import AT_ONCE, Caller, NoTurnError, Queries
 
 
 class Robots(ScriptedNetwork):

@@ -7,8 +7,7 @@ from typing import Any
 
 from strands_robots.envelope import text_of
 from strands_robots.fleet.adapter import FoundRobot
-from strands_robots.mcp.results import result
-from strands_robots.mcp.verbs import described, wanted
+from strands_robots.mcp.results import described, result, wanted
 
 
 def robot_of(*functions: Any) -> FoundRobot:

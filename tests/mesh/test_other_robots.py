@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from fixtures.mesh_robots import Arm, World
 from fixtures.ros_bases import SHUT, velocities
+from fixtures.ros_memory import MemoryLink
 from fixtures.waiting import eventually
 from tests.mesh.peers import Fleet
 
@@ -15,7 +16,6 @@ from strands_robots.drivers.reachy import ReachyDriver
 from strands_robots.drivers.ros.ros_bridge import RosBridgedRobot
 from strands_robots.mesh.core import Mesh
 from strands_robots.ros.link import Goal, OnMessage, Unwatch
-from strands_robots.ros.memory import MemoryLink
 from strands_robots.safety.authorization import Grants
 from strands_robots.state_files import state_dir
 

@@ -23,10 +23,10 @@ from strands_robots.recording.file import (
     RecordedJoints,
     RecordedPicture,
     Recorder,
+    RobotRecording,
     read_events,
     read_items,
 )
-from strands_robots.recording.sampling import RobotRecording
 from strands_robots.simulation import Simulation
 from strands_robots.utils import ValidationError
 

@@ -13,7 +13,8 @@ import zstandard
 from lz4 import frame as lz4
 from mcap.writer import CompressionType, Writer
 
-from strands_robots.recording import schemas, unpacking
+from strands_robots.recording import file as recording_file
+from strands_robots.recording import schemas
 from strands_robots.recording.file import read_items, recorded_actions
 from strands_robots.utils import ValidationError
 
@@ -63,7 +64,7 @@ def test_chunk_that_unpacks_to_gigabytes_is_refused_within_bounds(
         list(read_items(path))
     grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
     tracemalloc.stop()
-    assert grown < 4 * unpacking.CHUNK_MAX_BYTES / 1024
+    assert grown < 4 * recording_file.CHUNK_MAX_BYTES / 1024
 
 
 def test_many_small_chunks_that_unpack_to_gigabytes_are_refused(tmp_path: Path) -> None:
@@ -108,7 +109,7 @@ def test_message_that_would_take_the_memory_is_refused(tmp_path: Path, what: str
         recorded_actions(path)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert peak < unpacking.CHUNK_MAX_BYTES + 4 * len(data) + 2**20
+    assert peak < recording_file.CHUNK_MAX_BYTES + 4 * len(data) + 2**20
 
 
 def test_number_of_a_megabyte_in_a_picture_ends_at_64_bits(tmp_path: Path) -> None:
@@ -125,7 +126,7 @@ def test_chunk_of_many_records_is_never_held_as_objects(tmp_path: Path) -> None:
     assert list(read_items(path)) == []
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert peak < unpacking.CHUNK_MAX_BYTES + 8 * 2**20
+    assert peak < recording_file.CHUNK_MAX_BYTES + 8 * 2**20
 
 
 def test_record_that_claims_gigabytes_is_refused(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from strands_robots.ros.gate import CommandGate, surface_of
-from strands_robots.ros.names import graph_name, interface
+from strands_robots.ros.link import graph_name, interface
 from strands_robots.utils import ValidationError
 
 

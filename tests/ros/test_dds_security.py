@@ -10,8 +10,7 @@ from fixtures.dds_pki import DdsPki, governance
 
 from strands_robots.drivers.ros.rtps_robot import RtpsRobot
 from strands_robots.hardware_rtps_bridge import HardwareRtpsBridge
-from strands_robots.ros.dds import DdsLink
-from strands_robots.ros.dds_security import REQUIRED, checked_credentials, governance_gap
+from strands_robots.ros.dds import REQUIRED, DdsLink, checked_credentials, governance_gap
 from strands_robots.utils import ValidationError
 
 DOMAIN = 7

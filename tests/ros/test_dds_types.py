@@ -11,15 +11,27 @@ import pytest
 from cyclonedds.idl._machinery import BytesMachine
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from strands_robots.ros.dds import filled, plain
-from strands_robots.ros.dds_types import KINDS, Image, JointState, Odometry, Twist
+from strands_robots.ros import messages
+from strands_robots.ros.dds_types import KINDS
 from strands_robots.ros.link import RosError
+from strands_robots.ros.messages import plain
+
+Image, JointState, Odometry, Twist = (
+    KINDS["sensor_msgs/Image"],
+    KINDS["sensor_msgs/JointState"],
+    KINDS["nav_msgs/Odometry"],
+    KINDS["geometry_msgs/Twist"],
+)
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 # turtlesim is not among the packages of rosbags; the fields are those of its Pose.msg.
 TURTLE = "float32 x\nfloat32 y\nfloat32 theta\nfloat32 linear_velocity\nfloat32 angular_velocity\n"
 STORE.register(get_types_from_msg(TURTLE, "turtlesim/msg/Pose"))
 OLD = importlib.metadata.version("cyclonedds").startswith("0.10.")
+
+
+def filled(struct: type[Any], fields: dict[str, Any]) -> Any:
+    return messages.filled(struct(), fields, lambda kind: KINDS[kind]())
 
 
 def sample(struct: type[Any], rng: random.Random) -> Any:

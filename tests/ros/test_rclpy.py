@@ -9,15 +9,20 @@ from fixtures import rclpy_stand_in
 from fixtures.rclpy_stand_in.idl import MESSAGES
 from fixtures.rclpy_stand_in.interfaces import message_class, to_idl
 
-from strands_robots.ros import dds
+from strands_robots.ros import messages
 from strands_robots.ros.dds_types import KINDS
 from strands_robots.ros.link import RosError
-from strands_robots.ros.rclpy import filled, interface_class, plain
+from strands_robots.ros.messages import plain
+from strands_robots.ros.rclpy import interface_class
 from strands_robots.utils import ValidationError
 
 
 def made(kind: str) -> Any:
     return message_class(MESSAGES[kind])()
+
+
+def filled(message: Any, fields: dict[str, Any]) -> Any:
+    return messages.filled(message, fields, lambda kind: interface_class(kind, "msg")())
 
 
 @pytest.fixture(autouse=True)
@@ -28,7 +33,7 @@ def sourced() -> Any:
 
 @pytest.mark.parametrize("kind", sorted(KINDS))
 def test_empty_message_is_the_same_over_rclpy_and_bare_dds(kind: str) -> None:
-    assert plain(made(kind)) == dds.plain(KINDS[kind]())
+    assert plain(made(kind)) == plain(KINDS[kind]())
 
 
 FILLED: dict[str, dict[str, Any]] = {
@@ -45,8 +50,10 @@ FILLED: dict[str, dict[str, Any]] = {
 def test_filled_message_is_the_same_over_rclpy_and_bare_dds(kind: str) -> None:
     fields = FILLED[kind]
     message = filled(made(kind), fields)
-    assert plain(message) == dds.plain(dds.filled(KINDS[kind], fields))
-    assert to_idl(message).serialize() == dds.filled(KINDS[kind], fields).serialize()
+    assert plain(message) == plain(messages.filled(KINDS[kind](), fields, lambda inner: KINDS[inner]()))
+    assert (
+        to_idl(message).serialize() == messages.filled(KINDS[kind](), fields, lambda inner: KINDS[inner]()).serialize()
+    )
 
 
 def test_numpy_arrays_and_lists_of_bytes_are_accepted() -> None:

@@ -13,8 +13,14 @@ from fixtures import rclpy_stand_in
 from fixtures.rclpy_stand_in import idl
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from strands_robots.ros.dds_types import Header, PoseStamped, Time
-from strands_robots.ros.rclpy_session import sourced
+from strands_robots.ros.dds_types import KINDS
+from strands_robots.ros.rclpy import sourced
+
+Header, PoseStamped, Time = (
+    KINDS["std_msgs/Header"],
+    KINDS["geometry_msgs/PoseStamped"],
+    KINDS["builtin_interfaces/Time"],
+)
 
 
 def test_stand_in_is_importable_only_inside_its_block() -> None:

@@ -3,16 +3,16 @@ from __future__ import annotations
 import pytest
 
 from strands_robots.ros import ros_action
+from strands_robots.ros.actions import Ros2Link, ros2_backend
 from strands_robots.ros.dds import DdsLink
 from strands_robots.ros.link import RosError
 from strands_robots.ros.rclpy import MAX_QOS_HISTORY_DEPTH, RclpyLink
-from strands_robots.ros.ros2 import Ros2Link, ros2_backend
 from strands_robots.utils import ValidationError
 
 
 def installed(monkeypatch: pytest.MonkeyPatch, *, rclpy: bool, cyclonedds: bool) -> None:
-    monkeypatch.setattr("strands_robots.ros.ros2.sourced", lambda: rclpy)
-    monkeypatch.setattr("strands_robots.ros.ros2.find_spec", lambda name: object() if cyclonedds else None)
+    monkeypatch.setattr("strands_robots.ros.actions.sourced", lambda: rclpy)
+    monkeypatch.setattr("strands_robots.ros.actions.find_spec", lambda name: object() if cyclonedds else None)
 
 
 def test_sourced_ros_2_is_preferred_to_bare_dds(monkeypatch: pytest.MonkeyPatch) -> None:

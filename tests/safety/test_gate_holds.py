@@ -13,6 +13,7 @@ import pytest
 from fixtures.bodies import RecordingBody, ScriptedPolicy, StepClock
 from fixtures.devices import RecordingDevice
 from fixtures.ros_bases import OPEN, TOPIC, velocities
+from fixtures.ros_memory import MemoryLink
 from fixtures.waiting import eventually
 
 from strands_robots.drivers.reachy.motion import MotionController
@@ -21,7 +22,6 @@ from strands_robots.drivers.ros.mobile_base import MobileBaseRobot
 from strands_robots.hardware.body import DeviceBody
 from strands_robots.hardware.robot import HardwareRobot
 from strands_robots.policies.rollout import Rollout
-from strands_robots.ros.memory import MemoryLink
 from strands_robots.safety.gate import MotionGate, MotionRefused, MotionsHeldError, PermitVoidError
 from strands_robots.safety.plane import SafetyPlane
 from strands_robots.simulation import Simulation

@@ -19,7 +19,7 @@ from fixtures.waiting import eventually, said, signalled
 
 from strands_robots.audit import read_audit_log
 from strands_robots.device_connect.backends import LinkConfig, loopback_config
-from strands_robots.device_connect.links import network_of
+from strands_robots.device_connect.backends.config import network_of
 from strands_robots.safety import sighting_file
 from strands_robots.safety.identity import ROBOTS, EnrolledKeys, Exemption, KeyFile, SigningIdentity
 from strands_robots.safety.network_key import DEVICE_CONNECT, MESH, NetworkKey

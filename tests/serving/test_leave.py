@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 from fixtures.devices import RecordingDevice
+from fixtures.ros_memory import MemoryLink
 from fixtures.toy_robots import ToyRobot, ToyWorld
 
 from strands_robots import Permit, Simulation, verb
@@ -17,7 +18,6 @@ from strands_robots.drivers.ros.ros_bridge import RosBridgedRobot
 from strands_robots.envelope import success
 from strands_robots.hardware import HardwareRobot
 from strands_robots.ros.gate import CommandGate
-from strands_robots.ros.memory import MemoryLink
 from strands_robots.safety.authorization import Leave
 from strands_robots.safety.gate import MotionGate
 from strands_robots.serving.offered_verbs import own_verbs

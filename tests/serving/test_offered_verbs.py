@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 from fixtures.devices import TorqueDevice
 from fixtures.pan_tilt import ArmDevice, BarePanTilt, PanTilt
+from fixtures.ros_memory import MemoryLink
 from fixtures.toy_robots import ToyRobot, ToyWorld
 
 from strands_robots.contract import adapt
@@ -20,7 +21,6 @@ from strands_robots.device_connect.robot_driver import MobileBaseDeviceDriver
 from strands_robots.drivers.reachy import ReachyDriver
 from strands_robots.drivers.ros.mobile_base import MobileBaseRobot
 from strands_robots.hardware import HardwareRobot
-from strands_robots.ros.memory import MemoryLink
 from strands_robots.serving.arm_verbs import ARM_MOTION_VERBS, PICTURE_VERBS
 from strands_robots.serving.control_leases import CONTROL_VERBS
 from strands_robots.serving.offered_verbs import offered

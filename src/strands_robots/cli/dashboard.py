@@ -25,7 +25,7 @@ from strands_robots.utils import device_id, missing_extra
 
 if TYPE_CHECKING:
     from strands_robots.cli.demo.processes import RobotProcess
-    from strands_robots.dashboard.listening import RemoteAddress
+    from strands_robots.dashboard.access import RemoteAddress
     from strands_robots.dashboard.server import Dashboard
 
 PORT = 8800
@@ -77,10 +77,10 @@ def dashboard(
         raise CliError("--mesh: STRANDS_MESH switches the mesh off.", Exit.USAGE)
     signer = None if key is None else signing_key(key, passphrase_file)
     try:
-        from strands_robots.dashboard.feeds import Feeds  # noqa: PLC0415 - loaded when it is used
+        # Loaded when they are used.
+        from strands_robots.dashboard.access import OperatorKey, access_for, remote_address  # noqa: PLC0415
+        from strands_robots.dashboard.feeds import Feeds  # noqa: PLC0415 - as above
         from strands_robots.dashboard.fleet_model import FleetModel  # noqa: PLC0415 - as above
-        from strands_robots.dashboard.listening import access_for, remote_address  # noqa: PLC0415 - as above
-        from strands_robots.dashboard.operator_key import OperatorKey  # noqa: PLC0415 - as above
         from strands_robots.dashboard.server import Dashboard  # noqa: PLC0415 - as above
     except ModuleNotFoundError as exc:
         raise missing_extra("The page", "dashboard") from exc
@@ -182,8 +182,7 @@ def _announce(screen: Screen, url: str, remote: RemoteAddress | None) -> None:
     screen.say("The page is at")
     screen.copyable(f"  {url}")
     if remote is not None:
-        from strands_robots.dashboard.access import ROLES  # noqa: PLC0415 - as above
-        from strands_robots.dashboard.listening import qr_code  # noqa: PLC0415 - as above
+        from strands_robots.dashboard.access import ROLES, qr_code  # noqa: PLC0415 - as above
 
         facts |= {"remote": {role: remote.url(role) for role in ROLES}, "fingerprint": remote.fingerprint}
         for role in ROLES:

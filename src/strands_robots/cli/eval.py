@@ -52,8 +52,7 @@ def evaluate(
         import mujoco  # noqa: F401, PLC0415 - a simulation is needed by this command alone
     except ModuleNotFoundError as exc:
         raise missing_extra("An evaluation", "sim") from exc
-    from strands_robots.evaluation.episode import run_episode  # noqa: PLC0415 - numpy and MuJoCo
-    from strands_robots.evaluation.report import HEADINGS, rows_of, write_plot  # noqa: PLC0415
+    from strands_robots.evaluation.episode import HEADINGS, rows_of, run_episode, write_plot  # noqa: PLC0415 - MuJoCo
 
     if policies is not None:
         settings.put("STRANDS_POLICIES", str(policies))

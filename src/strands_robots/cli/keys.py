@@ -76,7 +76,7 @@ def mcp(
     revoke: Annotated[bool, typer.Option("--revoke", help="Remove the token of this name.")] = False,
 ) -> None:
     """Make a bearer token for a client of `mcp --http`, or revoke it."""
-    from strands_robots.mcp.tokens import Token, TokenFile  # noqa: PLC0415 - loaded when it is used
+    from strands_robots.http_access import Token, TokenFile  # noqa: PLC0415 - loaded when it is used
 
     tokens = TokenFile()
     if revoke:

@@ -53,8 +53,8 @@ def mcp(
         with networks_of(name) as networks:
             asyncio.run(serve_stdio(networks, name, read_only=read_only))
         return
+    from strands_robots.http_access import Token  # noqa: PLC0415 - as above
     from strands_robots.mcp.http import Address, serve_http  # noqa: PLC0415 - as above
-    from strands_robots.mcp.tokens import Token  # noqa: PLC0415 - as above
 
     host, _, number = http.rpartition(":")
     try:

@@ -18,8 +18,7 @@ from strands_robots.cli.output import CliError, Exit, Screen, progress_bar, tabl
 from strands_robots.errors import RefusalError
 from strands_robots.fleet.adapter import EVERY, Detail
 from strands_robots.recording.cameras import chosen_frames
-from strands_robots.recording.file import Recorder
-from strands_robots.recording.sampling import RobotRecording
+from strands_robots.recording.file import Recorder, RobotRecording
 from strands_robots.utils import identifier, number
 
 if TYPE_CHECKING:

@@ -1,21 +1,30 @@
-"""Access to the page: addresses, origins, tokens and roles.
+"""Access to the page: addresses, certificate, roles, and the operator's key.
 
-A browser sends the name that it was given (Host) and the page that asks (Origin). Both are checked on every request, so
-that neither another site nor a name that was pointed at this machine reaches anything. There is no cookie: a page
-presents its token, or on loopback nothing, as the first message of a WebSocket, which another origin cannot open.
+There is no cookie: a page presents its token, or on loopback nothing, as the first message of a WebSocket, which
+another origin cannot open.
 """
 
 from __future__ import annotations
 
+import hashlib
 import hmac
+import io
 import ipaddress
+import re
 import secrets
+import ssl
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
-from starlette.datastructures import Headers
-from starlette.responses import PlainTextResponse
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from strands_robots.certificates import CA_CERT, CA_KEY, init, issue
+from strands_robots.errors import StrandsRobotsError
+from strands_robots.http_access import HttpRules, bracketed
+from strands_robots.safety.ed25519 import load_signing_key
+from strands_robots.state_files import state_dir
+from strands_robots.utils import ValidationError, is_loopback_host, optional_module, shown
 
 VIEWER, OPERATOR = "viewer", "operator"
 ROLES = (VIEWER, OPERATOR)
@@ -34,41 +43,24 @@ HEADERS = {
     "cache-control": "no-store",
 }
 
-TOO_LONG = 200
+FOLDER = "dashboard-keys"
+SERVED_ANYWAY = frozenset({"127.0.0.1", "localhost"})
+
+WRONG_MAX, PAUSE_S = 5, 30.0
+"""Wrong passphrases after which none is tried for a while."""
 
 
 @dataclass(frozen=True, slots=True)
-class Access:
+class Access(HttpRules):
     """Addresses that the page answers at, and what opens it.
 
     Attributes:
-        origins: of the page, such as ``http://127.0.0.1:8800``.
         tokens: roles by token; without any, a page on loopback has ``local_role``.
         local_role: role of a page on loopback, which needs no token.
     """
 
-    origins: frozenset[str]
     tokens: Mapping[str, str] = field(default_factory=dict, repr=False)
     local_role: str = OPERATOR
-
-    @property
-    def hosts(self) -> frozenset[str]:
-        """The values of Host that the page answers to."""
-        return frozenset(each.partition("://")[2] for each in self.origins)
-
-    def refusal(self, headers: Mapping[str, str], *, websocket: bool) -> str:
-        """Return why a request is refused, or ""."""
-        host, origin = headers.get("host", "").lower(), headers.get("origin")
-        if host not in self.hosts:
-            return f"Host {host[:TOO_LONG]!r} is not an address of this page."
-        if origin is None:
-            if websocket:
-                return "A WebSocket needs an Origin."
-        elif origin.lower() not in self.origins or origin.lower().partition("://")[2] != host:
-            return f"Origin {origin[:TOO_LONG]!r} is not this page."
-        if headers.get("sec-fetch-site", "same-origin") not in ("same-origin", "none"):
-            return "Another site may not use this page."
-        return ""
 
     def role(self, token: object, *, local: bool) -> str | None:
         """Return the role of a page that presents ``token``, or None."""
@@ -95,39 +87,130 @@ def new_token() -> str:
 
 def is_local(client: object) -> bool:
     """Return True for the address of a program on this machine."""
-    host = client[0] if isinstance(client, list | tuple) and client else ""
+    return isinstance(client, list | tuple) and bool(client) and is_loopback_host(str(client[0]))
+
+
+@dataclass(frozen=True, slots=True)
+class RemoteAddress:
+    """An address beyond this machine that the page is served at.
+
+    Attributes:
+        cert, key: files of the certificate for this address.
+        tokens: of the roles, made at each start.
+    """
+
+    host: str
+    port: int
+    cert: Path
+    key: Path
+    tokens: dict[str, str]
+
+    @property
+    def origin(self) -> str:
+        """The page's origin at this address."""
+        return f"https://{bracketed(self.host)}:{self.port}"
+
+    def url(self, role: str) -> str:
+        """Return the address that opens the page with a role.
+
+        The token stands behind the hash, which a browser sends to no server.
+        """
+        return f"{self.origin}/#token={self.tokens[role]}"
+
+    @property
+    def fingerprint(self) -> str:
+        """SHA-256 of the certificate, as browsers show it."""
+        digest = hashlib.sha256(ssl.PEM_cert_to_DER_cert(self.cert.read_text(encoding="ascii"))).hexdigest()
+        return ":".join(digest[at : at + 2] for at in range(0, len(digest), 2)).upper()
+
+
+def remote_address(address: str, port: int) -> RemoteAddress:
+    """Return the address with a certificate of an authority of its own.
+
+    Raises:
+        ValidationError: ``address`` is no address or name of this machine, means all of them, or is where the page
+            is served anyway.
+    """
+    host = address.strip().strip("[]").lower()
     try:
-        return ipaddress.ip_address(str(host)).is_loopback
+        parsed = ipaddress.ip_address(host)
     except ValueError:
-        return False
+        if not re.fullmatch(r"[a-z0-9]([a-z0-9.-]{0,251}[a-z0-9])?", host):
+            raise ValidationError(f"--listen must be an IP address or a host name, not {shown(address)}.") from None
+    else:
+        if parsed.is_unspecified:
+            raise ValidationError(f"--listen must be one address of this machine, not all of them ({address}).")
+    if host in SERVED_ANYWAY:
+        raise ValidationError(f"--listen must be an address besides {host}, where the page is served anyway.")
+    folder = state_dir() / FOLDER
+    if not (folder / CA_CERT).exists() or not (folder / CA_KEY).exists():
+        init(folder, "strands-robots dashboard")
+    name = "page-" + re.sub(r"[^a-z0-9]", "-", host)[:58]
+    cert, key = folder / f"{name}.pem", folder / f"{name}.key"
+    if not (cert.exists() and key.exists()):
+        issue(folder, name, [host])
+    return RemoteAddress(host, port, cert, key, {role: new_token() for role in ROLES})
 
 
-class Guard:
-    """ASGI middleware that refuses strangers and sets the headers of every answer."""
+def access_for(port: int, remote: RemoteAddress | None, *, viewer: bool = False) -> Access:
+    """Return who may open a page on loopback, and at the remote address if any."""
+    origins = loopback_origins(port)
+    local = VIEWER if viewer else OPERATOR
+    if remote is None:
+        return Access(origins, {}, local)
+    return Access(origins | {remote.origin}, {token: role for role, token in remote.tokens.items()}, local)
 
-    def __init__(self, app: ASGIApp, access: Access) -> None:
-        self._app, self._access = app, access
 
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve one connection."""
-        if scope["type"] not in ("http", "websocket"):
-            await self._app(scope, receive, send)
-            return
-        why = self._access.refusal(Headers(scope=scope), websocket=scope["type"] == "websocket")
-        if not why and scope["type"] == "http" and scope["method"] not in ("GET", "HEAD"):
-            why = "Only GET is served."
-        if why and scope["type"] == "websocket":
-            await receive()
-            await send({"type": "websocket.close", "code": 1008})
-            return
+def qr_code(url: str) -> str:
+    """Return a QR code for a terminal, as text."""
+    segno, drawn = optional_module("segno", what="The QR code", extra="dashboard"), io.StringIO()
+    # Light modules are drawn, so that it reads on a dark terminal: two rows of modules a line.
+    segno.make(url, error="l").terminal(drawn, border=2, compact=True)
+    return drawn.getvalue()
 
-        async def with_headers(message: Message) -> None:
-            if message["type"] == "http.response.start":
-                own = [(name.encode(), value.encode()) for name, value in HEADERS.items()]
-                message["headers"] = [*message.get("headers", ()), *own]
-            await send(message)
 
-        if why:
-            await PlainTextResponse(f"{why}\n", 403)(scope, receive, with_headers)
-            return
-        await self._app(scope, receive, with_headers)
+class KeyRefusedError(StrandsRobotsError, RuntimeError):
+    """The operator's key cannot be used; the text says why."""
+
+
+class OperatorKey:
+    """Key file that frees locked robots and takes control.
+
+    It is opened with a passphrase for one act, and not kept.
+
+    Args:
+        path: of the key; None where the server was given none.
+    """
+
+    def __init__(self, path: Path | None) -> None:
+        self._path = path
+        self._wrong, self._until = 0, float("-inf")
+
+    @property
+    def present(self) -> bool:
+        """True where the server was given a key."""
+        return self._path is not None
+
+    def open(self, passphrase: object) -> Any:
+        """Return the private key. Slow on purpose: call it on a thread.
+
+        Raises:
+            KeyRefusedError: there is none, the passphrase does not open it, or too many were wrong.
+        """
+        if self._path is None:
+            raise KeyRefusedError("This page was started without --operator-key.")
+        if time.monotonic() < self._until:
+            raise KeyRefusedError(f"After {WRONG_MAX} wrong passphrases none is tried for {PAUSE_S:g} s.")
+        if not isinstance(passphrase, str) or not passphrase or len(passphrase) > 1000:
+            raise KeyRefusedError("The passphrase of the operator's key is missing.")
+        try:
+            key = load_signing_key(self._path, passphrase)
+        except OSError as exc:
+            raise KeyRefusedError(f"The operator's key cannot be read: {exc.strerror}") from exc
+        except ValueError as exc:
+            self._wrong += 1
+            if self._wrong >= WRONG_MAX:
+                self._wrong, self._until = 0, time.monotonic() + PAUSE_S
+            raise KeyRefusedError("The passphrase does not open the operator's key.") from exc
+        self._wrong = 0
+        return key

@@ -206,16 +206,21 @@ class HandControl:
             held.renewing = asyncio.create_task(self._renew(key, held))
         finally:
             self._taking.discard(key)
-        told = {name: value for name, value in answer.items() if name not in (LEASE_ID, "content")}
-        return {**told, "content": [{"text": _taken(answer)}]} if "taken_from" in answer else told
+        fields = {name: value for name, value in answer.items() if name not in (LEASE_ID, "content")}
+        return {**fields, "content": [{"text": _taken(answer)}]} if "taken_from" in answer else fields
 
     async def give(self, key: str) -> Envelope:
         """Stop what this page jogs there, and give the robot back."""
         held = self._held.get(key)
         if held is None:
             return error("This page does not hold the robot.")
-        await self._end_jog(held, "control was given back")
-        self._forget(key)
+        if held.jog is not None:
+            held.jog.release("control was given back")
+            if held.jog.task is not None:
+                await asyncio.wait([held.jog.task], timeout=ANSWER_S)
+        self._held.pop(key, None)
+        if held.renewing is not None:
+            held.renewing.cancel()
         return await held.robot.call("releaseControl", self._lease_of(held), ANSWER_S)
 
     def begin(self, key: str, message: Mapping[str, Any], units: Mapping[str, str] | None = None) -> str:
@@ -273,8 +278,8 @@ class HandControl:
             return answer
         # A lease that was taken lasts a minute; ours ends soon after this server.
         held = {LEASE_ID: lease, "kind": HUMAN, "ttl_s": LEASE_S, **which}
-        kept = await robot.call("acquireControl", held, ANSWER_S, moves=True)
-        return {**kept, "taken_from": str(before.get("holder", ""))[:128], "signed": signer is not None}
+        acquired = await robot.call("acquireControl", held, ANSWER_S, moves=True)
+        return {**acquired, "taken_from": str(before.get("holder", ""))[:128], "signed": signer is not None}
 
     async def _renew(self, key: str, held: HeldRobot) -> None:
         silent_since: float | None = None
@@ -398,17 +403,6 @@ class HandControl:
         if jog.released.is_set():
             return None
         return call.result()
-
-    async def _end_jog(self, held: HeldRobot, why: str) -> None:
-        if held.jog is not None:
-            held.jog.release(why)
-            if held.jog.task is not None:
-                await asyncio.wait([held.jog.task], timeout=ANSWER_S)
-
-    def _forget(self, key: str) -> None:
-        held = self._held.pop(key, None)
-        if held is not None and held.renewing is not None:
-            held.renewing.cancel()
 
     @staticmethod
     def _lease_of(held: HeldRobot) -> dict[str, str]:

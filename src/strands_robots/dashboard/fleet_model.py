@@ -11,11 +11,10 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
 from itertools import chain
 from typing import Any
 
-from strands_robots.dashboard.history import OVERLAP_S, WINDOW_S, History, plain_values
+from strands_robots.dashboard.history import HISTORY_HZ, OVERLAP_S, WINDOW_S, History, RobotRow, plain_values
 from strands_robots.envelope import jsonable
 from strands_robots.fleet.lockout_report import LockoutReport
 from strands_robots.policies.base import plain_numbers
@@ -26,7 +25,6 @@ ROBOTS_MAX = 2000
 """Rows; further names are not taken, so that invented ones use no memory."""
 
 TEXT_MAX, NAME_MAX = 300, 128
-HISTORY_S, HISTORY_HZ = 30.0, 10.0
 TIMELINE_MAX = 1000
 LOCKOUTS_MAX = 8
 LOCKS_WITHIN_S = 3.0
@@ -40,104 +38,6 @@ CONTROL_TOLD_S = 3.0
 UNSETTLED = frozenset({"not_stopped", "alarm", "refused", "unknown", "claimed"})
 UNANSWERED_S = 1.0
 """Seconds after a stop in which a robot on a second network may still answer it."""
-
-Joints = dict[str, float]
-
-
-@dataclass(slots=True)
-class RobotRow:
-    """One robot of one network.
-
-    Attributes:
-        cell: the cell that it is in, empty for none; None where it did not say, and stops with every cell.
-        locked: None where it did not say, or where its answer does not count; ``doubt`` has the reason.
-        heard: monotonic seconds of the last sign of life; None before the first.
-        stop: its answer to the latest emergency stop, first given at ``stop_at``; ``freed`` once it is not locked by
-            that stop any more.
-        locked_by: the latest emergency stop, once the robot has said that it locks it.
-        load: of its host, as it says it: 1-minute load average over the number of cores.
-        messages: signs of life since the last sample of the history, and ``gap_s`` the longest time between two.
-        units: unit of each joint's position, as its features name it; ``limits`` are in the same.
-        forms: its verbs, as :func:`~strands_robots.dashboard.verb_forms.forms_of` describes them.
-        holdable: its control lease can be acquired.
-        lacking: what a device that is none of ours does not have: a lockout, a lease, a stop.
-        hidden: another row shows the same robot.
-        namesake: another robot of this id has a row, too.
-        changed: number of the model's last change of something that the page shows at once.
-        ticked: the same for what it shows twice a second.
-    """
-
-    key: str
-    network: str
-    id: str
-    kind: str = ""
-    model: str = ""
-    cell: str | None = None
-    task: dict[str, Any] = field(default_factory=dict)
-    locked: bool | None = None
-    lockouts: list[dict[str, Any]] = field(default_factory=list)
-    doubt: str = ""
-    alarm: bool = False
-    stop: dict[str, Any] | None = None
-    stop_at: float = 0.0
-    locked_by: str = ""
-    control: dict[str, Any] = field(default_factory=dict)
-    control_told_at: float = float("-inf")
-    check_in: dict[str, Any] | None = None
-    forms: tuple[Mapping[str, Any], ...] = ()
-    holdable: bool = False
-    lacking: str = ""
-    hidden: bool = False
-    namesake: bool = False
-    limits: dict[str, tuple[float, float]] = field(default_factory=dict)
-    units: dict[str, str] = field(default_factory=dict)
-    cameras: tuple[str, ...] = ()
-    heard: float | None = None
-    link_ms: float | None = None
-    load: float | None = None
-    messages: int = 0
-    gap_s: float = 0.0
-    expected: bool = False
-    changed: int = 0
-    ticked: int = 0
-    joints: dict[str, Joints] = field(default_factory=dict)
-    joints_at: float = 0.0
-    history: deque[tuple[float, dict[str, Joints]]] = field(
-        default_factory=lambda: deque(maxlen=int(HISTORY_S * HISTORY_HZ))
-    )
-    encoded: tuple[int, int, str] = (-1, -1, "")
-
-    def facts(self) -> dict[str, Any]:
-        """Return the row as a card shows it."""
-        verbs = [str(each["name"]) for each in self.forms]
-        return {
-            "key": self.key,
-            "network": self.network,
-            "id": self.id,
-            "kind": self.kind,
-            "model": self.model,
-            "cell": self.cell,
-            "task": self.task,
-            "locked": self.locked,
-            "lockouts": self.lockouts,
-            "doubt": self.doubt,
-            "alarm": self.alarm,
-            "stop": self.stop,
-            "control": self.control,
-            "check_in": self.check_in,
-            "heard": None if self.heard is None else round(self.heard, 3),
-            "link_ms": None if self.link_ms is None else round(self.link_ms, 1),
-            "pictures": "getPicture" in verbs,
-            "expected": self.expected,
-            "lacking": self.lacking,
-            "namesake": self.namesake,
-        }
-
-    def text(self) -> str:
-        """Return :meth:`facts` as JSON, encoded once for each change."""
-        if self.encoded[:2] != (self.changed, self.ticked):
-            self.encoded = (self.changed, self.ticked, json.dumps(self.facts(), allow_nan=False, default=str))
-        return self.encoded[2]
 
 
 class FleetModel:
@@ -266,11 +166,11 @@ class FleetModel:
         """Add a change of the holder that the robot has not just told by an event."""
         with self._lock:
             row = self._rows.get(key_of(network, name))
-            told = row is not None and self.clock() - row.control_told_at < CONTROL_TOLD_S
+            announced = row is not None and self.clock() - row.control_told_at < CONTROL_TOLD_S
             before = row.control if row is not None else {}
         holder, had = control.get("holder"), before.get("holder")
         # What held it before the page came is no change.
-        if not before or not control or told or holder == had:
+        if not before or not control or announced or holder == had:
             return
         if not control["held"]:
             self.note(network, name, "control released", {"by": had})
@@ -421,7 +321,11 @@ class FleetModel:
             ]
             entries = [text for number, text in self._timeline if number > since]
             # A row that was hidden, or forgotten, may be shown again.
-            gone = [key for number, key in self._gone if number > since and not self._shows(key)]
+            gone = [
+                key
+                for number, key in self._gone
+                if number > since and (key not in self._rows or self._rows[key].hidden)
+            ]
             now = self.clock()
             if not rows and not entries and not gone:
                 return self._number, ""
@@ -512,10 +416,6 @@ class FleetModel:
             row.changed = self._next()
             self._keys_of[row.id] = (*self._keys_of.get(row.id, ()), key)
         return row
-
-    def _shows(self, key: str) -> bool:
-        row = self._rows.get(key)
-        return row is not None and not row.hidden
 
     def _note_expected(self, network: str) -> None:
         names = tuple((row.id, row.cell) for row in self._rows.values() if row.network == network and row.expected)

@@ -1,4 +1,4 @@
-"""History of the fleet: states of the last hour, samples of 15 minutes.
+"""Rows of robots, and their history: states of an hour, samples of 15 minutes.
 
 A sample has joints, lag and load. The history lives in the page's server, so a page that is loaded again shows what
 happened before. What a message costs is constant: states are noted when they change, everything else is read from the
@@ -7,11 +7,14 @@ rows once in ``SAMPLE_S``. Every length is bounded, per robot and in all.
 
 from __future__ import annotations
 
+import json
 import math
 from array import array
 from bisect import bisect_right
 from collections import deque
-from typing import Protocol
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
 
 MOVING, STILL, LOCKED, LOCKED_MOVING, SILENT = "m", "s", "l", "x", "q"
 """Moving, still, locked, moving although locked, silent; as they are sent."""
@@ -42,26 +45,112 @@ STOPS_MAX = 1000
 OVERLAP_S = 30.0
 """Seconds that an update goes back: a silence is found after it began."""
 
+HISTORY_S, HISTORY_HZ = 30.0, 10.0
+"""Joints that a row has: for so long, so many times a second."""
+
 NAN = float("nan")
 _BLANK = array("f", [NAN]) * SAMPLES
 
+Joints = dict[str, float]
 
-class Row(Protocol):
-    """The part of a robot's row that the history reads."""
+
+@dataclass(slots=True)
+class RobotRow:
+    """One robot of one network.
+
+    Attributes:
+        cell: the cell that it is in, empty for none; None where it did not say, and stops with every cell.
+        locked: None where it did not say, or where its answer does not count; ``doubt`` has the reason.
+        heard: monotonic seconds of the last sign of life; None before the first.
+        stop: its answer to the latest emergency stop, first given at ``stop_at``; ``freed`` once it is not locked by
+            that stop any more.
+        locked_by: the latest emergency stop, once the robot has said that it locks it.
+        load: of its host, as it says it: 1-minute load average over the number of cores.
+        messages: signs of life since the last sample of the history, and ``gap_s`` the longest time between two.
+        units: unit of each joint's position, as its features name it; ``limits`` are in the same.
+        forms: its verbs, as :func:`~strands_robots.dashboard.feeds.verb_forms` describes them.
+        holdable: its control lease can be acquired.
+        lacking: what a device that is none of ours does not have: a lockout, a lease, a stop.
+        hidden: another row shows the same robot.
+        namesake: another robot of this id has a row, too.
+        changed: number of the model's last change of something that the page shows at once.
+        ticked: the same for what it shows twice a second.
+    """
 
     key: str
-    task: dict[str, object]
-    locked: bool | None
-    heard: float | None
-    link_ms: float | None
-    load: float | None
-    messages: int
-    gap_s: float
-    joints_at: float
-    joints: dict[str, dict[str, float]]
+    network: str
+    id: str
+    kind: str = ""
+    model: str = ""
+    cell: str | None = None
+    task: dict[str, Any] = field(default_factory=dict)
+    locked: bool | None = None
+    lockouts: list[dict[str, Any]] = field(default_factory=list)
+    doubt: str = ""
+    alarm: bool = False
+    stop: dict[str, Any] | None = None
+    stop_at: float = 0.0
+    locked_by: str = ""
+    control: dict[str, Any] = field(default_factory=dict)
+    control_told_at: float = float("-inf")
+    check_in: dict[str, Any] | None = None
+    forms: tuple[Mapping[str, Any], ...] = ()
+    holdable: bool = False
+    lacking: str = ""
+    hidden: bool = False
+    namesake: bool = False
+    limits: dict[str, tuple[float, float]] = field(default_factory=dict)
+    units: dict[str, str] = field(default_factory=dict)
+    cameras: tuple[str, ...] = ()
+    heard: float | None = None
+    link_ms: float | None = None
+    load: float | None = None
+    messages: int = 0
+    gap_s: float = 0.0
+    expected: bool = False
+    changed: int = 0
+    ticked: int = 0
+    joints: dict[str, Joints] = field(default_factory=dict)
+    joints_at: float = 0.0
+    history: deque[tuple[float, dict[str, Joints]]] = field(
+        default_factory=lambda: deque(maxlen=int(HISTORY_S * HISTORY_HZ))
+    )
+    encoded: tuple[int, int, str] = (-1, -1, "")
+
+    def facts(self) -> dict[str, Any]:
+        """Return the row as a card shows it."""
+        verbs = [str(each["name"]) for each in self.forms]
+        return {
+            "key": self.key,
+            "network": self.network,
+            "id": self.id,
+            "kind": self.kind,
+            "model": self.model,
+            "cell": self.cell,
+            "task": self.task,
+            "locked": self.locked,
+            "lockouts": self.lockouts,
+            "doubt": self.doubt,
+            "alarm": self.alarm,
+            "stop": self.stop,
+            "control": self.control,
+            "check_in": self.check_in,
+            "heard": None if self.heard is None else round(self.heard, 3),
+            "link_ms": None if self.link_ms is None else round(self.link_ms, 1),
+            "pictures": "getPicture" in verbs,
+            "expected": self.expected,
+            "lacking": self.lacking,
+            "namesake": self.namesake,
+        }
+
+    def text(self) -> str:
+        """Return :meth:`facts` as JSON, encoded once for each change."""
+        if self.encoded[:2] != (self.changed, self.ticked):
+            self.encoded = (self.changed, self.ticked, json.dumps(self.facts(), allow_nan=False, default=str))
+        return self.encoded[2]
 
 
-def state_of(row: Row) -> str:
+def state_of(row: RobotRow) -> str:
     """Return the state of a robot that is heard; an unknown lockout is none."""
     moving = row.task.get("state") in IN_MOTION
     if row.locked:
@@ -148,13 +237,13 @@ class History:
 
     # Written by the model, in constant time.
 
-    def changed(self, row: Row, now: float) -> None:
+    def changed(self, row: RobotRow, now: float) -> None:
         """Note a robot's state after a change of its row, unless it is silent."""
         states = self._states.get(row.key)
         if row.heard is not None and (states is None or states.letters[-1] != ord(SILENT)):
             self._enter(row.key, state_of(row), now)
 
-    def heard(self, row: Row, before: float | None, now: float) -> None:
+    def heard(self, row: RobotRow, before: float | None, now: float) -> None:
         """Note that a robot was heard now, and a silence since ``before``."""
         if before is not None and now - before > self.silent_s:
             self._enter(row.key, SILENT, before)
@@ -176,7 +265,7 @@ class History:
         self._times[self._count % SAMPLES] = round(now, 3)
         self._count += 1
 
-    def sample(self, row: Row, now: float) -> None:
+    def sample(self, row: RobotRow, now: float) -> None:
         """Take a robot's sample of this time, once; and notice that it is silent."""
         if row.heard is None:
             self._enter(row.key, SILENT, now)

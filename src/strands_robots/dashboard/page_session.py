@@ -15,14 +15,12 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from strands_robots.arm_mixin import WAIT_S
 from strands_robots.bounded_json import json_object
-from strands_robots.dashboard.access import OPERATOR
+from strands_robots.dashboard.access import OPERATOR, KeyRefusedError, OperatorKey
 from strands_robots.dashboard.driving import HandControl
-from strands_robots.dashboard.feed import FleetFeed
+from strands_robots.dashboard.feeds import LEFT_OUT, FleetFeed
 from strands_robots.dashboard.fleet_model import FleetModel
-from strands_robots.dashboard.operator_key import KeyRefusedError, OperatorKey
 from strands_robots.dashboard.page_robots import PageRobot, PageRobots
 from strands_robots.dashboard.pictures import SMALL, SMALL_HZ, Pictures
-from strands_robots.dashboard.verb_forms import LEFT_OUT
 from strands_robots.envelope import Envelope, error, is_error, jsonable, text_of
 from strands_robots.recording.cameras import OVERVIEW
 from strands_robots.safety.stop_notes import Unheard, unheard_now
@@ -171,15 +169,12 @@ class PageSession:
             while not self._waiting.empty():
                 await self._send(self._waiting.get_nowait())
             if self._watched and tick % JOINTS_TICKS == 0:
-                await self._send_joints()
+                joints = model.joints(self._watched, self._joints_at)
+                if joints is not None:
+                    self._joints_at = joints["at"]
+                    await self._send(joints)
                 self._tell_new_forms()
             await asyncio.sleep(TICK_S)
-
-    async def _send_joints(self) -> None:
-        joints = self._server.model.joints(self._watched, self._joints_at)
-        if joints is not None:
-            self._joints_at = joints["at"]
-            await self._send(joints)
 
     def _take(self, payload: str) -> None:
         """Act on one message of the page; none of them makes the next one wait."""
@@ -245,7 +240,7 @@ class PageSession:
     async def _look(self, key: str) -> None:
         """Tell a robot's details, then every change of why its pose is not drawn."""
         looked = False
-        told: str | None = None
+        sent: str | None = None
         while True:
             why = NOT_KNOWN
             with contextlib.suppress(ValidationError):
@@ -256,9 +251,9 @@ class PageSession:
                     self._tell_details(key, looked=True)
                 why = await self._no_pose(key, robot)
                 looked = why != NOT_KNOWN
-            if why != told:
+            if why != sent:
                 self.tell({"type": "pose", "key": key, "why": why})
-            told = why
+            sent = why
             await asyncio.sleep(UNKNOWN_AGAIN_S if why == NOT_KNOWN else POSE_AGAIN_S)
 
     async def _no_pose(self, key: str, robot: PageRobot) -> str:
@@ -379,11 +374,11 @@ class PageSession:
                 outcomes[f"{feed.network}:{name}"] = {"free": free, "said": said[:300]}
                 self._server.model.note(feed.network, name, "resume", {"free": free, "said": said})
         locked = [name for name, each in outcomes.items() if not each["free"]]
-        told: Envelope = {"status": "error" if locked else "success", "robots": outcomes}
+        answer: Envelope = {"status": "error" if locked else "success", "robots": outcomes}
         said = f"Not resumed: {', '.join(locked)}." if locked else "Resumed. They move again when they are told to."
         said = " ".join([said, *(plain_text(str(each)) for each in unheard if each)])
         names = [name for each in unheard for name in each.names]
-        return {**told, "unheard": names, "content": [{"text": said}], **({"reason": said} if locked else {})}
+        return {**answer, "unheard": names, "content": [{"text": said}], **({"reason": said} if locked else {})}
 
     def _unheard(self, feed: FleetFeed) -> Unheard:
         """Return the robots of the roster not heard lately; it reads the disk."""

@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import IO, Any
 
-from strands_robots.utils import ValidationError, choice, mapping, missing_extra, number
+from strands_robots.utils import ValidationError, choice, mapping, number, optional_module
 
 MODELS = ("so100", "so101")
 """Built-in arms; the name comes from a robot, so no other is looked up."""
@@ -29,18 +29,13 @@ class PosePainter:
     """One model in a world of its own, and what draws it."""
 
     def __init__(self, model: str) -> None:
-        try:
-            from strands_robots.kinematics.chain import built_in  # noqa: PLC0415 - MuJoCo may be missing
-            from strands_robots.simulation.model import compile_scene  # noqa: PLC0415 - as above
-            from strands_robots.simulation.physics import Physics  # noqa: PLC0415 - as above
-            from strands_robots.simulation.rendering import Renderer  # noqa: PLC0415 - as above
-            from strands_robots.simulation.scene import (  # noqa: PLC0415 - as above
-                Scene,
-                SceneRobot,
-                find,
-            )
-        except ModuleNotFoundError as exc:
-            raise missing_extra("The 3-D pose", "sim") from exc
+        optional_module("mujoco", what="The 3-D pose", extra="sim")
+        from strands_robots.kinematics.chain import built_in  # noqa: PLC0415 - MuJoCo may be missing
+        from strands_robots.simulation.model import compile_scene  # noqa: PLC0415 - as above
+        from strands_robots.simulation.physics import Physics  # noqa: PLC0415 - as above
+        from strands_robots.simulation.rendering import Renderer  # noqa: PLC0415 - as above
+        from strands_robots.simulation.scene import Scene, SceneRobot, find  # noqa: PLC0415 - as above
+
         self._chain = built_in(model)
         self._snapshot = Physics(compile_scene(Scene().with_robot(SceneRobot(_ARM, find(model))))).snapshot
         self._renderer = Renderer()
@@ -53,12 +48,12 @@ class PosePainter:
         Raises:
             ValidationError: a joint is missing or no number.
         """
-        told = mapping("joints", joints)
+        degrees = mapping("joints", joints)
         found = {}
         for joint in self._chain.joints:
-            if joint.name not in told:
+            if joint.name not in degrees:
                 raise ValidationError(f"The robot does not report its joint {joint.name}.")
-            found[joint.name] = math.radians(number(joint.name, told[joint.name], low=-7200, high=7200))
+            found[joint.name] = math.radians(number(joint.name, degrees[joint.name], low=-7200, high=7200))
         jaw = self._chain.gripper
         if jaw is not None and gripper is not None:
             opening = number("gripper", gripper, low=0, high=1)

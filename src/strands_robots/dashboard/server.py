@@ -9,7 +9,7 @@ import logging
 import math
 import socket
 import time
-from collections.abc import AsyncIterator, Callable, Iterable
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -24,16 +24,14 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from strands_robots import audit
 from strands_robots.audit.journal import NAME as AUDIT_FILE
-from strands_robots.dashboard.access import Access, Guard, is_local
-from strands_robots.dashboard.emergency import FleetStop
-from strands_robots.dashboard.feed import poll_interval
-from strands_robots.dashboard.feeds import Feeds
+from strands_robots.dashboard.access import HEADERS, Access, OperatorKey, is_local
+from strands_robots.dashboard.feeds import Feeds, poll_interval
 from strands_robots.dashboard.fleet_model import FleetModel
 from strands_robots.dashboard.history import SAMPLE_S, SILENT_S
-from strands_robots.dashboard.operator_key import OperatorKey
-from strands_robots.dashboard.page_robots import PageRobots
+from strands_robots.dashboard.page_robots import FleetStop, PageRobots
 from strands_robots.dashboard.page_session import PageSession, Shared
 from strands_robots.dashboard.pictures import BOUNDARY, mjpeg
+from strands_robots.http_access import Guard
 
 logger = logging.getLogger(__name__)
 
@@ -99,9 +97,10 @@ class Dashboard:
             Route("/camera", self._camera),
             Route("/history", self._history),
             Route("/series", self._series),
-            *(Route(f"/{name}", _file(path)) for name, path in _files().items()),
+            Route("/", _file(STATIC / "index.html")),
+            *(Route(f"/{each.name}", _file(each)) for each in sorted(STATIC.iterdir()) if each.suffix in TYPES),
         ]
-        return Guard(Starlette(routes=routes, lifespan=self._lifespan), self.access)
+        return Guard(Starlette(routes=routes, lifespan=self._lifespan), self.access, HEADERS, ("GET", "HEAD"))
 
     def close(self) -> None:
         """Give up a running stop and leave the networks."""
@@ -114,8 +113,8 @@ class Dashboard:
 
     @contextlib.asynccontextmanager
     async def _lifespan(self, _: Starlette) -> AsyncIterator[None]:
-        tasks = [asyncio.create_task(self._refresh()), asyncio.create_task(self._follow_audit())]
-        tasks += [asyncio.create_task(self._sample()), asyncio.create_task(self._look())]
+        work = (self._refresh_stop(), self._find_shared_ids(), self._sample(), self._follow_audit())
+        tasks = [asyncio.create_task(each) for each in work]
         try:
             yield
         finally:
@@ -123,21 +122,17 @@ class Dashboard:
                 task.cancel()
             self.end_pictures()
 
-    async def _refresh(self) -> None:
+    async def _refresh_stop(self) -> None:
         while True:
-            try:
+            with _logged("The answers to a stop could not be read."):
                 self.stop.refresh()
-            except Exception:
-                logger.exception("The answers to a stop could not be read.")
             await asyncio.sleep(REFRESH_S if self.stop.running else 5 * REFRESH_S)
 
-    async def _look(self) -> None:
+    async def _find_shared_ids(self) -> None:
         """Find which rows are of one robot."""
         while True:
-            try:
+            with _logged("Robots that are on several networks could not be looked at."):
                 self.robots.look({key for each in self._sessions.values() for key in each.in_use})
-            except Exception:
-                logger.exception("Robots that are on several networks could not be looked at.")
             await asyncio.sleep(LOOK_S)
 
     async def _sample(self) -> None:
@@ -145,15 +140,13 @@ class Dashboard:
         clock = asyncio.get_running_loop().time
         due = clock()
         while True:
-            try:
+            with _logged("A sample of the fleet's history could not be taken."):
                 keys = self.model.begin_sample()
                 # A robot of a large fleet that does nothing is asked less often.
                 self.model.history.silent_s = SILENT_S + poll_interval(len(keys))
                 for first in range(0, len(keys), SAMPLED_AT_ONCE):
                     self.model.sample(keys[first : first + SAMPLED_AT_ONCE])
                     await asyncio.sleep(0)
-            except Exception:
-                logger.exception("A sample of the fleet's history could not be taken.")
             due = max(due + SAMPLE_S, clock())
             await asyncio.sleep(due - clock())
 
@@ -234,12 +227,12 @@ class Dashboard:
             telling.cancel()
 
     async def _tell_link(self, socket: WebSocket) -> None:
-        clock, told, due = asyncio.get_running_loop().time, None, 0.0
+        clock, sent, due = asyncio.get_running_loop().time, None, 0.0
         with contextlib.suppress(RuntimeError, WebSocketDisconnect):
             while True:
                 state = self.stop.state()
-                if state["can_stop"] is not told or clock() >= due:
-                    told, due = state["can_stop"], clock() + LINK_S
+                if state["can_stop"] is not sent or clock() >= due:
+                    sent, due = state["can_stop"], clock() + LINK_S
                     await socket.send_text(json.dumps(state, allow_nan=False))
                 await asyncio.sleep(LINK_LOOK_S)
 
@@ -322,10 +315,13 @@ def configured(app: ASGIApp, host: str, port: int, **tls: Any) -> uvicorn.Config
     )
 
 
-def _files() -> dict[str, Path]:
-    """Return the page's files by their path below the root."""
-    found = {path.name: path for path in sorted(STATIC.iterdir()) if path.suffix in TYPES}
-    return {"": found["index.html"], **found}
+@contextlib.contextmanager
+def _logged(problem: str) -> Iterator[None]:
+    """Log what the block raises: the page goes on, and the next time may succeed."""
+    try:
+        yield
+    except Exception:
+        logger.exception(problem)
 
 
 def _file(path: Path) -> Any:

@@ -15,9 +15,7 @@ the framework names the [device-connect] extra when that is missing.
 from __future__ import annotations
 
 import sys
-import threading
 from importlib import import_module
-from importlib.util import find_spec, module_from_spec
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -29,8 +27,7 @@ if TYPE_CHECKING:
         init_device_connect_sync,
         stop_device_connect,
     )
-    from strands_robots.device_connect.client import FleetClient
-    from strands_robots.device_connect.links import connect_agent
+    from strands_robots.device_connect.client import FleetClient, connect_agent
     from strands_robots.device_connect.process import LOOP_JOIN_TIMEOUT_S as _LOOP_JOIN_TIMEOUT_S
     from strands_robots.device_connect.process import StopSignal
     from strands_robots.device_connect.reachy_mini_driver import ReachyMiniDriver
@@ -67,7 +64,7 @@ _HOMES = {
     "RobotDeviceDriver": f"{_HERE}.robot_driver",
     "SimulationDeviceDriver": f"{_HERE}.simulation_driver",
     "StopSignal": f"{_HERE}.process",
-    "connect_agent": f"{_HERE}.links",
+    "connect_agent": f"{_HERE}.client",
     "init_device_connect": f"{_HERE}.bringup",
     "init_device_connect_sync": f"{_HERE}.bringup",
     "link_from_environment": f"{_HERE}.backends",
@@ -106,6 +103,9 @@ def load_when_used() -> None:
     For processes of our own alone: an application may rely on what the import does. Nothing happens where the package
     is imported already or is not installed.
     """
+    import threading  # noqa: PLC0415 - importing this package costs next to nothing
+    from importlib.util import find_spec, module_from_spec  # noqa: PLC0415 - as above
+
     spec = None if _FRAMEWORK[0] in sys.modules else find_spec(_FRAMEWORK[0])
     if spec is None or spec.loader is None:
         return

@@ -26,8 +26,8 @@ from strands_robots.contract import body_of, holds_robots
 from strands_robots.device_connect._compat import Runtime
 from strands_robots.device_connect.backends import LinkConfig
 from strands_robots.device_connect.backends.base import NoResponderError
+from strands_robots.device_connect.backends.config import insecure_opt_in, link_for
 from strands_robots.device_connect.base_driver import RobotDriver
-from strands_robots.device_connect.links import insecure_opt_in, link_for
 from strands_robots.device_connect.presence import encoded_capabilities
 from strands_robots.device_connect.process import LOOP_JOIN_TIMEOUT_S, DeviceLoop, enter_loop
 from strands_robots.device_connect.robot_driver import (

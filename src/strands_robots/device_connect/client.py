@@ -7,6 +7,7 @@ Device Connect.
 from __future__ import annotations
 
 import asyncio
+import atexit
 import contextlib
 import json
 import queue
@@ -20,11 +21,12 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 from device_connect_edge.messaging.exceptions import MessagingError, NotConnectedError, RequestTimeoutError
 
+from strands_robots import settings
 from strands_robots.bounded_json import LONG_MAX, json_object
 from strands_robots.device_connect.backends import LinkConfig, open_client
 from strands_robots.device_connect.backends.base import NoResponderError, ResponderLostError
+from strands_robots.device_connect.backends.config import network_of, usual_link
 from strands_robots.device_connect.discovery import DESCRIBE_S, HEARTBEATS_S, Discovery, Peer, parts
-from strands_robots.device_connect.links import network_of
 from strands_robots.device_connect.process import LOOP_JOIN_TIMEOUT_S, EventLoopThread
 from strands_robots.envelope import Envelope, error
 from strands_robots.errors import StrandsRobotsError
@@ -442,6 +444,27 @@ class FleetClient:
         if grade(answer) is Outcome.STOPPED:
             return answer
         return answer if answer.get("status") == "error" else error(explain(answer), stopped=None, answer=answer)
+
+
+def connect_agent(**options: Any) -> None:
+    """Connect the framework's ``discover`` and ``invoke`` to our robots.
+
+    Where the environment names no network, they are those of this machine. The end of the process disconnects: the
+    framework's own thread, which the interpreter would end inside Zenoh, could abort the process.
+
+    Args:
+        options: of ``device_connect_agent_tools.connect``, such as ``request_timeout``.
+    """
+    from device_connect_agent_tools import connect, disconnect  # noqa: PLC0415 - loaded when an agent connects
+
+    link = usual_link()
+    if link.meeting_point:
+        settings.put("ZENOH_CONNECT", link.meeting_point)
+        if not settings.is_set("DEVICE_CONNECT_DISCOVERY_MODE"):
+            settings.put("DEVICE_CONNECT_DISCOVERY_MODE", "d2d")
+    atexit.unregister(disconnect)
+    atexit.register(disconnect)
+    connect(**options)
 
 
 class EventSubscription:

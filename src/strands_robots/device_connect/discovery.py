@@ -21,7 +21,7 @@ from device_connect_edge.messaging.exceptions import MessagingError
 from strands_robots import settings
 from strands_robots.bounded_json import json_object
 from strands_robots.device_connect.backends.base import Backend, NoResponderError, UnreadableReplyError
-from strands_robots.device_connect.links import network_of
+from strands_robots.device_connect.backends.config import network_of
 from strands_robots.device_connect.presence import HEARTBEAT_S, PROCESS_HEARTBEAT_S, devices_in
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety.sightings import sightings

@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 from strands_robots.device_connect.backends import LinkConfig
-from strands_robots.device_connect.links import enrolled_robots, network_of, usual_link
+from strands_robots.device_connect.backends.config import enrolled_robots, network_of, usual_link
 from strands_robots.device_connect.stop_link import stop_link
 from strands_robots.envelope import Envelope, error, success, text_of
 from strands_robots.safety.answers import StopReport

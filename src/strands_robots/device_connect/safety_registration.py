@@ -15,8 +15,8 @@ from device_connect_edge.messaging.exceptions import MessagingError
 from strands_robots.contract import Haltable, body_of
 from strands_robots.device_connect._compat import link_of, stated_id
 from strands_robots.device_connect.backends import LinkConfig
+from strands_robots.device_connect.backends.config import network_of
 from strands_robots.device_connect.discovery import parts
-from strands_robots.device_connect.links import network_of
 from strands_robots.device_connect.stop_link import NoStopLink, stop_link
 from strands_robots.envelope import Envelope
 from strands_robots.safety.estop_listener import ListenerRegistration, estop_listener

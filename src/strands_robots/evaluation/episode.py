@@ -1,23 +1,27 @@
-"""One episode: a task in a world of its own, stepped by hand in the control loop."""
+"""Episodes: a task in a world that is stepped by hand, and the report of many."""
 
 from __future__ import annotations
 
+import math
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
+from statistics import median
 from typing import Any
+from xml.sax.saxutils import escape
 
 import numpy as np
 
 from strands_robots.contract import RolloutEvent
 from strands_robots.envelope import is_error
-from strands_robots.evaluation.expert import EXPERT, ExpertPolicy
 from strands_robots.evaluation.tasks import ROBOT, EvaluationTask, task_of
+from strands_robots.kinematics.motion import Motion
+from strands_robots.kinematics.moves import Start
 from strands_robots.policies import create_policy
-from strands_robots.policies.base import Action, Policy, Ranges
+from strands_robots.policies.base import Action, Policy, PolicyError, Ranges, numbers
 from strands_robots.policies.check import RobotFacts
 from strands_robots.policies.profiled import ProfiledPolicy
 from strands_robots.policies.rollout import Clock, Rollout, RolloutObservers
@@ -26,11 +30,79 @@ from strands_robots.safety.gate import Permit
 from strands_robots.simulation.world import Simulation
 from strands_robots.utils import ValidationError
 
+EXPERT = "expert:"
+"""Prefix of the name of a scripted expert, before that of its task."""
+
+SPEED = 0.5
+"""Share of full speed at which an expert moves."""
+
 HZ = 50.0
 """Control rate of an episode, unless another is asked for."""
 
 KEPT_STEPS = 10
 """Control steps for which the goal must be reached without a break."""
+
+Z95 = 1.959964
+"""Quantile of the normal distribution for 95 %."""
+
+HEADINGS = ("policy", "episodes", "success", "95 % interval", "median time of a success")
+
+_ROW, _LEFT, _WIDTH, _TOP = 34, 190, 420, 54
+"""Pixels of the plot."""
+
+
+class ExpertPolicy:
+    """Policy that plays planned motions, one after another.
+
+    Args:
+        task: whose motions are planned.
+        world: where it is set up.
+        hz: control rate.
+    """
+
+    uses_cameras = False
+
+    def __init__(self, task: EvaluationTask, world: Simulation, hz: float) -> None:
+        self._task = task
+        self._world = world
+        self._hz = hz
+        self._step = 0
+        self._motion: Motion | None = None
+
+    def reset(self, instruction: str, ranges: Ranges) -> None:
+        self._step, self._motion = 0, None
+
+    def act(self, observation: Mapping[str, Any]) -> Action | Any | None:
+        """Return what the present motion says; plan the next one at its end.
+
+        Raises:
+            PolicyError: there is no way.
+        """
+        while True:
+            if self._motion is not None:
+                action = self._motion.act(observation)
+                if action is not None:
+                    return action
+                self._step += 1
+            try:
+                self._motion = self._task.plan(self._step, self._start(observation), self._world)
+            except ValidationError as exc:
+                raise PolicyError(f"the expert has no plan: {exc}") from exc
+            if self._motion is None:
+                return None
+            self._motion.clock = self._world.body(ROBOT).clock
+
+    def interrupt(self) -> None:
+        """Do nothing: this policy never waits."""
+
+    def close(self) -> None:
+        """Do nothing: this policy has no resources."""
+
+    def _start(self, observation: Mapping[str, Any]) -> Start:
+        body = self._world.body(ROBOT)
+        arm = body.arm
+        state = arm.state(numbers(observation)).told(arm.told(body.targets))
+        return Start(arm, state, self._hz, SPEED)
 
 
 @dataclass(frozen=True)
@@ -247,3 +319,59 @@ class _Recording:
             name = "policyComplete"
             payload |= {"steps": event.step, "state": event.state, "error": event.error, "loop": dict(event.loop)}
         self._recorder.take(self._device, name, payload, at=self._begun + self._clock.now())
+
+
+def wilson(successes: int, episodes: int) -> tuple[float, float]:
+    """Return Wilson's score interval (95 %) of a success rate, from 0 to 1."""
+    if episodes == 0:
+        return 0.0, 1.0
+    share, square = successes / episodes, Z95**2
+    centre = (share + square / (2 * episodes)) / (1 + square / episodes)
+    spread = Z95 * math.sqrt(share * (1 - share) / episodes + square / (4 * episodes**2)) / (1 + square / episodes)
+    # At the ends rounding may leave the interval by 1e-17.
+    low, high = max(0.0, centre - spread), min(1.0, centre + spread)
+    return (0.0 if successes == 0 else low), (1.0 if successes == episodes else high)
+
+
+Outcomes = Mapping[str, Sequence[Episode]]
+"""Episodes by policy."""
+
+
+def rows_of(outcomes: Outcomes) -> list[tuple[str, ...]]:
+    """Return a row for each policy, as :data:`HEADINGS` name its columns."""
+    rows: list[tuple[str, ...]] = []
+    for policy, episodes in outcomes.items():
+        good = [each for each in episodes if each.success]
+        low, high = wilson(len(good), len(episodes))
+        took = f"{median(each.seconds for each in good):.1f} s" if good else "-"
+        share = f"{100 * len(good) / max(1, len(episodes)):.0f} %"
+        rows.append((policy, str(len(episodes)), share, f"{100 * low:.0f} to {100 * high:.0f} %", took))
+    return rows
+
+
+def table_of(outcomes: Outcomes) -> str:
+    """Return the rows as a Markdown table."""
+    lines = [HEADINGS, tuple("---" for _ in HEADINGS), *rows_of(outcomes)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def write_plot(path: Path, title: str, outcomes: Outcomes) -> None:
+    """Draw the success rate of each policy with its interval, as SVG."""
+    height = _TOP + _ROW * len(outcomes) + 40
+    parts = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{_LEFT + _WIDTH + 60}" height="{height}" '
+        'font-family="sans-serif" font-size="13">',
+        f'<rect width="100%" height="100%" fill="white"/><text x="16" y="26" font-size="16">{escape(title)}</text>',
+    ]
+    for percent in range(0, 101, 25):
+        x = _LEFT + _WIDTH * percent / 100
+        parts.append(f'<path d="M{x} {_TOP - 8}V{height - 34}" stroke="#dddddd"/>')
+        parts.append(f'<text x="{x}" y="{height - 16}" text-anchor="middle">{percent} %</text>')
+    for index, (policy, episodes) in enumerate(outcomes.items()):
+        good = sum(each.success for each in episodes)
+        low, high = (_LEFT + _WIDTH * each for each in wilson(good, len(episodes)))
+        y, x = _TOP + _ROW * index + 10, _LEFT + _WIDTH * good / max(1, len(episodes))
+        parts.append(f'<text x="16" y="{y + 5}">{escape(policy)}</text>')
+        parts.append(f'<path d="M{low:.1f} {y}H{high:.1f}" stroke="#1f5a94" stroke-width="3"/>')
+        parts.append(f'<circle cx="{x:.1f}" cy="{y}" r="6" fill="#1f5a94"/>')
+    path.write_text("\n".join([*parts, "</svg>", ""]), encoding="utf-8")

@@ -130,7 +130,7 @@ class LinkFlags:
         if self.alone:
             link = backends.link_from_environment(tenant, credentials_file=self.credentials, alone=True)
             return link
-        from strands_robots.device_connect.links import usual_link  # noqa: PLC0415 - loaded when a network is used
+        from strands_robots.device_connect.backends.config import usual_link  # noqa: PLC0415 - loaded when a network is used
 
         return usual_link(tenant, self.port, self.credentials)
 

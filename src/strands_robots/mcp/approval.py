@@ -34,8 +34,7 @@ from strands_robots.envelope import Envelope, error, is_error
 from strands_robots.errors import ApprovalError
 from strands_robots.fleet.adapter import ReceivedCall
 from strands_robots.fleet.refusals import refusal_of
-from strands_robots.mcp.access import ClientAccess
-from strands_robots.mcp.caller import Caller
+from strands_robots.mcp.caller import Caller, ClientAccess
 from strands_robots.mcp.results import jpeg_of, result
 from strands_robots.safety.authorization import Approval, Grants, digest
 from strands_robots.serving.arm_verbs import ARM_MOTION_VERBS
@@ -193,8 +192,8 @@ async def _question(access: ClientAccess, robot: str, verb: str, params: Mapping
     pose = await access.caller.call(robot, "getPose", named)
     seen = await access.caller.call(robot, "getPicture", {"width": 640, "height": 480})
     # Of a verb of the robot's own nothing is known, so that all of it is shown.
-    told = {"speed", "wait"} if verb in KNOWN else set[str]()
-    asked = json.dumps({name: value for name, value in params.items() if name not in told}, default=str)
+    described = {"speed", "wait"} if verb in KNOWN else set[str]()
+    asked = json.dumps({name: value for name, value in params.items() if name not in described}, default=str)
     cut = f"... ({len(asked)} characters)" if len(asked) > SHOWN_MAX else ""
     lines = [
         f"Let the real robot {json.dumps(robot)} move?",

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 import secrets
+import tempfile
 import time
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import anyio
@@ -16,7 +20,7 @@ import anyio
 from strands_robots.arm_mixin import WAIT_S
 from strands_robots.contract import RUNNING
 from strands_robots.envelope import Envelope, error, is_error, success, text_of
-from strands_robots.errors import NoAnswerError, NoSuchRobotError, RefusalError, UnreachableError
+from strands_robots.errors import NoAnswerError, NoSuchRobotError, RefusalError, StrandsRobotsError, UnreachableError
 from strands_robots.fleet.adapter import FoundRobot, NetworkAdapter, ReceivedCall
 from strands_robots.fleet.all_stops import answer_of, estop_all, stop_all
 from strands_robots.fleet.fleet_verdict import FleetVerdict
@@ -24,13 +28,18 @@ from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.refusals import LEASE_CODES, said
 from strands_robots.fleet.robot_task import runs
 from strands_robots.fleet.stop_answers import answer_of_bearers
-from strands_robots.mcp.queries import NoTurnError, Queries
 from strands_robots.mcp.results import refused
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.safety.stopping import Outcome, grade
 from strands_robots.serving.advertised import AdvertisedVerb, find_verb
 from strands_robots.serving.verbs import LEASE_ID, LEASE_NAMES, LEASE_TTL_S, TTL_MAX_S, TTL_MIN_S
 from strands_robots.utils import ValidationError, number
+
+AT_ONCE = 8
+"""Reads of one client that a robot has at a time; it carries out four."""
+
+WAITING_MAX = 1024
+"""Reads of one client that wait for a turn, of all robots together."""
 
 ANSWER_S = 10.0
 """Longest wait for the answer to a call that does not wait for a motion."""
@@ -63,6 +72,104 @@ OUT_OF_SIGHT = (NoAnswerError, NoSuchRobotError, UnreachableError)
 
 Target = tuple[str, str]
 """A robot's id, and the name of one robot of its world or nothing."""
+
+
+class NoTurnError(StrandsRobotsError, RuntimeError):
+    """A read got no turn in its time, or too many wait; the text says which."""
+
+
+@dataclass(slots=True)
+class _RobotReads:
+    turns: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(AT_ONCE))
+    number: int = 0
+
+
+class Queries:
+    """Reads of one client that run or wait.
+
+    A robot has room for a few dozen reads of all its callers together and refuses the next one. A client that asks a
+    hundred at once therefore has them sent a few at a time, and leaves the rest of the room to others.
+    """
+
+    def __init__(self) -> None:
+        self._robots: dict[str, _RobotReads] = {}
+        self._waiting = 0
+
+    @asynccontextmanager
+    async def turn(self, robot: str, within: float) -> AsyncIterator[None]:
+        """Wait for a turn at a robot, and keep it for the length of the block.
+
+        Raises:
+            NoTurnError: none within ``within`` seconds, or too many reads wait.
+        """
+        if self._waiting >= WAITING_MAX:
+            raise NoTurnError(f"{WAITING_MAX} reads of this client wait already; try again later.")
+        # A name is forgotten with its last read, so that made-up ones take no memory.
+        robot_reads = self._robots.setdefault(robot, _RobotReads())
+        robot_reads.number += 1
+        try:
+            await self._turn_of(robot_reads, within)
+            try:
+                yield
+            finally:
+                robot_reads.turns.release()
+        finally:
+            robot_reads.number -= 1
+            if not robot_reads.number:
+                del self._robots[robot]
+
+    async def _turn_of(self, robot_reads: _RobotReads, within: float) -> None:
+        self._waiting += 1
+        try:
+            async with asyncio.timeout(within):
+                await robot_reads.turns.acquire()
+        except TimeoutError:
+            raise NoTurnError(f"The robot did not answer this client's earlier reads within {within:g} s.") from None
+        finally:
+            self._waiting -= 1
+
+
+@dataclass(frozen=True)
+class ClientAccess:
+    """One client as the tools see it.
+
+    Attributes:
+        approves: whether the yes of the client's user is the operator's approval of a motion.
+        show_picture: makes a JPEG readable for that user and returns its address.
+    """
+
+    caller: Caller
+    approves: bool
+    show_picture: Callable[[bytes], str]
+
+
+AccessOf = Callable[[Any], ClientAccess]
+"""Returns the access of the client that sent a request."""
+
+
+class PictureFiles:
+    """Pictures for a user on this machine, as files; the newest ones are kept."""
+
+    KEPT = 8
+
+    def __init__(self) -> None:
+        self._folder = tempfile.TemporaryDirectory(prefix="strands-robots-mcp-")
+        self._files: list[Path] = []
+
+    def show(self, jpeg: bytes) -> str:
+        """Write a picture; return its address."""
+        descriptor, name = tempfile.mkstemp(suffix=".jpg", dir=self._folder.name)
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(jpeg)
+        path = Path(name)
+        self._files.append(path)
+        while len(self._files) > self.KEPT:
+            self._files.pop(0).unlink(missing_ok=True)
+        return path.as_uri()
+
+    def close(self) -> None:
+        """Remove the files."""
+        self._folder.cleanup()
 
 
 @dataclass
@@ -206,18 +313,18 @@ class Caller:
         params = acquire_arguments(lasts, robot_name)
         # While a motion of its own runs, the secret of that motion says that the robot is this client's.
         moves = any(each == robot for each, _ in self._moving.values())
-        own = self._lease(target) or ({LEASE_ID: self._secret(robot)} if moves else {})
-        answer = await self.call(robot, "acquireControl", {**params, **own}, moves=True)
+        lease = self._lease(target) or ({LEASE_ID: self._secret(robot)} if moves else {})
+        answer = await self.call(robot, "acquireControl", {**params, **lease}, moves=True)
         lease_id = answer.get(LEASE_ID)
         # The secret stays here: a model has no use for it.
-        told = {name: value for name, value in answer.items() if name != LEASE_ID}
+        fields = {name: value for name, value in answer.items() if name != LEASE_ID}
         if is_error(answer) or not isinstance(lease_id, str):
-            return told
+            return fields
         one = robot, str(answer.get("robot_name", target[1]))
         self._forget(one)
         held = self._leases[one] = _Held(lease_id, lasts)
         held.renewing = asyncio.ensure_future(self._keep(one, held, at_robot / RENEWALS))
-        return {**told, **success(f"Held until it is released, or {lasts:g} s after this client went away.")} | {
+        return {**fields, **success(f"Held until it is released, or {lasts:g} s after this client went away.")} | {
             "expires_in_s": lasts
         }
 

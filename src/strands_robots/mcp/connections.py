@@ -1,4 +1,4 @@
-"""Connections of the HTTP server: deadlines, bounds, a reserve for stops.
+"""Connections and sessions of the HTTP server: bounds, a reserve for stops.
 
 uvicorn waits for a header and a body as long as the client likes, so half-sent requests could fill the process until no
 stop of a true client finds a place. Here each connection has a deadline in every part of a request, those that have
@@ -14,8 +14,10 @@ import ipaddress
 import logging
 import re
 import socket
+import time
 from collections import Counter
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
 from enum import Enum
 from itertools import chain, islice
 from typing import Any
@@ -24,7 +26,9 @@ import h11
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from strands_robots.mcp._compat import end_session
 from strands_robots.mcp.server import MESSAGE_MAX
+from strands_robots.serving.verbs import TTL_MAX_S
 
 logger = logging.getLogger(__name__)
 
@@ -68,6 +72,15 @@ RETRY_S = 0.05
 
 KEEPALIVE = {"TCP_KEEPIDLE": 2, "TCP_KEEPINTVL": 1, "TCP_KEEPCNT": 3, "TCP_USER_TIMEOUT": 5000}
 """Options of a connection: its client's machine is gone after 5 s without a sign."""
+
+SESSION_IDLE_S = TTL_MAX_S + 300.0
+"""Seconds without a request after which a session is ended; every lease of its client has ended before."""
+
+SESSIONS_OF_TOKEN_MAX = 32
+"""Sessions of one token; beyond it the idle one that is missed least is ended."""
+
+SESSIONS_MAX = 256
+"""Sessions of all tokens; beyond it one of the token that has the most is ended."""
 
 
 class Phase(Enum):
@@ -211,21 +224,21 @@ class Connections:
             self.leave(connection)
             connection.owner = owner
             self._owned.setdefault(owner, {})[connection] = None
-        own = self._owned[owner]
-        if len(own) > TOKEN_MAX:
-            _give_way(own, connection)
+        owned = self._owned[owner]
+        if len(owned) > TOKEN_MAX:
+            _give_way(owned, connection)
         if self._total > TOTAL_MAX:
             _give_way(list(chain.from_iterable(self._owned.values())), connection)
-        if len(own) > TOKEN_MAX + RESERVE or self._total > TOTAL_MAX + RESERVE:
+        if len(owned) > TOKEN_MAX + RESERVE or self._total > TOTAL_MAX + RESERVE:
             return Capacity.NONE
-        return Capacity.ANY if connection in islice(own, TOKEN_MAX) and self._total <= TOTAL_MAX else Capacity.STOPS
+        return Capacity.ANY if connection in islice(owned, TOKEN_MAX) and self._total <= TOTAL_MAX else Capacity.STOPS
 
     def leave(self, connection: HttpConnection) -> None:
         """Forget a connection."""
         self._strangers.pop(connection, None)
-        own = self._owned.get(connection.owner, {})
-        own.pop(connection, None)
-        if not own:
+        owned = self._owned.get(connection.owner, {})
+        owned.pop(connection, None)
+        if not owned:
             self._owned.pop(connection.owner, None)
 
     def give_up_one(self) -> None:
@@ -345,3 +358,74 @@ def _give_way(connections: Iterable[HttpConnection], to: HttpConnection) -> None
     others = [each for each in connections if each is not to and each.phase in GIVES_WAY]
     if others:
         min(others, key=lambda each: GIVES_WAY.index(each.phase)).cut()
+
+
+@dataclass
+class _Session:
+    owner: str
+    used_at: float = field(default_factory=time.monotonic)
+    uses: int = 1
+    open: int = 0
+
+
+class Sessions:
+    """Sessions that the SDK's manager keeps, within bounds: it ends none by itself.
+
+    A session in which a request is open, a stream or a call, is never ended here. Its end halts nothing: what its
+    client holds and moves ends with the client's leases, which last shorter than an idle session.
+
+    Args:
+        manager: the SDK's ``StreamableHTTPSessionManager``.
+    """
+
+    def __init__(self, manager: Any) -> None:
+        self.manager = manager
+        self._sessions: dict[str, _Session] = {}
+
+    def __len__(self) -> int:
+        return len(self._sessions)
+
+    def begin(self, session_id: str, owner: str) -> None:
+        """Note a request in a session that is the owner's."""
+        session = self._sessions.get(session_id)
+        if session is not None and session.owner == owner:
+            session.open += 1
+            session.uses += 1
+
+    def end(self, session_id: str, owner: str) -> None:
+        """Note the end of that request."""
+        session = self._sessions.get(session_id)
+        if session is not None and session.owner == owner:
+            session.open -= 1
+            session.used_at = time.monotonic()
+
+    async def opened(self, session_id: str, owner: str) -> None:
+        """Keep a new session; an idle one may be ended for it."""
+        self._sessions[session_id] = _Session(owner)
+        counts = Counter(each.owner for each in self._sessions.values())
+        if counts[owner] > SESSIONS_OF_TOKEN_MAX:
+            await self._end_one(owner, session_id)
+        elif len(self._sessions) > SESSIONS_MAX:
+            await self._end_one(counts.most_common(1)[0][0], session_id)
+
+    async def close(self, session_id: str) -> None:
+        """End a session."""
+        self._sessions.pop(session_id, None)
+        await end_session(self.manager, session_id)
+
+    async def close_idle(self) -> None:
+        """End the sessions that nobody has used for long."""
+        before = time.monotonic() - SESSION_IDLE_S
+        for session_id, session in tuple(self._sessions.items()):
+            if not session.open and session.used_at < before:
+                await self.close(session_id)
+
+    async def _end_one(self, owner: str, new: str) -> None:
+        idle = {
+            session_id: (each.uses > 1, each.used_at)
+            for session_id, each in self._sessions.items()
+            if each.owner == owner and not each.open and session_id != new
+        }
+        if idle:
+            # One that was never used after its beginning goes first, so that a flood of them ends no client's.
+            await self.close(min(idle, key=lambda each: idle[each]))

@@ -19,22 +19,18 @@ import anyio
 import uvicorn
 from mcp.server.auth.middleware.bearer_auth import AuthenticatedUser
 from mcp.server.auth.provider import AccessToken
-from mcp.server.transport_security import TransportSecurityMiddleware, TransportSecuritySettings
-from starlette.requests import Request
+from mcp.server.transport_security import TransportSecuritySettings
 from starlette.responses import JSONResponse, Response
 from starlette.types import Message, Receive, Scope, Send
 
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.fleet.networks import Networks
-from strands_robots.mcp.access import ClientAccess
+from strands_robots.http_access import Guard, HttpRules, Token, TokenFile, bracketed
 from strands_robots.mcp.approval import Approvals
-from strands_robots.mcp.caller import Caller
-from strands_robots.mcp.connections import CONNECTION, IDLE_S, BoundedServer, Capacity, Connections, listener
-from strands_robots.mcp.resources import RobotResources
-from strands_robots.mcp.server import GONE, MESSAGE_MAX, STOPS, THREADS, build
-from strands_robots.mcp.sessions import Sessions
+from strands_robots.mcp.caller import Caller, ClientAccess
+from strands_robots.mcp.connections import CONNECTION, IDLE_S, BoundedServer, Capacity, Connections, Sessions, listener
+from strands_robots.mcp.server import GONE, MESSAGE_MAX, STOPS, THREADS, RobotResources, build
 from strands_robots.mcp.standing import StandingController
-from strands_robots.mcp.tokens import Token, TokenFile
 from strands_robots.utils import is_loopback_host
 
 PATH = "/mcp"
@@ -84,26 +80,23 @@ class Address:
     @property
     def origin(self) -> str:
         """Scheme, host and port."""
-        return f"http{'s' if self.cert else ''}://{_bracketed((self.hosts or (self.host,))[0])}:{self.port}"
+        return f"http{'s' if self.cert else ''}://{bracketed((self.hosts or (self.host,))[0])}:{self.port}"
 
-    def security(self) -> Any:
+    def rules(self) -> HttpRules:
         """Return the Host and Origin headers that requests may have."""
-        names = ["127.0.0.1", "localhost", "[::1]"] if self.loopback else [_bracketed(self.host)]
-        names += [_bracketed(each) for each in self.hosts]
+        names = ["127.0.0.1", "localhost", "[::1]"] if self.loopback else [bracketed(self.host)]
         scheme = "https" if self.cert else "http"
-        return TransportSecuritySettings(
-            allowed_hosts=[*(f"{name}:*" for name in names), *names],
-            allowed_origins=[*(f"{scheme}://{name}:*" for name in names), *(f"{scheme}://{name}" for name in names)],
-        )
+        known = (*names, *map(bracketed, self.hosts))
+        return HttpRules(frozenset(f"{scheme}://{name}".lower() for name in known), any_port=True)
 
 
 class _Client:
     """One token's client: its networks, and its open requests."""
 
-    def __init__(self, token: Token, caller: Caller, show_picture: Callable[[bytes], str]) -> None:
-        self.token = token
+    def __init__(self, token: Token, networks: Networks, show_picture: Callable[[bytes], str]) -> None:
+        self.token, self.open = token, 0
+        caller = Caller(networks, present=lambda: bool(self.open))
         self.access = ClientAccess(caller, approves=token.approves, show_picture=show_picture)
-        self.open = 0
 
 
 class _Sent:
@@ -149,7 +142,6 @@ class HttpServer:
         self._leaving: set[asyncio.Task[None]] = set()
         self._running = AsyncExitStack()
         self._sessions: dict[bool, Sessions] = {}
-        self._security = TransportSecurityMiddleware(address.security())
         self.connections = Connections()
 
     @contextlib.asynccontextmanager
@@ -162,9 +154,9 @@ class HttpServer:
             standing = StandingController(self._default.name, networks)
             for read_only in (False, True):
                 server = build(_access_of, resources, approvals, standing, read_only=read_only)
-                server.streamable_http_app(
-                    streamable_http_path=PATH, transport_security=self._address.security(), host=self._address.host
-                )
+                # Guard has checked the addresses of a request.
+                unchecked = TransportSecuritySettings(enable_dns_rebinding_protection=False)
+                server.streamable_http_app(streamable_http_path=PATH, transport_security=unchecked)
                 self._sessions[read_only] = Sessions(server.session_manager)
                 await stack.enter_async_context(server.session_manager.run())
             await stack.enter_async_context(resources.published())
@@ -189,18 +181,15 @@ class HttpServer:
         if scope["path"] != PATH:
             await Response(status_code=404)(scope, receive, send)
             return
-        # Nothing below this line happens for a page of another origin, whatever its method and its session.
-        refusal = await self._security.validate_request(Request(scope), is_post=scope["method"] == "POST")
         # Read here and not in a thread: a stop waits for no thread of the pool. It is one small file.
         token = self._token(headers.get(b"authorization", ""))
-        if refusal is None and token is None:
+        if token is None:
             refusal = JSONResponse(
                 {"error": "invalid_token", "error_description": "strands-robots keys mcp NAME makes a token"},
                 status_code=401,
                 headers={"www-authenticate": 'Bearer error="invalid_token"', **CLOSE},
             )
-        if refusal is not None or token is None:
-            await (refusal or Response(status_code=401))(scope, receive, send)
+            await refusal(scope, receive, send)
             return
         room = self.connections.admit(scope["state"][CONNECTION], token.name)
         body = b"" if room is Capacity.NONE else await _body(headers, receive)
@@ -279,11 +268,9 @@ class HttpServer:
         return await asyncio.shield(client)
 
     async def _new_client(self, token: Token) -> _Client:
-        made: list[_Client] = []
-        caller = Caller(await self._connected(token.name), present=lambda: any(each.open for each in made))
-        self._running.callback(caller.close)
-        made.append(_Client(token, caller, self._show))
-        return made[0]
+        client = _Client(token, await self._connected(token.name), self._show)
+        self._running.callback(client.access.caller.close)
+        return client
 
     async def _connected(self, name: str) -> Networks:
         networks = self._networks_of(name)
@@ -295,8 +282,8 @@ class HttpServer:
         """Halt and release what every client has."""
         for leaving in self._leaving:
             leaving.cancel()
-        made = [each.result() for each in self._clients.values() if each.done() and not each.exception()]
-        await asyncio.gather(*(client.access.caller.leave() for client in made))
+        connected = [each.result() for each in self._clients.values() if each.done() and not each.exception()]
+        await asyncio.gather(*(client.access.caller.leave() for client in connected))
         self._connecting.shutdown(wait=False)
 
     def _show(self, jpeg: bytes) -> str:
@@ -343,7 +330,8 @@ async def serve_http(
     require_secure(address, tokens)
     app = HttpServer(networks_of, tokens, address, default)
     config = uvicorn.Config(
-        app,
+        # Nothing happens for a page of another origin, whatever its method and its session.
+        Guard(app, address.rules()),
         lifespan="off",
         log_level="warning",
         ssl_certfile=address.cert,
@@ -416,7 +404,3 @@ def _access_of(context: Any) -> ClientAccess:
 def _header(message: Mapping[str, Any], name: bytes) -> str:
     """Return a header of a scope or of an answer's start, empty where there is none."""
     return next((value.decode("latin-1") for each, value in message["headers"] if each.lower() == name), "")
-
-
-def _bracketed(host: str) -> str:
-    return f"[{host}]" if ":" in host else host

@@ -20,12 +20,10 @@ from pydantic import Field
 
 from strands_robots.envelope import Envelope, error, is_error, success
 from strands_robots.fleet.all_lockouts import ask_lockouts, by_robot
-from strands_robots.mcp.access import AccessOf
 from strands_robots.mcp.approval import Approvals, Wish
-from strands_robots.mcp.caller import acquire_arguments
-from strands_robots.mcp.results import Result, facts, picture, quoted, result, row
+from strands_robots.mcp.caller import AccessOf, acquire_arguments
+from strands_robots.mcp.results import INSTEAD, Result, described, facts, picture, quoted, result, row, wanted
 from strands_robots.mcp.standing import StandingController
-from strands_robots.mcp.verbs import INSTEAD, described, wanted
 from strands_robots.serving.advertised import AdvertisedVerb
 from strands_robots.serving.stop_arguments import stop_reason, stop_scope
 from strands_robots.utils import shown
@@ -332,12 +330,12 @@ async def _progress(context: Context[Any, Any], status: partial[Any]) -> AsyncIt
         while True:
             await asyncio.sleep(PROGRESS_S)
             said = facts(await status())
-            kept = {
+            fields = {
                 name: said[name]
                 for name in ("task_status", "instruction", "step_count", "running_policies")
                 if name in said
             }
-            await context.report_progress(time.monotonic() - began, message=quoted(kept)[:1000])
+            await context.report_progress(time.monotonic() - began, message=quoted(fields)[:1000])
 
     reporting = asyncio.ensure_future(report())
     try:

@@ -170,6 +170,7 @@ class FleetSafety:
             if absent and time.monotonic() - published >= SPACING_S:
                 # A link that was down when the stop was published may be back: the same stop again.
                 published = time.monotonic()
+                self._open_link()
                 self._publish_estop(order, none, signing_key)
             return absent
 
@@ -179,6 +180,9 @@ class FleetSafety:
         counts, stopped = self._conclude(order, responses, replies, roster)
         self._close_stop(order, counts, signing_key, {str(each["responder_id"]) for each in replies})
         unreached = (roster | context.registry.seen_within(KNOWN_S)) - stopped - {context.peer_id}
+        if unreached:
+            self._open_link()
+        self._serve_missed()
         self._retry.begin(
             order.epoch,
             unreached,
@@ -217,6 +221,7 @@ class FleetSafety:
         counts, stopped = self._conclude(order, [*own, *replies], replies, stop.targets())
         if scope.cell:
             self._close_stop(order, counts, signing_key, {str(each["responder_id"]) for each in replies})
+        self._serve_missed()
         self._unresumed[order.epoch] = until = time.monotonic() + KNOWN_S
         while len(self._unresumed) > SCOPED_MAX:
             del self._unresumed[next(iter(self._unresumed))]
@@ -376,13 +381,21 @@ class FleetSafety:
 
     def _send_stop(self, epoch: str, body: dict[str, Any]) -> None:
         """Publish a stop on both connections, as either may hang."""
-        stops = self.stops
-        if stops is not None:
-            stops.publish(topics.estop(), body)
+        if self.stops is not None:
+            self.stops.publish(topics.estop(), body)
         self._publish(topics.estop(), body, f"Emergency stop {epoch}", logging.CRITICAL)
-        if stops is not None:
-            with contextlib.suppress(TransportError):  # the next repetition tries again
-                stops.open(self)  # by a peer without a robot, which had no connection of its own until now
+
+    def _serve_missed(self) -> None:
+        """Answer a robot that missed the stop and asks, also without a robot."""
+        if self.stops is not None:
+            with contextlib.suppress(TransportError):  # this peer has left the mesh
+                self.stops.open(self)
+
+    def _open_link(self) -> None:
+        """Have a connection for stops, also without a robot; a first stop does not wait for that."""
+        if self.stops is not None:
+            with contextlib.suppress(TransportError):  # the next repetition or check-in tries again
+                self.stops.connect(self)
 
     def _from_session(self) -> dict[str, str]:
         """Return the field that states our session, where the transport has any."""
@@ -544,12 +557,9 @@ class FleetSafety:
         """Check in with the robots that need a live controller."""
         peer = self.context.peer_id
         body = self._signed({"peer_id": peer, "estop_id": new_epoch()}, Purpose.CHECK_IN, signing_key)
-        if self.stops is not None:
-            with contextlib.suppress(TransportError):  # the next check-in tries again
-                self.stops.open(self)
-            if self.stops.publish(topics.check_in(peer), body):
-                return
-        self._publish(topics.check_in(peer), body, "A check-in", logging.ERROR)
+        self._open_link()
+        if self.stops is None or not self.stops.publish(topics.check_in(peer), body):
+            self._publish(topics.check_in(peer), body, "A check-in", logging.ERROR)
 
     def on_check_in(self, sample: Sample) -> None:
         """Record the check-in of a controller; a refused one is audited."""

@@ -73,7 +73,8 @@ class MeshStopLink:
         self.on_stop: Callable[[str, bytes], None] = lambda sender, payload: None
         """Hands a stop, with its sender's session, to the e-stop listener's thread."""
         self._end_looks: Callable[[], None] = lambda: None
-        self._close_stops: Callable[[], None] = lambda: None
+        self._connecting = threading.Lock()
+        self._close_stops: Callable[[], None] | None = None
 
     @property
     def up(self) -> bool:
@@ -89,11 +90,16 @@ class MeshStopLink:
             self._declared.append(transport.declare_subscriber(topics.check_in("*"), self._on_presence_check_in))
         # No topic names who stops: until the message is read, a session stands for its sender.
         self.on_stop = partial(on_event, ESTOP)
-        self._close_stops = transport.open_stops(self.on_stop, self._on_check_in)
         for event, topic in TOPICS.items():
             self._declared.append(transport.declare_subscriber(topic("*"), asked(event)))
         on_state(True)
         self._end_looks = repeat("missed stops", LOOK_HZ, self._look)
+
+    def connect(self) -> None:
+        """Open the connection for stops and check-ins; return at once. Twice is once."""
+        with self._connecting:
+            if self._close_stops is None:
+                self._close_stops = self._transport.open_stops(self.on_stop, self._on_check_in)
 
     def publish(self, source: str, event: str, payload: bytes) -> bool:
         try:
@@ -106,7 +112,10 @@ class MeshStopLink:
         self._end_looks()
         undeclare(self._declared)
         self._declared.clear()
-        self._close_stops()
+        with self._connecting:
+            close, self._close_stops = self._close_stops, None
+        if close is not None:
+            close()
 
     def _on_presence_check_in(self, sample: Sample) -> None:
         # A signed check-in counts once: its second copy would be refused as one played again.
@@ -272,14 +281,14 @@ class PeerStops:
             undeclare([before])
         if peer.adapter.moves:
             try:
-                stops.open(peer)
+                stops.connect(peer)
             except TransportError:
                 stops.left_by(peer)
                 raise
         return stops
 
     def open(self, peer: StopPeer) -> None:
-        """Have the e-stop listener serve a peer by its own link; twice is once.
+        """Have the e-stop listener serve a peer, also with what it has sent; twice is once.
 
         Raises:
             TransportError: the peer is not on the mesh.
@@ -303,6 +312,13 @@ class PeerStops:
             )
             self._link = registration.link if isinstance(registration.link, MeshStopLink) else None
         registration.open()
+
+    def connect(self, peer: StopPeer) -> None:
+        """Have a connection for stops alone; as :meth:`open` besides."""
+        self.open(peer)
+        link = self._link
+        if link is not None:
+            link.connect()
 
     def left_by(self, peer: StopPeer) -> None:
         """Receive no more for a peer; the last ends the subscriptions."""

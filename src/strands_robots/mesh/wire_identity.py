@@ -32,7 +32,14 @@ from strands_robots.mesh import wire
 from strands_robots.mesh.scheduler import RecentKeys
 from strands_robots.mesh.transport.config import Posture, TlsCredentials
 from strands_robots.safety import ed25519
-from strands_robots.safety.identity import SigningIdentity, console_key, kept_consoles, stated_consoles
+from strands_robots.safety.identity import (
+    PUBLIC_KEYS,
+    SigningIdentity,
+    console_key,
+    enrolled_consoles,
+    kept_consoles,
+    stated_consoles,
+)
 from strands_robots.utils import MissingExtraError, ValidationError, canonical_json, identifier, shown
 
 if TYPE_CHECKING:
@@ -46,9 +53,6 @@ CONSOLE = "console"
 CONSOLE_FIELDS = frozenset({"v", "key", "t", "nonce", "sig"})
 MOTION = "mesh-motion"
 INPUT = "mesh-input"
-
-READ_AGAIN_S = 1.0
-"""Age in seconds from which the trusted keys are read anew."""
 
 
 class ConsoleSigner:
@@ -93,9 +97,11 @@ class ConsoleTrust:
         self._clock = clock
         self._lock = threading.Lock()
         self._keys: frozenset[bytes] = frozenset()
-        self._path: Path | None = None
-        self._read_at = float("-inf")
+        self._stated: tuple[str, ...] = ()
+        self._paths: tuple[Path, ...] = ()
+        self._stamps: tuple[object, ...] = ()
         self._complaint = ""
+        self._trusted()  # read now: the first command waits for no disk
 
     def refusal(self, body: Mapping[str, Any], purpose: str) -> str | None:
         """Return the reason why ``body`` is not signed by a trusted console, or None."""
@@ -115,10 +121,15 @@ class ConsoleTrust:
         return None if ed25519.signed_by_one_of([key], signature, covered) else "its signature does not fit"
 
     def _trusted(self) -> frozenset[bytes]:
+        """Return the keys, read anew where a setting or a file has changed."""
         with self._lock:
-            now, path = time.monotonic(), console_key().path
-            if now - self._read_at >= READ_AGAIN_S or path != self._path:
-                self._keys, self._read_at, self._path = self._read(), now, path
+            stated = settings.raw("STRANDS_STATE_DIR"), settings.raw(PUBLIC_KEYS)
+            if stated != self._stated:
+                self._stated, self._paths = stated, (console_key().path, enrolled_consoles().path)
+            # Taken before the files are read: one that changes meanwhile is read once more.
+            stamps = (stated, *map(_stamp, self._paths))
+            if stamps != self._stamps:
+                self._stamps, self._keys = stamps, self._read()
             return self._keys
 
     def _read(self) -> frozenset[bytes]:
@@ -131,6 +142,21 @@ class ConsoleTrust:
             logger.error("Keys of consoles are left out: %s", complaint)
         self._complaint = complaint
         return keys
+
+
+def _stamp(path: Path) -> tuple[object, ...]:
+    """Return what changes with a key file, its access and that of its folders."""
+    facts: list[object] = []
+    for each in (path, *path.parents[:3]):
+        try:
+            found = each.stat()
+        except OSError:
+            facts.append(None)
+            continue
+        facts.append((found.st_mode, found.st_uid))
+        if each is path:
+            facts.append((found.st_ino, found.st_ctime_ns, found.st_size))
+    return tuple(facts)
 
 
 def _covered(body: Mapping[str, Any], head: Mapping[str, Any], purpose: str) -> bytes:

@@ -8,7 +8,7 @@ from functools import partial
 from typing import Any
 
 from strands_robots.contract import body_of, holds_robots
-from strands_robots.utils import ValidationError, missing_extra, shown
+from strands_robots.utils import ValidationError, optional_module, shown
 
 QUALITY = 80
 
@@ -55,9 +55,9 @@ def frames_of(robot: Any) -> Frames | None:
     ``get_observation()``. A camera ``arm/wrist`` is called ``arm.wrist`` on the wire, which allows no slash.
     """
     body = body_of(robot)
-    own, observe = getattr(body, "camera_frames", None), getattr(body, "get_observation", None)
-    if callable(own):
-        frames: Frames = own
+    camera_frames, observe = getattr(body, "camera_frames", None), getattr(body, "get_observation", None)
+    if callable(camera_frames):
+        frames: Frames = camera_frames
         return frames
     draw = _drawing(robot)
     if draw is not None:
@@ -86,8 +86,8 @@ def chosen_frames(robot: Any, names: Sequence[str] | None) -> Frames | None:
         return lambda: _selected(frames(), names)
     features = robot.get_features()
     known = [str(name) for name in features.get("cameras", ())]
-    own = [name for name in known if "/" in name] or [OVERVIEW]
-    wanted = own if names is None else list(names)
+    of_robots = [name for name in known if "/" in name] or [OVERVIEW]
+    wanted = of_robots if names is None else list(names)
     for name in wanted:
         if name not in known:
             raise ValidationError(f"camera must be one of {', '.join(known)}, not {shown(name)}.")
@@ -118,9 +118,9 @@ def has_cameras(robot: Any) -> bool:
     From its ``has_cameras``, else by what draws or takes pictures, else by the shapes in ``observation_features``.
     """
     body = body_of(robot)
-    own = getattr(body, "has_cameras", None)
-    if isinstance(own, bool):
-        return own
+    stated = getattr(body, "has_cameras", None)
+    if isinstance(stated, bool):
+        return stated
     if callable(getattr(body, "camera_frames", None)):
         return True
     if (
@@ -212,8 +212,4 @@ def _image(name: str, pixels: Any) -> Any:
     shape = tuple(getattr(pixels, "shape", ()))
     if len(shape) != 3 or shape[2] != 3 or str(getattr(pixels, "dtype", "")) != "uint8":
         raise ValidationError(f"a frame of {name} must be height x width x 3 of uint8, not {shape}.")
-    try:
-        from PIL import Image  # noqa: PLC0415 - optional, loaded when a picture is taken
-    except ImportError:
-        raise missing_extra("Encoding camera frames", "record") from None
-    return Image.fromarray(pixels)
+    return optional_module("PIL.Image", what="Encoding camera frames", extra="record").fromarray(pixels)

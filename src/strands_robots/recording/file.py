@@ -1,26 +1,40 @@
-"""MCAP files of recordings, readable up to the last whole chunk."""
+"""Robots sampled into MCAP files, which are readable to the last whole chunk."""
 
 from __future__ import annotations
 
+import io
 import json
+import logging
+import os
 import queue
 import struct
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, BinaryIO, Self
 
-from strands_robots.policies.base import Action, numbers
+from strands_robots.contract import RolloutEvent, Unsubscribe, behind_contract, holds_robots, observe
+from strands_robots.envelope import text_of
+from strands_robots.policies.base import numbers
 from strands_robots.policies.decoding import decode_json
 from strands_robots.recording import schemas
-from strands_robots.recording._compat import close_chunk
+from strands_robots.recording.cameras import Frames, jpeg
 from strands_robots.recording.schemas import Schema
-from strands_robots.recording.unpacking import read_messages
 from strands_robots.teleoperators.recorded import Frame, check_length
-from strands_robots.utils import ValidationError, missing_extra, shown
+from strands_robots.utils import ValidationError, number, optional_module, shown
+
+logger = logging.getLogger(__name__)
+
+CHUNK_MAX_BYTES = 64 * 2**20
+RATIO_MAX = 200
+"""Bounds of what is read, because a few kilobytes can unpack to gigabytes.
+
+A chunk may unpack to the first, and a file to so many times its own size besides one such chunk.
+"""
 
 CHUNK_BYTES = 16_384
 """Largest chunk: at most this much is lost of a file that was cut off."""
@@ -42,6 +56,89 @@ STEADY = frozenset({STEP, "observationUpdate", "stateUpdate", "state"})
 
 JOINTS, CAMERA, LOG = "joint_states", "camera", "log"
 """Channel names, after the device, of everything that is not an event."""
+
+JOINTS_HZ, CAMERAS_HZ, GATE_HZ = 50.0, 15.0, 20.0
+"""Rates at which joints are read, pictures are taken, and the gate is checked for halts and locks."""
+
+PATIENCE_S = 0.5
+"""A source that fails for this long is reported; a busy bus costs a sample, it is not a fault."""
+
+
+def read_messages(file: BinaryIO) -> Iterator[tuple[Any, Any, Any]]:
+    """Yield schema, channel and message of each message, in the order of writing.
+
+    Raises:
+        ValidationError: it unpacks to more than a recording does.
+        McapError, EndOfFile, struct.error: it is no MCAP file, or was cut off.
+    """
+    from mcap.exceptions import McapError  # noqa: PLC0415 - an extra
+    from mcap.records import Channel, Chunk, Message, Schema  # noqa: PLC0415
+    from mcap.stream_reader import StreamReader  # noqa: PLC0415
+
+    schemas: dict[int, Any] = {}
+    channels: dict[int, Any] = {}
+    left = CHUNK_MAX_BYTES + RATIO_MAX * os.fstat(file.fileno()).st_size
+    stream = StreamReader(file, emit_chunks=True, record_size_limit=CHUNK_MAX_BYTES)
+    for each in stream.records:
+        if isinstance(each, Chunk):
+            each.data = _unpacked(each, min(left, CHUNK_MAX_BYTES))
+            each.compression = ""
+            left -= len(each.data)
+        for record in _records(each.data) if isinstance(each, Chunk) else [each]:
+            if isinstance(record, Schema):
+                schemas[record.id] = record
+            elif isinstance(record, Channel):
+                channels[record.id] = record
+            elif isinstance(record, Message):
+                channel = channels.get(record.channel_id)
+                if channel is None:
+                    raise McapError(f"no channel record found with id {record.channel_id}")
+                yield schemas.get(channel.schema_id), channel, record
+
+
+def _records(data: bytes) -> Iterator[Any]:
+    """Yield the records of a chunk one at a time; it may have millions."""
+    from mcap.data_stream import ReadDataStream  # noqa: PLC0415 - an extra
+    from mcap.opcode import Opcode  # noqa: PLC0415 - likewise
+    from mcap.records import Channel, Message, Schema  # noqa: PLC0415 - likewise
+
+    stream = ReadDataStream(io.BytesIO(data))
+    while stream.count < len(data):
+        opcode, length = stream.read1(), stream.read8()
+        if opcode == Opcode.CHANNEL:
+            yield Channel.read(stream)
+        elif opcode == Opcode.MESSAGE:
+            yield Message.read(stream, length)
+        elif opcode == Opcode.SCHEMA:
+            yield Schema.read(stream)
+        else:
+            stream.read(length)
+
+
+def _unpacked(chunk: Any, limit: int) -> bytes:
+    """Return the bytes of a chunk, at most ``limit``, whatever its header claims."""
+    if chunk.compression == "zstd":
+        import zstandard  # noqa: PLC0415 - comes with mcap
+
+        try:
+            with zstandard.ZstdDecompressor(max_window_size=CHUNK_MAX_BYTES).stream_reader(chunk.data) as reader:
+                data = reader.read(limit + 1)
+        except zstandard.ZstdError as exc:
+            raise ValidationError(f"a chunk cannot be unpacked: {exc}") from exc
+    elif chunk.compression == "lz4":
+        from lz4.frame import LZ4FrameDecompressor  # noqa: PLC0415
+
+        try:
+            data = LZ4FrameDecompressor().decompress(chunk.data, max_length=limit + 1)
+        except RuntimeError as exc:
+            raise ValidationError(f"a chunk cannot be unpacked: {exc}") from exc
+    elif chunk.compression:
+        raise ValidationError(f"a chunk is packed with {chunk.compression!r}, not with zstd or lz4")
+    else:
+        data = chunk.data
+    if len(data) > limit:
+        raise ValidationError(f"a chunk unpacks to more than {limit} bytes")
+    return bytes(data)
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,7 +287,6 @@ class _Channels:
     """Channels of an open file, each registered with its first message."""
 
     def __init__(self, file: Any, counts: Counter[str]) -> None:
-        self._file = file
         self._open_since: float | None = None
         self._writer = _mcap().Writer(file, chunk_size=CHUNK_BYTES)
         self._writer.start(profile="", library="strands-robots")
@@ -227,8 +323,7 @@ class _Channels:
 
     def close_chunk(self) -> None:
         """Put everything written so far into the file."""
-        close_chunk(self._writer)
-        self._file.flush()
+        self._writer.flush()
         self._open_since = None
 
     def finish(self) -> None:
@@ -288,7 +383,8 @@ def recorded_actions(path: Path, device: str | None = None) -> list[Frame]:
             frames, action = actions.setdefault(item.robot, []), numbers(given if isinstance(given, Mapping) else {})
         else:
             continue
-        _append(frames, item.at, action)
+        if action and (not frames or item.at > frames[-1][0]):
+            frames.append((item.at, action))
         rows, values = rows + 1, values + len(action)
         check_length(rows, values)
     usable = {**joints, **{robot: frames for robot, frames in actions.items() if frames}}
@@ -303,11 +399,6 @@ def recorded_actions(path: Path, device: str | None = None) -> list[Frame]:
         raise ValidationError(f"device must be one of those that were recorded ({known}), not {shown(device)}.")
     (frames,) = chosen.values()
     return [(at - frames[0][0], action) for at, action in frames]
-
-
-def _append(frames: list[Frame], at: float, action: Action) -> None:
-    if action and (not frames or at > frames[-1][0]):
-        frames.append((at, action))
 
 
 def _item(schema: str, channel: Any, message: Any) -> RecordedItem | None:
@@ -336,8 +427,146 @@ def _ns(seconds: float) -> int:
 
 
 def _mcap() -> Any:
-    try:
-        from mcap import writer  # noqa: PLC0415 - an extra
-    except ModuleNotFoundError as exc:
-        raise missing_extra("Recording", "record") from exc
-    return writer
+    return optional_module("mcap.writer", what="Recording", extra="record")
+
+
+class RobotRecording:
+    """Samples a robot into ``recorder`` while it is entered as a context.
+
+    A source that cannot be read for half a second is reported once in the log and once in the recording, as the event
+    ``notRecorded``, and is still read at every beat. Each camera fails on its own. A beat that is missed is left out
+    and counted in the event ``samplesSkipped``.
+
+    Args:
+        robot: behind the contract, or an object that :func:`~strands_robots.contract.adapt` makes fit.
+        recorder: entered, made with ``joints_of_events=False``.
+        device: name of the robot in the recording.
+        frames: takes its pictures; None for none.
+        joints_hz: 1 to 200.
+        cameras_hz: 0.1 to 60.
+
+    Raises:
+        ValidationError: a rate outside its domain, or an object that is no robot.
+    """
+
+    def __init__(
+        self,
+        robot: Any,
+        recorder: Recorder,
+        device: str,
+        *,
+        frames: Frames | None = None,
+        joints_hz: float = JOINTS_HZ,
+        cameras_hz: float = CAMERAS_HZ,
+    ) -> None:
+        self._robot = behind_contract(robot)
+        self._recorder = recorder
+        self._device = device
+        self._frames = frames
+        self._stopping = threading.Event()
+        self.skipped: Counter[str] = Counter()
+        """Beats that came too late, by source: joints, cameras, gate."""
+        self._failing: dict[str, tuple[float, bool]] = {}
+        self._generation = self._robot.gate.generation
+        self._lock = ""
+        sources: list[tuple[str, float, Callable[[], None]]] = [
+            ("joints", number("joints_hz", joints_hz, low=1, high=200), self._sample_joints),
+            ("gate", GATE_HZ, self._check_gate),
+        ]
+        if frames is not None:
+            hz = number("cameras_hz", cameras_hz, low=0.1, high=60)
+            sources.append(("cameras", hz, self._sample_pictures))
+        self._threads = [
+            threading.Thread(target=self._paced, args=source, name=f"record-{source[0]}", daemon=True)
+            for source in sources
+        ]
+        self._unsubscribe: Unsubscribe = lambda: None
+
+    def __enter__(self) -> Self:
+        self._unsubscribe = observe(self._robot, self._record)
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._stopping.set()
+        for thread in self._threads:
+            thread.join()
+        # The gate's own thread has ended; two checks at a time would record the same halt twice.
+        self._attempt("gate", self._check_gate)
+        self._unsubscribe()
+        if self.skipped:
+            self._take("samplesSkipped", dict(self.skipped))
+
+    def _take(self, event: str, payload: Mapping[str, Any]) -> None:
+        self._recorder.take(self._device, event, payload)
+
+    def _paced(self, source: str, hz: float, sample: Callable[[], None]) -> None:
+        started, tick = time.monotonic(), 0
+        while not self._stopping.wait(max(0.0, started + tick / hz - time.monotonic())):
+            self._attempt(source, sample)
+            due = max(tick + 1, int((time.monotonic() - started) * hz))
+            if due > tick + 1:
+                self.skipped[source] += due - tick - 1
+            tick = due
+
+    def _attempt(self, source: str, sample: Callable[[], None]) -> None:
+        try:
+            sample()
+        except Exception as exc:  # noqa: BLE001 - a robot's read may raise anything; the recording goes on
+            self._report(source, f"{type(exc).__name__}: {exc}")
+        else:
+            self._failing.pop(source, None)
+
+    def _report(self, source: str, problem: str) -> None:
+        now = time.monotonic()
+        since, reported = self._failing.setdefault(source, (now, False))
+        if reported or now - since < PATIENCE_S:
+            return
+        self._failing[source] = (since, True)
+        logger.warning("%s: its %s are not recorded: %s", self._device, source, problem)
+        self._take("notRecorded", {"what": source, "error": problem})
+
+    def _sample_joints(self) -> None:
+        state = self._robot.get_state()
+        if holds_robots(self._robot):
+            for name, joints in (state.get("robots") or {}).items():
+                self._recorder.take_joints(f"{self._device}/{name}", numbers(joints))
+            return
+        if state.get("joints_error"):
+            raise ConnectionError(state["joints_error"])
+        self._recorder.take_joints(self._device, numbers(state.get("joints") or {}))
+
+    def _sample_pictures(self) -> None:
+        frames = self._frames() if self._frames is not None else {}
+        for camera in frames:
+            self._attempt(f"pictures of {camera}", partial(self._take_picture, frames, camera))
+
+    def _take_picture(self, frames: Mapping[str, Any], camera: str) -> None:
+        self._recorder.take_picture(self._device, camera, jpeg(camera, frames[camera]))
+
+    def _check_gate(self) -> None:
+        gate = self._robot.gate
+        if gate.generation != self._generation:
+            self._generation = gate.generation
+            self._take("halted", {})
+        refusal = gate.refusal("motion")
+        lock = "" if refusal is None else text_of(refusal)
+        if lock != self._lock:
+            self._lock = lock
+            self._take("locked" if lock else "unlocked", {"reason": lock} if lock else {})
+
+    def _record(self, event: RolloutEvent) -> None:
+        """Record a rollout's event with its name and fields on Device Connect."""
+        world = holds_robots(self._robot)
+        robot = {"robot_name": event.robot} if world else {}
+        kind = "policy" if world else "task"
+        if event.kind == "step":
+            step = {"step": event.step, "observation": dict(event.observation), "action": dict(event.action)}
+            self._take(STEP, {**step, **robot})
+        elif event.kind == "started":
+            self._take(f"{kind}Started", {"instruction": event.instruction, "policy_provider": event.policy, **robot})
+        else:
+            end = {"instruction": event.instruction, "steps": event.step, "duration": event.elapsed_s}
+            loop = {"loop": dict(event.loop)} if event.loop else {}
+            self._take(f"{kind}Complete", {**end, "state": event.state, "error": event.error, **loop, **robot})

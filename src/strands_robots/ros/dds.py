@@ -1,24 +1,63 @@
-"""Link to a ROS 2 graph over bare DDS, without ROS 2 on this side."""
+"""Link to a ROS 2 graph over bare DDS, without ROS 2 here, and DDS Security."""
 
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import logging
+import os
+import ssl
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from email import message_from_bytes
+from fnmatch import fnmatchcase
 from importlib import import_module
+from pathlib import Path
 from types import ModuleType
-from typing import Any, get_args, get_type_hints
+from typing import Any
+from xml.etree import ElementTree
 
 from strands_robots import settings
-from strands_robots.ros.dds_security import checked_credentials, presenting
-from strands_robots.ros.link import Message, OnMessage, RosError, Unwatch, next_message
-from strands_robots.ros.names import absolute, bare_kind, domain, is_latched
-from strands_robots.utils import missing_extra, number, shown
+from strands_robots.ros.link import (
+    Message,
+    OnMessage,
+    RosError,
+    Unwatch,
+    absolute,
+    bare_kind,
+    deliver,
+    domain,
+    is_latched,
+    next_message,
+)
+from strands_robots.ros.messages import filled, plain
+from strands_robots.utils import ValidationError, number, optional_module
 
 logger = logging.getLogger(__name__)
+
+REQUIRED = ("identity_ca", "certificate", "private_key", "governance", "permissions")
+OPTIONAL = ("permissions_ca",)
+
+# The names of the properties are those of the OMG's DDS Security 1.1; the plugins are the ones of Cyclone DDS.
+_FILE, _DATA = "file:", "data:,"
+_LONGEST = 100_000
+_PROPERTIES = {
+    "identity_ca": "dds.sec.auth.identity_ca",
+    "certificate": "dds.sec.auth.identity_certificate",
+    "private_key": "dds.sec.auth.private_key",
+    "permissions_ca": "dds.sec.access.permissions_ca",
+    "governance": "dds.sec.access.governance",
+    "permissions": "dds.sec.access.permissions",
+}
+_PLUGINS = (
+    ("auth", "libdds_security_auth.so", "authentication"),
+    ("access", "libdds_security_ac.so", "access_control"),
+    ("crypto", "libdds_security_crypto.so", "crypto"),
+)
+
+_presented: dict[int, DdsCredentials] = {}
+_presenting = threading.Lock()
 
 DEPTH = 10
 _SLICE_MS = 100
@@ -37,6 +76,198 @@ _domains: dict[int, Any] = {}
 _domains_lock = threading.Lock()
 
 
+@dataclass(frozen=True, slots=True)
+class DdsCredentials:
+    """The checked credentials of one participant, as URIs; never printed."""
+
+    uris: Mapping[str, str] = field(repr=False)
+
+    def document(self, name: str) -> bytes:
+        """Return the content of one of them, such as the signed ``governance``."""
+        uri = self.uris[name]
+        return uri.removeprefix(_DATA).encode() if uri.startswith(_DATA) else Path(uri.removeprefix(_FILE)).read_bytes()
+
+    def policies(self, qos: Any) -> list[Any]:
+        """Return property policies of a participant for the given ``cyclonedds.qos``.
+
+        Raises:
+            ValidationError: the loaded Cyclone DDS has no DDS Security.
+        """
+        found = {_PROPERTIES[name]: uri for name, uri in self.uris.items()}
+        folder = _plugin_folder()
+        for role, file, called in _PLUGINS:
+            loaded = {"path": str(folder / file), "init": f"init_{called}", "finalize": f"finalize_{called}"}
+            found |= {".".join(("dds.sec", role, "library", part)): value for part, value in loaded.items()}
+        return [qos.Policy.Property(key, value) for key, value in found.items()]
+
+
+def checked_credentials(config: object) -> DdsCredentials | None:
+    """Check a ``dds_security_config`` and return its credentials; None stays None.
+
+    Values are paths or ``file:`` or ``data:,`` URIs. The permissions CA is the identity CA unless it is given. No
+    message shows a value that may be a key.
+
+    Raises:
+        ValidationError: a key is missing or unknown, a value names no readable file and is no ``data:,`` URI, or the
+            private key is not that of the certificate.
+    """
+    if config is None:
+        return None
+    if not isinstance(config, dict):
+        raise ValidationError(f"dds_security_config must be an object of paths by name, not {type(config).__name__}.")
+    missing = [key for key in REQUIRED if key not in config]
+    unknown = sorted(str(key) for key in config if key not in REQUIRED + OPTIONAL)
+    if missing or unknown:
+        wrong = [f"no {key}" for key in missing] + [f"an unknown {key}" for key in unknown]
+        raise ValidationError(
+            f"dds_security_config must have {', '.join(REQUIRED)} and may have permissions_ca; it has "
+            f"{' and '.join(wrong)}."
+        )
+    uris = {key: _uri(f"dds_security_config[{key!r}]", value) for key, value in config.items()}
+    uris.setdefault("permissions_ca", uris["identity_ca"])
+    credentials = DdsCredentials(uris)
+    _check_key(credentials)
+    return credentials
+
+
+@contextlib.contextmanager
+def presenting(domain_id: int, credentials: DdsCredentials | None) -> Iterator[None]:
+    """Join a domain with ``credentials`` inside this context, one thread at a time.
+
+    The access control of Cyclone DDS 0.10 keeps the governance and permissions of the first participant of a domain
+    for every later one of the process, so this refuses other credentials, which the library would ignore.
+
+    Raises:
+        RosError: this process has presented other credentials in this domain.
+    """
+    with _presenting:
+        if credentials is not None and _presented.get(domain_id, credentials) != credentials:
+            raise RosError(
+                f"This process has presented other credentials in DDS domain {domain_id}; use another process."
+            )
+        yield
+        if credentials is not None:
+            _presented[domain_id] = credentials
+
+
+def _check_key(credentials: DdsCredentials) -> None:
+    # The plugins accept a key that does not fit and then fail with every peer.
+    with contextlib.ExitStack() as files:
+        names = []
+        for name in ("certificate", "private_key"):
+            # In memory, because a key given as data has no business on a disk.
+            file = files.enter_context(os.fdopen(os.memfd_create(name), "wb"))
+            file.write(credentials.document(name))
+            file.flush()
+            names.append(f"/proc/self/fd/{file.fileno()}")
+        try:
+            ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT).load_cert_chain(names[0], names[1], password=lambda: "")
+        except (ssl.SSLError, ValueError) as exc:
+            raise ValidationError(
+                "dds_security_config['private_key'] must be the PEM key of dds_security_config['certificate'], without "
+                "a passphrase; it is not."
+            ) from exc
+
+
+def _uri(name: str, value: object) -> str:
+    domain = f"{name} must be a path, a file: URI or a data:, URI of 1 to {_LONGEST} characters"
+    if not isinstance(value, str):
+        raise ValidationError(f"{domain}, not {type(value).__name__}.")
+    if not value.strip() or len(value) > _LONGEST or "\0" in value:
+        raise ValidationError(f"{domain}, not one of {len(value)}.")
+    if value.startswith(_DATA) and value != _DATA:
+        return value
+    path = value.removeprefix(_FILE).removeprefix("//" if value.startswith("file:///") else "")
+    if not path.isprintable() or path.startswith(("data:", "pkcs11:", "//")):
+        raise ValidationError(f"{domain}; this one has another scheme, a host or control characters.")
+    file = Path(path).absolute()
+    if not (file.is_file() and os.access(file, os.R_OK)):
+        raise ValidationError(f"{name} must name a readable file, not {str(file)!r}.")
+    return f"{_FILE}{file}"
+
+
+def _plugin_folder() -> Path:
+    library = _loaded_library()
+    if library is not None:
+        # Upstream installs the plugins beside the library, Debian in a folder of the library's name.
+        for folder in (library.parent, *sorted(library.parent.glob("libddsc*/"))):
+            if all((folder / file).is_file() for _, file, _ in _PLUGINS):
+                return folder
+    raise ValidationError(
+        f"dds_security_config cannot be honoured: the Cyclone DDS of this process ({library or 'not found'}) has no "
+        "DDS Security plugins, and no wheel of cyclonedds 11 brings them; use cyclonedds 0.10.5 built on Debian's "
+        "cyclonedds-dev, which scripts/dds-security.sh of this project does."
+    )
+
+
+def _loaded_library() -> Path | None:
+    """Return the file of the loaded Cyclone DDS, on Linux."""
+    maps = Path("/proc/self/maps")
+    lines = maps.read_text().splitlines() if maps.exists() else []
+    paths = (Path(line.split(maxsplit=5)[5]) for line in lines if "/libddsc" in line)
+    return next((path for path in paths if path.name.startswith("libddsc")), None)
+
+
+def governance_gap(document: bytes, domain_id: int, topic: str) -> str | None:
+    """Return how a governance document lets a stranger write ``topic``, or None.
+
+    The documents are those of DDS Security 1.1, section 9.4.1.2: XML inside S/MIME. The plugins check the signature.
+
+    Args:
+        document: the signed document.
+        domain_id: the DDS domain.
+        topic: the topic's name on the wire, such as ``rt/cmd_vel``.
+    """
+    rule = _domain_rule(document, domain_id)
+    if rule is None:
+        return f"it has no rule for domain {domain_id}"
+    if _flag(rule, "allow_unauthenticated_participants"):
+        return "it allows unauthenticated participants"
+    topics = rule.iterfind("topic_access_rules/topic_rule")
+    # The first rule that fits is the one that counts.
+    fitting = next((each for each in topics if fnmatchcase(topic, _text(each, "topic_expression"))), None)
+    if fitting is None:
+        return f"it has no rule for {topic}"
+    if not _flag(fitting, "enable_write_access_control"):
+        return f"it lets every participant write {topic}"
+    kinds = (_text(rule, "rtps_protection_kind"), _text(fitting, "metadata_protection_kind"))
+    if all(kind in ("", "NONE") for kind in (*kinds, _text(fitting, "data_protection_kind"))):
+        return f"it neither signs nor encrypts {topic}"
+    return None
+
+
+def _domain_rule(document: bytes, domain_id: int) -> ElementTree.Element | None:
+    parts = message_from_bytes(document).walk()
+    signed = next((part for part in parts if part.get_content_type() == "text/plain"), None)
+    content = signed.get_payload(decode=True) if signed is not None else None
+    try:
+        root = ElementTree.fromstring(content if isinstance(content, bytes) else b"")
+    except ElementTree.ParseError:
+        return None
+    rules = root.iterfind("domain_access_rules/domain_rule")
+    return next((each for each in rules if _covers(each.find("domains"), domain_id)), None)
+
+
+def _covers(domains: ElementTree.Element | None, domain_id: int) -> bool:
+    if domains is None:
+        return False
+    if any((each.text or "").strip() == str(domain_id) for each in domains.iterfind("id")):
+        return True
+    for span in domains.iterfind("id_range"):
+        low, high = _text(span, "min") or "0", _text(span, "max") or str(domain_id)
+        if low.isdecimal() and high.isdecimal() and int(low) <= domain_id <= int(high):
+            return True
+    return False
+
+
+def _flag(rule: ElementTree.Element, name: str) -> bool:
+    return _text(rule, name).lower() in ("true", "1")
+
+
+def _text(rule: ElementTree.Element, name: str) -> str:
+    return (rule.findtext(name) or "").strip()
+
+
 class DdsLink:
     """A :class:`~strands_robots.ros.link.RosLink` of topics, opened by first use.
 
@@ -45,7 +276,7 @@ class DdsLink:
     Args:
         domain_id: 0 to 232; ``ROS_DOMAIN_ID`` by default.
         match_s: how long a publish waits for a first subscription, and a read without a type for a publisher.
-        dds_security_config: credentials of :func:`~strands_robots.ros.dds_security.checked_credentials`; the
+        dds_security_config: credentials of :func:`~strands_robots.ros.dds.checked_credentials`; the
             participant then presents them or does not come up. Without, the participant proves nothing.
 
     Raises:
@@ -82,7 +313,7 @@ class DdsLink:
         self._writer(topic, kind)
 
     def publish(self, topic: str, kind: str, fields: Message) -> None:
-        message = filled(_struct(kind), fields)
+        message = _filled(kind, fields)
         writer = self._writer(topic, kind)
         deadline = time.monotonic() + self._match_s
         subscribed = import_module("strands_robots.ros._compat").subscribed
@@ -94,7 +325,7 @@ class DdsLink:
 
     def broadcast(self, topic: str, kind: str, fields: Message) -> None:
         """Publish, such as telemetry, whether or not there is a subscription."""
-        message = filled(_struct(kind), fields)
+        message = _filled(kind, fields)
         _write(self._writer(topic, kind), message, topic, kind)
 
     def read(self, topic: str, kind: str | None, within_s: float) -> dict[str, Any]:
@@ -130,7 +361,7 @@ class DdsLink:
             while not done.is_set():
                 if waitset.wait(slice_ns):
                     for message in _arrived(reader, topic, core.DDSException, done):
-                        _deliver(on_message, message, topic)
+                        deliver(on_message, message, topic)
 
         thread = threading.Thread(target=run, name=f"dds-{topic.strip('/')}", daemon=True)
 
@@ -227,10 +458,10 @@ class DdsLink:
                 quality = qos.Qos(reliable, qos.Policy.History.KeepLast(DEPTH))
                 struct = _struct(kind)
                 try:
-                    made = _dds("pub").DataWriter(self.open(), self._topic(topic, struct), qos=quality)
+                    writer = _dds("pub").DataWriter(self.open(), self._topic(topic, struct), qos=quality)
                 except _dds("core").DDSException as exc:
                     raise RosError(f"{topic} cannot be published as {bare_kind(kind)}: {exc}") from exc
-                self._writers[key] = made
+                self._writers[key] = writer
             return self._writers[key]
 
     def _kind_of(self, topic: str) -> str:
@@ -243,6 +474,10 @@ class DdsLink:
             if time.monotonic() >= deadline:
                 raise RosError(f"No publisher of {topic} in domain {self.domain_id}, so its type is not known.")
             time.sleep(_POLL_S)
+
+
+def _filled(kind: str, fields: Message) -> Any:
+    return filled(_struct(kind)(), fields, lambda inner: _struct(inner)())
 
 
 def _write(writer: Any, message: Any, topic: str, kind: str) -> None:
@@ -270,13 +505,8 @@ def _struct(kind: str) -> type[Any]:
     return found
 
 
-def _dds(module: str) -> ModuleType:
-    try:
-        return import_module(f"cyclonedds.{module}")
-    except ModuleNotFoundError as exc:
-        if (exc.name or "").partition(".")[0] != "cyclonedds":
-            raise
-        raise missing_extra("Bare DDS", "ros2") from exc
+def _dds(module: str) -> Any:
+    return optional_module(f"cyclonedds.{module}", what="Bare DDS", extra="ros2")
 
 
 def _arrived(reader: Any, topic: str, lost: type[Exception], done: threading.Event) -> Iterator[dict[str, Any]]:
@@ -297,85 +527,3 @@ def _arrived(reader: Any, topic: str, lost: type[Exception], done: threading.Eve
         # A writer that leaves delivers one sample without data.
         if samples[0].sample_info.valid_data:
             yield plain(samples[0])
-
-
-def _deliver(on_message: OnMessage, message: dict[str, Any], topic: str) -> None:
-    try:
-        on_message(message)
-    except Exception:
-        logger.exception("A watcher of %s failed.", topic)
-
-
-def filled(struct: type[Any], fields: Mapping[str, Any], place: str = "") -> Any:
-    """Return a struct with these fields, else zeros; a wrong one is a RosError."""
-    hints = get_type_hints(struct, include_extras=True)
-    message = struct()
-    for name, value in fields.items():
-        if name not in hints:
-            raise RosError(f"{struct.__name__} has no field {place}{name}; it has {', '.join(hints)}.")
-        setattr(message, name, _value(hints[name], getattr(message, name), value, f"{place}{name}"))
-    return message
-
-
-def plain(message: Any) -> dict[str, Any]:
-    """Return the fields of a message as numbers, text, bytes, lists and dictionaries."""
-    return {each.name: _plain(getattr(message, each.name)) for each in dataclasses.fields(message)}
-
-
-def _value(hint: Any, zero: Any, value: Any, place: str) -> Any:
-    if dataclasses.is_dataclass(zero):
-        if not isinstance(value, Mapping):
-            raise RosError(f"{place} must be an object of fields, not {shown(value)}.")
-        return filled(type(zero), value, f"{place}.")
-    if isinstance(zero, bytes):
-        return _bytes(value, place)
-    if isinstance(zero, list):
-        return _items(hint, zero, value, place)
-    if isinstance(zero, bool) or isinstance(value, bool):
-        fits = isinstance(zero, bool) and isinstance(value, bool)
-    elif isinstance(zero, float):
-        fits = isinstance(value, int | float)
-        value = float(value) if fits else value
-    else:
-        fits = isinstance(value, type(zero))
-    if not fits:
-        raise RosError(f"{place} must be a {type(zero).__name__}, not {shown(value)}.")
-    return value
-
-
-def _items(hint: Any, zero: list[Any], value: Any, place: str) -> list[Any]:
-    listed = value.tolist() if callable(getattr(value, "tolist", None)) else value
-    if not isinstance(listed, Sequence) or isinstance(listed, str | bytes):
-        raise RosError(f"{place} must be a list, not {shown(value)}.")
-    if zero and len(listed) != len(zero):
-        raise RosError(f"{place} must have {len(zero)} items, not {len(listed)}.")
-    kind = _item_type(hint)
-    return [_value(kind, kind(), each, f"{place}[{n}]") for n, each in enumerate(listed)]
-
-
-def _item_type(hint: Any) -> Any:
-    inner = get_args(get_args(hint)[0])[0]
-    # A number's type is Annotated[float, "float64"]; that of text and structs is itself.
-    parts = get_args(inner)
-    return parts[0] if parts else inner
-
-
-def _bytes(value: Any, place: str) -> bytes:
-    if isinstance(value, bytes | bytearray):
-        return bytes(value)
-    tobytes = getattr(value, "tobytes", None)
-    if callable(tobytes):
-        return bytes(tobytes())
-    try:
-        return bytes(value) if isinstance(value, list) else bytes([-1])
-    except (TypeError, ValueError):
-        raise RosError(f"{place} must be bytes or a list of them, not {shown(value)}.") from None
-
-
-def _plain(value: Any) -> Any:
-    if dataclasses.is_dataclass(value):
-        return plain(value)
-    if not isinstance(value, list | tuple):
-        return value
-    # A sequence has one type, and a scan or a map has many values.
-    return list(value) if value and isinstance(value[0], int | float | str) else [_plain(each) for each in value]

@@ -1,22 +1,17 @@
 """ROS 2 messages as IDL types of Cyclone DDS, with their names on the wire.
 
-Fields and their order are those of the public ``.msg`` files of common_interfaces and geometry2. A ROS ``uint8``
-is declared ``byte``: with ``uint8`` a peer on Cyclone DDS 0.10, which many ROS 2 installations ship, fails to match
-and can crash. Annotations are evaluated by the library, so this module does not postpone them.
+A ROS ``uint8`` is declared ``byte``: with ``uint8`` a peer on Cyclone DDS 0.10, which many ROS 2 installations ship,
+fails to match and can crash.
 """
 
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from __future__ import annotations
 
-from cyclonedds.idl import IdlStruct
-from cyclonedds.idl.types import array, float32, float64, int8, int32, sequence, uint32
+from dataclasses import dataclass, field
+from typing import Any, get_args
+
+from cyclonedds.idl import make_idl_struct, types
 
 from strands_robots.ros._compat import bound_samples, pack_as_bytes
-
-try:
-    from cyclonedds.idl.types import byte
-except ImportError:  # Cyclone DDS 0.10 means by uint8 what 11 means by byte
-    from cyclonedds.idl.types import uint8 as byte
 
 SAMPLE_MAX = 16 * 2**10
 """Longest sample that is decoded, in bytes: 200 transforms, or 300 joints."""
@@ -30,259 +25,100 @@ ARRAY_MAX = 256 * 2**10
 PICTURE_MAX = 3 * 2**20
 """The same of pictures, whose bytes are copied thrice: a raw one of 1280 by 720 fits."""
 
-KINDS: dict[str, type[Any]] = {}
-"""The IDL type of each ``pkg/Name`` that this bundle carries."""
-
-
-def _typed(kind: str) -> dict[str, str]:
-    package, _, name = kind.partition("/")
-    return {"typename": f"{package}::msg::dds_::{name}_"}
-
-
-def _nine() -> list[float]:
-    return [0.0] * 9
-
-
-def _thirty_six() -> list[float]:
-    return [0.0] * 36
-
-
-# The library's own spellings of lists are values, which a type checker cannot read.
-if TYPE_CHECKING:
-    Strings = list[str]
-    Float32s = list[float]
-    Int8s = list[int]
-    Float64s = list[float]
-    Nine = list[float]
-    ThirtySix = list[float]
-    Bytes = bytes
-else:
-    Strings = sequence[str]
-    Float32s = sequence[float32]
-    Int8s = sequence[int8]
-    Float64s = sequence[float64]
-    Bytes = sequence[byte]
-    Nine = array[float64, 9]
-    ThirtySix = array[float64, 36]
-
-
-@dataclass
-class Time(IdlStruct, **_typed("builtin_interfaces/Time")):
-    sec: int32 = 0
-    nanosec: uint32 = 0
-
-
-@dataclass
-class Header(IdlStruct, **_typed("std_msgs/Header")):
-    stamp: Time = field(default_factory=Time)
-    frame_id: str = ""
-
-
-@dataclass
-class String(IdlStruct, **_typed("std_msgs/String")):
-    data: str = ""
-
-
-@dataclass
-class Vector3(IdlStruct, **_typed("geometry_msgs/Vector3")):
-    x: float64 = 0.0
-    y: float64 = 0.0
-    z: float64 = 0.0
-
-
-@dataclass
-class Point(IdlStruct, **_typed("geometry_msgs/Point")):
-    x: float64 = 0.0
-    y: float64 = 0.0
-    z: float64 = 0.0
-
-
-@dataclass
-class Quaternion(IdlStruct, **_typed("geometry_msgs/Quaternion")):
-    x: float64 = 0.0
-    y: float64 = 0.0
-    z: float64 = 0.0
-    w: float64 = 1.0
-
-
-@dataclass
-class Twist(IdlStruct, **_typed("geometry_msgs/Twist")):
-    linear: Vector3 = field(default_factory=Vector3)
-    angular: Vector3 = field(default_factory=Vector3)
-
-
-@dataclass
-class TwistStamped(IdlStruct, **_typed("geometry_msgs/TwistStamped")):
-    header: Header = field(default_factory=Header)
-    twist: Twist = field(default_factory=Twist)
-
-
-@dataclass
-class TwistWithCovariance(IdlStruct, **_typed("geometry_msgs/TwistWithCovariance")):
-    twist: Twist = field(default_factory=Twist)
-    covariance: ThirtySix = field(default_factory=_thirty_six)
-
-
-@dataclass
-class Pose(IdlStruct, **_typed("geometry_msgs/Pose")):
-    position: Point = field(default_factory=Point)
-    orientation: Quaternion = field(default_factory=Quaternion)
-
-
-@dataclass
-class PoseStamped(IdlStruct, **_typed("geometry_msgs/PoseStamped")):
-    header: Header = field(default_factory=Header)
-    pose: Pose = field(default_factory=Pose)
-
-
-@dataclass
-class PoseWithCovariance(IdlStruct, **_typed("geometry_msgs/PoseWithCovariance")):
-    pose: Pose = field(default_factory=Pose)
-    covariance: ThirtySix = field(default_factory=_thirty_six)
-
-
-@dataclass
-class Transform(IdlStruct, **_typed("geometry_msgs/Transform")):
-    translation: Vector3 = field(default_factory=Vector3)
-    rotation: Quaternion = field(default_factory=Quaternion)
-
-
-@dataclass
-class TransformStamped(IdlStruct, **_typed("geometry_msgs/TransformStamped")):
-    header: Header = field(default_factory=Header)
-    child_frame_id: str = ""
-    transform: Transform = field(default_factory=Transform)
-
-
-if TYPE_CHECKING:
-    Transforms = list[TransformStamped]
-else:
-    Transforms = sequence[TransformStamped]
-
-
-@dataclass
-class TFMessage(IdlStruct, **_typed("tf2_msgs/TFMessage")):
-    transforms: Transforms = field(default_factory=list)
-
-
-@dataclass
-class Odometry(IdlStruct, **_typed("nav_msgs/Odometry")):
-    header: Header = field(default_factory=Header)
-    child_frame_id: str = ""
-    pose: PoseWithCovariance = field(default_factory=PoseWithCovariance)
-    twist: TwistWithCovariance = field(default_factory=TwistWithCovariance)
-
-
-@dataclass
-class MapMetaData(IdlStruct, **_typed("nav_msgs/MapMetaData")):
-    map_load_time: Time = field(default_factory=Time)
-    resolution: float32 = 0.0
-    width: uint32 = 0
-    height: uint32 = 0
-    origin: Pose = field(default_factory=Pose)
-
-
-@dataclass
-class OccupancyGrid(IdlStruct, **_typed("nav_msgs/OccupancyGrid")):
-    header: Header = field(default_factory=Header)
-    info: MapMetaData = field(default_factory=MapMetaData)
-    data: Int8s = field(default_factory=list)
-
-
-@dataclass
-class TurtlePose(IdlStruct, **_typed("turtlesim/Pose")):
-    x: float32 = 0.0
-    y: float32 = 0.0
-    theta: float32 = 0.0
-    linear_velocity: float32 = 0.0
-    angular_velocity: float32 = 0.0
-
-
-@dataclass
-class JointState(IdlStruct, **_typed("sensor_msgs/JointState")):
-    header: Header = field(default_factory=Header)
-    name: Strings = field(default_factory=list)
-    position: Float64s = field(default_factory=list)
-    velocity: Float64s = field(default_factory=list)
-    effort: Float64s = field(default_factory=list)
-
-
-@dataclass
-class LaserScan(IdlStruct, **_typed("sensor_msgs/LaserScan")):
-    header: Header = field(default_factory=Header)
-    angle_min: float32 = 0.0
-    angle_max: float32 = 0.0
-    angle_increment: float32 = 0.0
-    time_increment: float32 = 0.0
-    scan_time: float32 = 0.0
-    range_min: float32 = 0.0
-    range_max: float32 = 0.0
-    ranges: Float32s = field(default_factory=list)
-    intensities: Float32s = field(default_factory=list)
-
-
-@dataclass
-class Image(IdlStruct, **_typed("sensor_msgs/Image")):
-    header: Header = field(default_factory=Header)
-    height: uint32 = 0
-    width: uint32 = 0
-    encoding: str = ""
-    is_bigendian: byte = 0
-    step: uint32 = 0
-    data: Bytes = field(default_factory=bytes)
-
-
-@dataclass
-class CompressedImage(IdlStruct, **_typed("sensor_msgs/CompressedImage")):
-    header: Header = field(default_factory=Header)
-    format: str = ""
-    data: Bytes = field(default_factory=bytes)
-
-
-@dataclass
-class ImuMessage(IdlStruct, **_typed("sensor_msgs/Imu")):
-    header: Header = field(default_factory=Header)
-    orientation: Quaternion = field(default_factory=Quaternion)
-    orientation_covariance: Nine = field(default_factory=_nine)
-    angular_velocity: Vector3 = field(default_factory=Vector3)
-    angular_velocity_covariance: Nine = field(default_factory=_nine)
-    linear_acceleration: Vector3 = field(default_factory=Vector3)
-    linear_acceleration_covariance: Nine = field(default_factory=_nine)
-
-
-@dataclass
-class BatteryState(IdlStruct, **_typed("sensor_msgs/BatteryState")):
-    header: Header = field(default_factory=Header)
-    voltage: float32 = 0.0
-    temperature: float32 = 0.0
-    current: float32 = 0.0
-    charge: float32 = 0.0
-    capacity: float32 = 0.0
-    design_capacity: float32 = 0.0
-    percentage: float32 = 0.0
-    power_supply_status: byte = 0
-    power_supply_health: byte = 0
-    power_supply_technology: byte = 0
-    present: bool = False
-    cell_voltage: Float32s = field(default_factory=list)
-    cell_temperature: Float32s = field(default_factory=list)
-    location: str = ""
-    serial_number: str = ""
-
-
-pack_as_bytes(Image, "data")
-pack_as_bytes(CompressedImage, "data")
-
 _LONGEST = {
-    Image: PICTURE_MAX,
-    CompressedImage: PICTURE_MAX,
-    LaserScan: ARRAY_MAX,
-    OccupancyGrid: ARRAY_MAX,
-    String: TEXT_MAX,
+    "sensor_msgs/Image": PICTURE_MAX,
+    "sensor_msgs/CompressedImage": PICTURE_MAX,
+    "sensor_msgs/LaserScan": ARRAY_MAX,
+    "nav_msgs/OccupancyGrid": ARRAY_MAX,
+    "std_msgs/String": TEXT_MAX,
 }
 
-for _struct in IdlStruct.__subclasses__():
-    if _struct.__module__ == __name__:
-        _package, _, _, _name = _struct.__idl_typename__.split("::")
-        KINDS[f"{_package}/{_name.removesuffix('_')}"] = _struct
-        bound_samples(_struct, _LONGEST.get(_struct, SAMPLE_MAX))
+DEFINITIONS = """
+builtin_interfaces/Time: int32 sec, uint32 nanosec
+std_msgs/Header: builtin_interfaces/Time stamp, string frame_id
+std_msgs/String: string data
+geometry_msgs/Vector3: float64 x, float64 y, float64 z
+geometry_msgs/Point: float64 x, float64 y, float64 z
+geometry_msgs/Quaternion: float64 x, float64 y, float64 z, float64 w 1
+geometry_msgs/Twist: geometry_msgs/Vector3 linear, geometry_msgs/Vector3 angular
+geometry_msgs/TwistStamped: std_msgs/Header header, geometry_msgs/Twist twist
+geometry_msgs/TwistWithCovariance: geometry_msgs/Twist twist, float64[36] covariance
+geometry_msgs/Pose: geometry_msgs/Point position, geometry_msgs/Quaternion orientation
+geometry_msgs/PoseStamped: std_msgs/Header header, geometry_msgs/Pose pose
+geometry_msgs/PoseWithCovariance: geometry_msgs/Pose pose, float64[36] covariance
+geometry_msgs/Transform: geometry_msgs/Vector3 translation, geometry_msgs/Quaternion rotation
+geometry_msgs/TransformStamped: std_msgs/Header header, string child_frame_id, geometry_msgs/Transform transform
+tf2_msgs/TFMessage: geometry_msgs/TransformStamped[] transforms
+nav_msgs/Odometry: std_msgs/Header header, string child_frame_id,
+    geometry_msgs/PoseWithCovariance pose, geometry_msgs/TwistWithCovariance twist
+nav_msgs/MapMetaData: builtin_interfaces/Time map_load_time, float32 resolution, uint32 width, uint32 height,
+    geometry_msgs/Pose origin
+nav_msgs/OccupancyGrid: std_msgs/Header header, nav_msgs/MapMetaData info, int8[] data
+turtlesim/Pose: float32 x, float32 y, float32 theta, float32 linear_velocity, float32 angular_velocity
+sensor_msgs/JointState: std_msgs/Header header, string[] name, float64[] position, float64[] velocity, float64[] effort
+sensor_msgs/LaserScan: std_msgs/Header header, float32 angle_min, float32 angle_max, float32 angle_increment,
+    float32 time_increment, float32 scan_time, float32 range_min, float32 range_max, float32[] ranges,
+    float32[] intensities
+sensor_msgs/Image: std_msgs/Header header, uint32 height, uint32 width, string encoding, uint8 is_bigendian,
+    uint32 step, uint8[] data
+sensor_msgs/CompressedImage: std_msgs/Header header, string format, uint8[] data
+sensor_msgs/Imu: std_msgs/Header header,
+    geometry_msgs/Quaternion orientation, float64[9] orientation_covariance,
+    geometry_msgs/Vector3 angular_velocity, float64[9] angular_velocity_covariance,
+    geometry_msgs/Vector3 linear_acceleration, float64[9] linear_acceleration_covariance
+sensor_msgs/BatteryState: std_msgs/Header header, float32 voltage, float32 temperature, float32 current,
+    float32 charge, float32 capacity, float32 design_capacity, float32 percentage, uint8 power_supply_status,
+    uint8 power_supply_health, uint8 power_supply_technology, bool present, float32[] cell_voltage,
+    float32[] cell_temperature, string location, string serial_number
+"""
+"""Types that bare DDS carries: name, and each field as in the public ``.msg`` files, a default behind its name."""
+
+_idl: Any = types
+# Cyclone DDS 0.10 means by uint8 what 11 means by byte.
+_IDL_NAMES = {"bool": bool, "string": str, "uint8": getattr(_idl, "byte", _idl.uint8)}
+
+KINDS: dict[str, type[Any]] = {}
+"""The IDL type of each ``pkg/Name`` of :data:`DEFINITIONS`."""
+
+
+def _field(kind: str, default: str) -> tuple[Any, Any, str]:
+    """Return a field's IDL type, its dataclass default, and its type in words."""
+    item, several, length = kind.removesuffix("]").partition("[")
+    if item in KINDS:
+        idl, word, zero = KINDS[item], item, field(default_factory=KINDS[item])
+    else:
+        idl = _IDL_NAMES.get(item) or getattr(_idl, item)
+        # A number's type is Annotated[float, "float64"]; those of text and truth are themselves.
+        plain = (get_args(idl) or (idl,))[0]
+        word, zero = plain.__name__, plain(default) if default else plain()
+    if length:
+        zeros = [zero] * int(length)
+        return _idl.array[idl, len(zeros)], field(default_factory=zeros.copy), f"{word}[{length}]"
+    if several and item == "uint8":
+        return _idl.sequence[idl], b"", "bytes"
+    if several:
+        return _idl.sequence[idl], field(default_factory=list), f"sequence<{word}>"
+    return idl, zero, word
+
+
+def _struct(kind: str, declared: list[list[str]]) -> type[Any]:
+    """Return a message's IDL type; each field has a type, a name, maybe a default."""
+    package, _, name = kind.partition("/")
+    fields = {called: _field(of, "".join(default)) for of, called, *default in declared}
+    idl_types = {called: idl for called, (idl, _, _) in fields.items()}
+    struct: Any = make_idl_struct(name, f"{package}::msg::dds_::{name}_", idl_types, dataclassify=False)
+    for called, (_, default, _) in fields.items():
+        setattr(struct, called, default)
+    struct = dataclass(struct)
+    words = {called: word for called, (_, _, word) in fields.items()}
+    struct.get_fields_and_field_types = staticmethod(lambda: words)
+    pictures = [called for called, word in words.items() if word == "bytes"]
+    if pictures:
+        pack_as_bytes(struct, *pictures)
+    bound_samples(struct, _LONGEST.get(kind, SAMPLE_MAX))
+    return struct  # type: ignore[no-any-return]
+
+
+for _line in DEFINITIONS.replace(",\n", ",").strip().splitlines():
+    _kind, _, _fields = _line.partition(": ")
+    KINDS[_kind] = _struct(_kind, [each.split() for each in _fields.split(",")])

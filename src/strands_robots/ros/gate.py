@@ -15,7 +15,7 @@ from typing import Any
 
 from strands_robots import settings
 from strands_robots.envelope import Envelope, error
-from strands_robots.ros.names import bare_kind
+from strands_robots.ros.link import bare_kind
 
 ALLOW = "STRANDS_ROS2_COMMAND_ALLOW"
 

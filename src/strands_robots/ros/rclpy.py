@@ -1,23 +1,46 @@
-"""Link to a ROS 2 graph through rclpy of the ROS 2 that is sourced."""
+"""Link to a ROS 2 graph through rclpy of the ROS 2 that is sourced, and its node."""
 
 from __future__ import annotations
 
+import atexit
 import logging
-import re
 import threading
 import time
-from array import array
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from importlib import import_module
+from importlib.util import find_spec
+from types import ModuleType
 from typing import Any
 from weakref import WeakSet
 
-from strands_robots.ros.link import CancelCheck, Goal, Message, OnMessage, RosError, Unwatch, never, next_message
-from strands_robots.ros.names import absolute, bare_kind, class_place, domain, is_latched, node_name
-from strands_robots.ros.rclpy_session import RclpySession, ros2
-from strands_robots.utils import number, shown, whole
+from strands_robots.ros.link import (
+    CancelCheck,
+    Goal,
+    Message,
+    OnMessage,
+    RosError,
+    Unwatch,
+    absolute,
+    bare_kind,
+    class_place,
+    domain,
+    is_latched,
+    never,
+    next_message,
+    node_name,
+)
+from strands_robots.ros.messages import filled, plain
+from strands_robots.utils import number, whole
 
 logger = logging.getLogger(__name__)
+
+SPIN_S = 0.1
+"""Longest time in seconds that the executor waits before it checks whether to end."""
+
+NO_RCLPY = (
+    "rclpy cannot be imported here: source a ROS 2 installation, Humble or later, "
+    "and use the Python that it was built for."
+)
 
 DEPTH = 10
 MAX_QOS_HISTORY_DEPTH = 2**31 - 1
@@ -25,10 +48,101 @@ MAX_QOS_HISTORY_DEPTH = 2**31 - 1
 
 WAIT_S = 0.002
 
-_SEQUENCE = re.compile(r"sequence<(.+?)(?:, *(\d+))?>\Z")
-_ARRAY = re.compile(r"(.+)\[(\d+)\]\Z")
-_INTEGER = re.compile(r"(u?)int(8|16|32|64)\Z")
-_NUMBERS: dict[str, type] = {"float": float, "double": float, "long double": float, "boolean": bool}
+
+def sourced() -> bool:
+    """Return True where the Python client of a ROS 2 is on the path."""
+    return find_spec("rclpy") is not None
+
+
+def ros2(module: str) -> ModuleType:
+    """Import a module of the ROS 2 client, or raise :class:`RosError`."""
+    try:
+        return import_module(module)
+    except ImportError as exc:
+        raise RosError(f"{NO_RCLPY} ({exc})") from exc
+
+
+class RclpySession:
+    """One node, spun by a thread of its own from construction to :meth:`close`.
+
+    It has its own context: it installs no signal handler, writes no environment variable for its domain, and is
+    independent of any other use of rclpy in the process.
+
+    Raises:
+        RosError: no ROS 2 is sourced, or its middleware did not start.
+    """
+
+    def __init__(self, name: str, domain_id: int) -> None:
+        rclpy, contexts, executors = ros2("rclpy"), ros2("rclpy.context"), ros2("rclpy.executors")
+        self._rclpy = rclpy
+        self._context = contexts.Context()
+        try:
+            rclpy.init(context=self._context, domain_id=domain_id)
+            self.node = rclpy.create_node(
+                name,
+                context=self._context,
+                use_global_arguments=False,
+                enable_rosout=False,
+                start_parameter_services=False,
+            )
+            self._executor = executors.SingleThreadedExecutor(context=self._context)
+            self._executor.add_node(self.node)
+        except Exception as exc:
+            # Whatever the middleware raises; what has been made so far goes with the context.
+            self._shut()
+            raise RosError(f"ROS 2 could not be joined in domain {domain_id}: {exc}") from exc
+        self._done = threading.Event()
+        self._thread = threading.Thread(target=self._spin, name=f"rclpy-{name}", daemon=True)
+        self._thread.start()
+        # A thread that is still inside the client library at the interpreter's exit can abort the process.
+        atexit.register(self.close)
+
+    def later(self, action: Callable[[], None]) -> None:
+        """Run ``action`` on the executor's thread, soon, and log what it raises.
+
+        Requests go out there: a response that arrives before its request is registered would be lost.
+        """
+
+        def run() -> None:
+            try:
+                action()
+            except Exception:
+                logger.exception("A request to the ROS 2 graph failed.")
+
+        self._executor.create_task(run)
+
+    def close(self, parts: Sequence[Any] = ()) -> None:
+        """End the thread and take the node off the graph; not from a callback.
+
+        A second call does nothing; the interpreter's exit calls it for every session that is still open.
+
+        Args:
+            parts: parts that the node does not destroy by itself, such as its action clients.
+        """
+        atexit.unregister(self.close)
+        if self._done.is_set():
+            return
+        self._done.set()
+        self._thread.join(20 * SPIN_S)
+        for each in parts:
+            each.destroy()
+        self._executor.shutdown(timeout_sec=SPIN_S)
+        self.node.destroy_node()
+        self._shut()
+
+    def _shut(self) -> None:
+        if self._context.ok():
+            self._rclpy.shutdown(context=self._context)
+
+    def _spin(self) -> None:
+        while not self._done.is_set() and self._context.ok():
+            try:
+                self._executor.spin_once(timeout_sec=SPIN_S)
+            except Exception:
+                if self._done.is_set() or not self._context.ok():
+                    return
+                logger.exception("The executor of %s raised; it goes on.", self._thread.name)
+                self._done.wait(SPIN_S)
 
 
 class RclpyLink:
@@ -61,7 +175,7 @@ class RclpyLink:
         self._lock = threading.RLock()
         self._session: RclpySession | None = None
         self._opened_at = 0.0
-        self._made: dict[tuple[str, str, str], Any] = {}
+        self._endpoints: dict[tuple[str, str, str], Any] = {}
         self._goals: WeakSet[Goal] = WeakSet()
 
     def open(self) -> RclpySession:
@@ -73,7 +187,7 @@ class RclpyLink:
             return self._session
 
     def publish(self, topic: str, kind: str, fields: Message) -> None:
-        message = filled(interface_class(kind, "msg")(), fields)
+        message = filled(_new(kind), fields, _new)
         publisher = self._publisher(topic, kind)
         if not self._wait_for(lambda: bool(publisher.get_subscription_count()), self._match_s):
             raise RosError(f"No subscription to {topic} as {bare_kind(kind)} in domain {self.domain_id}.")
@@ -81,7 +195,7 @@ class RclpyLink:
 
     def broadcast(self, topic: str, kind: str, fields: Message) -> None:
         """Publish, such as telemetry, whether or not there is a subscription."""
-        message = filled(interface_class(kind, "msg")(), fields)
+        message = filled(_new(kind), fields, _new)
         _send(self._publisher(topic, kind), message, topic, kind)
 
     def read(self, topic: str, kind: str | None, within_s: float) -> dict[str, Any]:
@@ -114,7 +228,7 @@ class RclpyLink:
     def call(self, service: str, kind: str, fields: Message, within_s: float) -> dict[str, Any]:
         deadline = time.monotonic() + within_s
         struct = interface_class(kind, "srv")
-        request = filled(struct.Request(), fields)
+        request = filled(struct.Request(), fields, _new)
         session = self.open()
         client = self._cached("srv", service, kind, lambda: session.node.create_client(struct, absolute(service)))
         if not self._wait_for(client.service_is_ready, within_s):
@@ -145,7 +259,7 @@ class RclpyLink:
     ) -> Goal:
         deadline = time.monotonic() + within_s
         struct = interface_class(kind, "action")
-        message = filled(struct.Goal(), goal)
+        message = filled(struct.Goal(), goal, _new)
         session = self.open()
         make = ros2("rclpy.action").ActionClient
         client = self._cached("action", action, kind, lambda: make(session.node, struct, absolute(action)))
@@ -199,8 +313,8 @@ class RclpyLink:
     def close(self) -> None:
         with self._lock:
             session, self._session = self._session, None
-            actions = [made for (section, _, _), made in self._made.items() if section == "action"]
-            self._made.clear()
+            actions = [client for (section, _, _), client in self._endpoints.items() if section == "action"]
+            self._endpoints.clear()
         for goal in list(self._goals):
             goal.fail("the link was closed")
         if session is not None:
@@ -218,12 +332,12 @@ class RclpyLink:
     def _cached(self, section: str, name: str, kind: str, make: Callable[[], Any]) -> Any:
         key = (section, name, bare_kind(kind))
         with self._lock:
-            if key not in self._made:
+            if key not in self._endpoints:
                 try:
-                    self._made[key] = make()
+                    self._endpoints[key] = make()
                 except Exception as exc:
                     raise RosError(f"{name} cannot be used as {bare_kind(kind)}: {exc}") from exc
-            return self._made[key]
+            return self._endpoints[key]
 
     def _kind_of(self, topic: str) -> str:
         node, found = self.open().node, list[str]()
@@ -343,93 +457,5 @@ def interface_class(kind: str, section: str) -> Any:
     return found
 
 
-def filled(message: Any, fields: Mapping[str, Any], place: str = "") -> Any:
-    """Set fields of ``message`` and return it; a wrong one is a RosError.
-
-    A message class describes its fields by ``get_fields_and_field_types``, in the terms of the ROS 2 interface
-    definition: ``double``, ``string<10>``, ``sequence<uint8>``, ``double[36]``, ``geometry_msgs/Vector3``.
-    """
-    types = message.get_fields_and_field_types()
-    for name, value in fields.items():
-        if name not in types:
-            raise RosError(f"{type(message).__name__} has no field {place}{name}; it has {', '.join(types)}.")
-        where = f"{place}{name}"
-        try:
-            setattr(message, name, _value(types[name], value, where, getattr(message, name)))
-        except (AssertionError, OverflowError) as exc:
-            raise RosError(f"{where} must be a {types[name]}, not {shown(value)}.") from exc
-    return message
-
-
-def plain(message: Any) -> dict[str, Any]:
-    """Return the fields of a message as numbers, text, bytes, lists and dictionaries."""
-    types = message.get_fields_and_field_types()
-    return {name: _plain(kind, getattr(message, name)) for name, kind in types.items()}
-
-
-def _value(kind: str, value: Any, place: str, zero: Any = None) -> Any:
-    if (several := _several(kind)) is not None:
-        return _items(*several, value, place)
-    if "/" in kind:
-        if not isinstance(value, Mapping):
-            raise RosError(f"{place} must be an object of fields, not {shown(value)}.")
-        return filled(interface_class(kind, "msg")() if zero is None else zero, value, f"{place}.")
-    if kind == "octet":
-        if not isinstance(value, int) or isinstance(value, bool):
-            raise RosError(f"{place} must be an octet, not {shown(value)}.")
-        return value.to_bytes(1, "little")
-    wanted = str if kind.partition("<")[0] in ("string", "wstring") else _NUMBERS.get(kind, int)
-    if wanted is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
-    if not isinstance(value, wanted) or (wanted is int and isinstance(value, bool)):
-        raise RosError(f"{place} must be a {kind}, not {shown(value)}.")
-    # Newer ROS 2 checks no value in its setters, and the conversion to C would cut an integer.
-    return _whole(kind, value, place) if isinstance(value, int) else value
-
-
-def _whole(kind: str, value: int, place: str) -> int:
-    integer = _INTEGER.match(kind)
-    if integer is not None:
-        bits = int(integer[2])
-        low, high = (0, 2**bits) if integer[1] else (-(2 ** (bits - 1)), 2 ** (bits - 1))
-        if not low <= value < high:
-            raise RosError(f"{place} must be a {kind}, from {low} to {high - 1}, not {shown(value)}.")
-    return value
-
-
-def _items(kind: str, length: int | None, value: Any, place: str) -> Any:
-    if kind == "uint8" and str(getattr(value, "dtype", "")) == "uint8":
-        value = value.tobytes()
-    if kind == "uint8" and isinstance(value, bytes | bytearray):
-        items: Any = bytes(value)
-    else:
-        items = value.tolist() if callable(getattr(value, "tolist", None)) else value
-        if not isinstance(items, Sequence) or isinstance(items, str | bytes):
-            raise RosError(f"{place} must be a list, not {shown(value)}.")
-        items = [_value(kind, each, f"{place}[{n}]") for n, each in enumerate(items)]
-    if length is not None and len(items) != length:
-        raise RosError(f"{place} must have {length} items, not {len(items)}.")
-    # An array of the right type is taken as it is; every other sequence would be checked number by number.
-    return array("B", items) if kind == "uint8" and length is None else items
-
-
-def _plain(kind: str, value: Any) -> Any:
-    several = _several(kind)
-    if several is not None:
-        if several[0] == "uint8":
-            return bytes(value)
-        if "/" in several[0] or several[0] == "octet":
-            return [_plain(several[0], each) for each in value]
-        return value.tolist() if callable(getattr(value, "tolist", None)) else list(value)
-    if "/" in kind:
-        return plain(value)
-    return value[0] if kind == "octet" else value
-
-
-def _several(kind: str) -> tuple[str, int | None] | None:
-    """Return the item type and the fixed length of a list; None for other types."""
-    if (found := _SEQUENCE.match(kind)) is not None:
-        return found[1], None
-    if (found := _ARRAY.match(kind)) is not None:
-        return found[1], int(found[2])
-    return None
+def _new(kind: str) -> Any:
+    return interface_class(kind, "msg")()

@@ -18,9 +18,10 @@ from strands_robots.ros.link import (
     OnMessage,
     RosError,
     Unwatch,
+    bare_kind,
+    deliver,
     never,
 )
-from strands_robots.ros.names import bare_kind
 from strands_robots.ros.rosbridge_session import (
     Fragments,
     RosbridgeAccess,
@@ -422,10 +423,7 @@ class RosbridgeLink:
         subscription.silent = False
         whole = with_bytes(subscription.kind, body)
         for each in watchers:
-            try:
-                each(whole)
-            except Exception:
-                logger.exception("A watcher of %s failed.", topic)
+            deliver(each, whole, str(topic))
 
     def _status(self, message: dict[str, Any]) -> None:
         said = f"rosbridge says: {shown(message.get('msg'))}"

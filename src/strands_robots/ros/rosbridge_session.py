@@ -25,9 +25,8 @@ from socket import SHUT_RDWR, SO_LINGER, SOL_SOCKET
 from typing import Any
 
 from strands_robots.bounded_json import LONG_MAX, MESSAGE_MAX, OutOfBoundsError, parsed
-from strands_robots.ros.link import Message, NoReceiptError, RosError
-from strands_robots.ros.names import bare_kind
-from strands_robots.utils import ValidationError, dial_host_error, mapping, missing_extra, port, shown, text
+from strands_robots.ros.link import Message, NoReceiptError, RosError, bare_kind
+from strands_robots.utils import ValidationError, dial_host_error, mapping, optional_module, port, shown, text
 
 logger = logging.getLogger(__name__)
 
@@ -255,7 +254,7 @@ class RosbridgeSession:
         with self._lock:
             if self._thread is not None and self._thread.is_alive():
                 return
-            client = _websockets_client()
+            client = optional_module("websockets.sync.client", what="A rosbridge connection", extra="rosbridge")
             self._settled = threading.Event()
             self._closing = threading.Event()
             self._thread = threading.Thread(
@@ -468,13 +467,3 @@ class UrgentConnection:
 
     def _lost(self, why: str) -> None:
         logger.info("The second connection to %s was lost: %s", self._session.url, why)
-
-
-def _websockets_client() -> Any:
-    try:
-        from websockets.sync import client  # noqa: PLC0415 - loaded when a connection is asked for
-    except ModuleNotFoundError as exc:
-        if (exc.name or "").partition(".")[0] != "websockets":
-            raise
-        raise missing_extra("A rosbridge connection", "rosbridge") from exc
-    return client

@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 from fixtures.ros_bases import OPEN, TOPIC, Made
+from fixtures.ros_memory import MemoryLink
 
 from strands_robots.drivers.ros.mobile_base import MobileBaseRobot, PosedBaseRobot
-from strands_robots.ros.memory import MemoryLink
 
 
 @pytest.fixture(autouse=True)

@@ -6,13 +6,13 @@ from typing import Any
 
 import pytest
 from fixtures.ros_bases import Lock
+from fixtures.ros_memory import MemoryLink
 from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from strands_robots.drivers.ros.ackermann_robot import AckermannRosRobot
 from strands_robots.ros.gate import CommandGate
-from strands_robots.ros.memory import MemoryLink
 from strands_robots.utils import ValidationError
 
 OPEN = CommandGate(lambda _: ("manual_drive", "vehicle_state", "enable_state"), lambda: False)

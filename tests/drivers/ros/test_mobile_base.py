@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 from fixtures.ros_bases import OPEN, SHUT, TOPIC, FaultyLink, Made, memory, none_left, velocities
+from fixtures.ros_memory import MemoryLink
 from fixtures.waiting import eventually
 from hypothesis import given
 from hypothesis import settings as hypothesis_settings
@@ -22,7 +23,6 @@ from strands_robots.drivers.ros.mobile_base import MobileBaseRobot, PosedBaseRob
 from strands_robots.drivers.ros.ros_bridge import RosBridgedRobot
 from strands_robots.envelope import error
 from strands_robots.ros.link import EarlierRefusedError
-from strands_robots.ros.memory import MemoryLink
 from strands_robots.utils import ValidationError
 
 speed = st.floats(min_value=-5, max_value=5)

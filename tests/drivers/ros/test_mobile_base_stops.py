@@ -10,10 +10,10 @@ from typing import Any
 
 import pytest
 from fixtures.ros_bases import TOPIC, FaultyLink, Lock, Made, memory, none_left, velocities
+from fixtures.ros_memory import MemoryLink
 from fixtures.waiting import eventually
 
 from strands_robots.ros.link import OnMessage, RosError, Unwatch
-from strands_robots.ros.memory import MemoryLink
 from strands_robots.safety.stop_executor import stop_executor
 from strands_robots.safety.stopping import Outcome, grade
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 from fixtures.ros_bases import Lock, memory, none_left, velocities
+from fixtures.ros_memory import MemoryLink
 from fixtures.waiting import eventually
 
 from strands_robots.contract import TaskRobot
@@ -15,7 +16,6 @@ from strands_robots.drivers.ros.rtps_robot import RtpsRobot
 from strands_robots.envelope import Envelope
 from strands_robots.ros.gate import CommandGate
 from strands_robots.ros.link import Goal, Message, OnMessage, RosError
-from strands_robots.ros.memory import MemoryLink
 from strands_robots.utils import ValidationError
 
 NAV = "/navigate_to_pose"
@@ -318,8 +318,8 @@ def test_invalid_constructor_argument_is_refused_by_name(options: dict[str, Any]
 
 def test_robot_without_ros_is_constructed_and_its_verbs_name_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "1")
-    monkeypatch.setattr("strands_robots.ros.ros2.sourced", lambda: False)
-    monkeypatch.setattr("strands_robots.ros.ros2.find_spec", lambda name: None)
+    monkeypatch.setattr("strands_robots.ros.actions.sourced", lambda: False)
+    monkeypatch.setattr("strands_robots.ros.actions.find_spec", lambda name: None)
     robot = RosBridgedRobot.from_ros("rover", cmd_vel_topic="/cmd_vel", odom_topic="/odom", command_gate=OPEN)
     assert isinstance(robot, TaskRobot)
     for answer in (robot.drive(0.1), robot.get_pose(), robot.stop()):

@@ -13,11 +13,11 @@ import pytest
 from fixtures.child import Child
 from fixtures.nats_server import NatsServer
 from fixtures.page_driving import answer, card, hold_until, middle, moving, open_robot, take
+from fixtures.page_feed import forms_of
 from fixtures.page_site import picture, shows
 from fixtures.served_page import ServedPage
 from fixtures.waiting import eventually
 
-from strands_robots.dashboard.verb_forms import forms_of
 from strands_robots.device_connect.backends import LinkConfig
 from strands_robots.safety.ed25519 import keygen
 

@@ -12,13 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fixtures.page_feed import PageFeed
+from fixtures.page_feed import PageFeed, forms_of
 from fixtures.page_site import picture, shows
 from fixtures.served_page import FORMS, ServedPage
 from fixtures.waiting import eventually
 from PIL import Image
 
-from strands_robots.dashboard.verb_forms import forms_of
 from strands_robots.envelope import success
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(300)]

@@ -15,7 +15,7 @@ from fixtures.waiting import eventually
 
 pytest.importorskip("playwright.sync_api")
 
-from strands_robots.dashboard.verb_forms import forms_of
+from fixtures.page_feed import forms_of
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(300)]
 

@@ -12,12 +12,12 @@ from typing import Any
 
 import pytest
 from fixtures.page_driving import open_robot, verb_form
+from fixtures.page_feed import forms_of
 from fixtures.page_site import picture, shows
 from fixtures.served_page import FORMS, ServedPage
 from fixtures.waiting import eventually
 from PIL import Image
 
-from strands_robots.dashboard.verb_forms import forms_of
 from strands_robots.envelope import error, success
 from strands_robots.safety.answers import Answer
 

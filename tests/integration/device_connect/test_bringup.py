@@ -24,6 +24,7 @@ from device_connect_edge.drivers import DeviceDriver, rpc
 from fixtures.certificates import Authority, Identity
 from fixtures.nats_credentials import NatsAccounts, Token
 from fixtures.nats_server import NatsServer
+from fixtures.ros_memory import MemoryLink
 from fixtures.toy_robots import ToyRobot, ToyWorld
 from fixtures.waiting import eventually, free_port
 from fixtures.zenoh_router import ZenohRouter
@@ -43,7 +44,6 @@ from strands_robots.device_connect.client import CallRefusedError
 from strands_robots.device_connect.robot_driver import RobotDeviceDriver
 from strands_robots.device_connect.simulation_driver import SimulationDeviceDriver
 from strands_robots.drivers.ros.mobile_base import MobileBaseRobot
-from strands_robots.ros.memory import MemoryLink
 from strands_robots.safety.plane import plane
 from strands_robots.serving.offered_verbs import offered
 from strands_robots.utils import ValidationError

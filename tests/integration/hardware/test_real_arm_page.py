@@ -20,8 +20,8 @@ from fixtures.waiting import until
 from PIL import Image
 
 from strands_robots.dashboard.driving import HandControl
+from strands_robots.dashboard.pictures import Poses
 from strands_robots.dashboard.pose_process import PosePainter
-from strands_robots.dashboard.poses import Poses
 from strands_robots.device_connect import FleetClient, loopback_config
 
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")

@@ -10,8 +10,14 @@ import pytest
 from fixtures.feetech_bus import FeetechBus
 from fixtures.waiting import eventually
 
-from strands_robots.recording.file import RecordedEvent, RecordedJoints, Recorder, read_items, recorded_actions
-from strands_robots.recording.sampling import RobotRecording
+from strands_robots.recording.file import (
+    RecordedEvent,
+    RecordedJoints,
+    Recorder,
+    RobotRecording,
+    read_items,
+    recorded_actions,
+)
 
 pytestmark = pytest.mark.system
 

@@ -21,7 +21,7 @@ pytest.importorskip("mcp.server.mcpserver", reason="needs the extra mcp", exc_ty
 
 import httpx2
 
-from strands_robots.mcp import connections, http, sessions
+from strands_robots.mcp import connections, http
 from strands_robots.mesh.keys import CA_CERT, init, issue
 from strands_robots.serving.control_leases import leases_of
 
@@ -131,7 +131,7 @@ def test_sessions_that_nobody_uses_are_ended_for_new_ones(site: McpSite, url: st
                 assert client.post(url, json=ping, headers={"Mcp-Session-Id": used}).status_code == 200
         alive = [each for each in ids if client.post(url, json=ping, headers={"Mcp-Session-Id": each}).is_success]
         assert alive == ids[-len(alive) :]
-        assert 0 < len(alive) <= sessions.TOKEN_MAX
+        assert 0 < len(alive) <= connections.SESSIONS_OF_TOKEN_MAX
         assert memory_mb(site.server.pid) - before < 50
 
 

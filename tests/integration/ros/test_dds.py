@@ -19,10 +19,10 @@ from fixtures.waiting import eventually
 from tests.integration.ros.conftest import obeyed, x_of
 
 from strands_robots.drivers.ros.rtps_robot import RtpsRobot
-from strands_robots.ros.dds import DdsLink, filled, plain
+from strands_robots.ros.dds import DdsLink
 from strands_robots.ros.dds_types import KINDS
-from strands_robots.ros.link import RosError
-from strands_robots.ros.names import bare_kind
+from strands_robots.ros.link import RosError, bare_kind
+from strands_robots.ros.messages import filled, plain
 from strands_robots.utils import ValidationError
 
 DOMAIN = 91
@@ -172,12 +172,13 @@ def test_latched_topic_is_read_after_its_only_message(topic: str, kind: str, mes
     struct = KINDS[bare_kind(kind)]
     latching = Qos(Policy.Durability.TransientLocal, Policy.Reliability.Reliable(10**8), Policy.History.KeepLast(1))
     writer = DataWriter(participant, Topic(participant, f"rt{topic}", struct), qos=latching)
-    writer.write(filled(struct, message))
+    written = filled(struct(), message, lambda inner: KINDS[inner]())
+    writer.write(written)
     link = DdsLink(DOMAIN, match_s=20.0)
     try:
         read = link.read(topic, kind, 20.0)
         assert message.keys() <= read.keys()
-        assert read == plain(filled(struct, message))
+        assert read == plain(written)
     finally:
         link.close()
 

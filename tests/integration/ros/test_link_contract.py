@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 from fixtures import rclpy_stand_in
 from fixtures.base_process import nav2
+from fixtures.ros_memory import MemoryLink
 from fixtures.waiting import eventually
 
 from strands_robots.ros.dds import DdsLink
 from strands_robots.ros.link import Goal, Message, OnMessage, RosError, RosLink, run_goal
-from strands_robots.ros.memory import MemoryLink
 from strands_robots.ros.rclpy import RclpyLink
 
 DOMAIN = 95

@@ -9,10 +9,9 @@ from typing import Any
 
 from strands_robots.drivers.ros.mobile_base import LINK_ERRORS, MobileBaseRobot
 from strands_robots.envelope import Envelope, error, success
+from strands_robots.ros.actions import Ros2Link
 from strands_robots.ros.gate import CommandGate
-from strands_robots.ros.link import RosLink
-from strands_robots.ros.names import graph_name, interface
-from strands_robots.ros.ros2 import Ros2Link
+from strands_robots.ros.link import RosLink, graph_name, interface
 from strands_robots.safety.gate import MotionRefused, MotionRequest, Permit
 from strands_robots.utils import ValidationError, mapping, number, shown
 

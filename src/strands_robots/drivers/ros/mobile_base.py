@@ -18,8 +18,7 @@ from strands_robots.drivers.ros.velocity import CurrentHold, OdometryMonitor, Ve
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.policies.rollout import RolloutObservers
 from strands_robots.ros.gate import CommandGate
-from strands_robots.ros.link import RosError, RosLink
-from strands_robots.ros.names import bare_kind, graph_name, interface
+from strands_robots.ros.link import RosError, RosLink, bare_kind, graph_name, interface
 from strands_robots.safety.gate import MotionGate, MotionRefused, MotionRequest, Permit
 from strands_robots.safety.stop_targets import halted_with_verbs
 from strands_robots.safety.stopping import PendingVerdict, StopVerdict, halts_in_parts

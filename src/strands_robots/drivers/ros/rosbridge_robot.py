@@ -6,8 +6,7 @@ from typing import Any
 
 from strands_robots.drivers.ros.mobile_base import PosedBaseRobot
 from strands_robots.ros.gate import CommandGate
-from strands_robots.ros.link import RosLink
-from strands_robots.ros.names import graph_name
+from strands_robots.ros.link import RosLink, graph_name
 from strands_robots.ros.rosbridge import RosbridgeLink
 from strands_robots.ros.rosbridge_session import RosbridgeAccess
 from strands_robots.utils import number

@@ -147,7 +147,7 @@ def enrolled_keys(link: LinkConfig) -> dict[str, bytes]:
     Raises:
         KeyFileError: the keys cannot be used.
     """
-    from strands_robots.device_connect.links import enrolled_robots  # noqa: PLC0415 - the network is loaded when it is used
+    from strands_robots.device_connect.backends.config import enrolled_robots  # noqa: PLC0415 - the network is loaded when it is used
 
     try:
         return enrolled_robots(link)

@@ -234,6 +234,6 @@ def _measured(search: RosterSearch, report: StopReport, sending: Sending) -> Sto
 
 def network_key(link: LinkConfig) -> NetworkKey:
     """Return the key of the network that a link reaches."""
-    from strands_robots.device_connect.links import network_of  # noqa: PLC0415 - the network is loaded when it is used
+    from strands_robots.device_connect.backends.config import network_of  # noqa: PLC0415 - the network is loaded when it is used
 
     return network_of(link)
