@@ -106,6 +106,7 @@ class StopExecutor:
         with self._attaching:
             self._watch_deadlines()
             slot, key = self._slot(target, name), target_key(target)
+            has_parts(type(target))  # remembered for the first stop
             if slot.owners == 0:
                 slot.wake, slot.thread = self._ready_thread(name)
                 # What was submitted to the reserve in between waits at the slot.
@@ -172,7 +173,7 @@ class StopExecutor:
         limit = settings.number("STRANDS_HALT_DEADLINE_S") if within is None else within
         slot = self._slots.get(target_key(target)) or self._slot(target, name)
         stop = SubmittedStop(slot, target, name, reason, limit, time.monotonic() if since is None else since, answered)
-        stop.parts = has_parts(target)
+        stop.parts = has_parts(type(target))
         stop.direct = stop.parts and hasattr(type(target), "unanswered")
         stop.future.set_running_or_notify_cancel()
         if answered is not None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import secrets
-import threading
 import time
 import uuid
 from collections import deque
@@ -192,12 +191,12 @@ class _Share:
 
 
 class FairQueue:
-    """Bounded queue of events from links: fair between sources, newest first.
+    """Bounded queue of events for one reader: fair between sources, newest first.
 
     A flood of forged stops must not delay a true one. Sources share a fixed number of buckets by a keyed hash; buckets
     are served in turn, one event each, the newest stop first. What overflows a bucket is its oldest stop; a controller
     repeats its stop, so a true one arrives again. A source that was vouched for has a bucket of its own, and every
-    second turn is of such a one: names that are made up share the other turns. No method but :meth:`get` blocks.
+    second turn is of such a one: names that are made up share the other turns. No method blocks or takes a lock.
 
     Args:
         buckets: number of those that all sources share.
@@ -212,9 +211,7 @@ class FairQueue:
         self._capacity = capacity
         self._crowd, self._signed = _Share(_Bucket(capacity) for _ in range(buckets)), _Share()
         self._vouched: dict[str, _Bucket] = {}
-        self._waiting = threading.Event()
         self._crowd_next = False
-        self._closed = False
         self.displaced = False
 
     def vouch(self, source: str) -> None:
@@ -242,23 +239,12 @@ class FairQueue:
         # Within one text: the hash of a pair keeps the same names together whatever the salt.
         shared = self._crowd.buckets[hash(self._salt + source) % len(self._crowd.buckets)]
         bucket = self._vouched.get(source, shared)
-        # Adding to a bucket and setting an event are atomic; no lock is shared with the reader's thread.
+        # Adding to a bucket is atomic.
         if urgent:
             self.displaced = self.displaced or len(bucket.urgent) == self._capacity
             bucket.urgent.append(received)
         elif len(bucket.later) < self._capacity // 2:
             bucket.later.append(received)
-        # While it is set, the reader's next look is still to come: most messages of a flood need not wake it.
-        if not self._waiting.is_set():
-            self._waiting.set()
-
-    def get(self) -> StopEvent | None:
-        """Return the next event, waiting for one; None once closed and empty."""
-        while (event := self.take()) is None and not self._closed:
-            self._waiting.wait()
-            self._waiting.clear()
-            # What was put between the look and the clearing is found by the next look; what comes later sets it.
-        return event
 
     def take(self) -> StopEvent | None:
         """Return the next event, of the crowd and of vouched sources in turn."""
@@ -281,8 +267,3 @@ class FairQueue:
         while self.take() is not None:
             pass
         self.displaced = False
-
-    def close(self) -> None:
-        """Let :meth:`get` return None when nothing is left."""
-        self._closed = True
-        self._waiting.set()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import queue
 import threading
 import time
@@ -114,16 +115,16 @@ def revoke_permits(target: object) -> None:
         gate.revoke()
 
 
-def has_parts(target: object) -> bool:
-    """Return whether the executor calls the parts of its halt."""
-    kind = type(target)
+@functools.lru_cache(maxsize=256)
+def has_parts(kind: type) -> bool:
+    """Return whether the executor calls the parts of the halt of such a target."""
     halt = getattr(kind, "halt", None)
     return hasattr(kind, "halt_here") and (halt is None or getattr(halt, "halts_in_parts", False))
 
 
 def target_key(target: Target) -> Hashable:
     """Return an identity that is equal for the same target."""
-    body = body_of(target)
+    body = target.wrapped if issubclass(type(target), RobotWrapper) else target  # type: ignore[union-attr]
     params = getattr(type(body), "__dataclass_params__", None)
     if params is None or not (params.frozen and params.eq):
         return id(body)
