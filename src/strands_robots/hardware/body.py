@@ -87,9 +87,9 @@ class DeviceBody:
         self.lock = bus_lock(device)
         self.bounds = {**action_ranges(device), **_checked(joint_ranges or {}, device)}
         positions = [key for key in self.bounds if not is_velocity(key)]
-        self._speed_limit = {} if speed_limit is None else checked_speeds(speed_limit, positions)
+        self._speeds = {} if speed_limit is None else checked_speeds(speed_limit, positions)
         self._read_joints = joint_reader(device)
-        self.speeds = default_speeds(device) | self._speed_limit
+        self.speeds = default_speeds(device) | self._speeds
         """Greatest speed by action key: as given, else 2 rad/s for an angle."""
         self._latest: tuple[float, dict[str, float]] | None = None
         self.targets: dict[str, float] = {}
@@ -133,7 +133,7 @@ class DeviceBody:
                 return
             self.bring_up(self.device)
             self._lost, self._was_connected = False, True
-            self.speeds = default_speeds(self.device) | self._speed_limit
+            self.speeds = default_speeds(self.device) | self._speeds
             # A driver that connects switches the torque on.
             self._limp = set()
 
@@ -165,10 +165,11 @@ class DeviceBody:
     def get_joints(self, tries: int = READ_TRIES, *, urgent: bool = False) -> dict[str, float]:
         """Read the joints; repeat after a lost answer unless a stop waits for the bus.
 
-        Args:
-            urgent: repeat all the same, for this is the stop.
-
         Raises what the device raises.
+
+        Args:
+            tries: reads of which one has to be answered.
+            urgent: do not give the bus up to a stop that waits, for this is the stop.
         """
         with self.lock:
             joints = self._exchange(self._read_joints, tries, urgent=urgent)
