@@ -236,9 +236,10 @@ class FairQueue:
     ) -> None:
         """Add an event; of those that are not urgent, a full bucket drops the new."""
         received = StopEvent(event, source, payload, time.monotonic(), network, codec)
-        # Within one text: the hash of a pair keeps the same names together whatever the salt.
-        shared = self._crowd.buckets[hash(self._salt + source) % len(self._crowd.buckets)]
-        bucket = self._vouched.get(source, shared)
+        bucket = self._vouched.get(source)
+        if bucket is None:
+            # Within one text: the hash of a pair keeps the same names together whatever the salt.
+            bucket = self._crowd.buckets[hash(self._salt + source) % len(self._crowd.buckets)]
         # Adding to a bucket is atomic.
         if urgent:
             self.displaced = self.displaced or len(bucket.urgent) == self._capacity
@@ -264,6 +265,7 @@ class FairQueue:
 
     def clear(self) -> None:
         """Forget what waits."""
-        while self.take() is not None:
-            pass
+        for bucket in (*self._crowd.buckets, *self._signed.buckets):
+            bucket.urgent.clear()
+            bucket.later.clear()
         self.displaced = False
