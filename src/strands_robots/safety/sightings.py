@@ -9,6 +9,7 @@ what could be read.
 from __future__ import annotations
 
 import atexit
+import contextlib
 import os
 import threading
 import time
@@ -109,6 +110,7 @@ class Sightings:
         self.directory = directory
         self.file = SightingFile(directory)
         self._starts = StartLocks(directory)
+        self._starts_seen: dict[tuple[NetworkKey, str], int] = {}
         self.problem = ""
         """Empty, or the reason why the last write did not succeed."""
         self._clock = clock
@@ -294,8 +296,16 @@ class Sightings:
             time.sleep(LEAVES_EVERY_S)
 
     def _looked(self, network: NetworkKey, name: str, *, begins: bool) -> tuple[bool, list[Served]]:
+        if not begins:
+            # The count first: a row that is written after it counts anew. Without it the next look reads the rows.
+            with contextlib.suppress(OSError):
+                self._starts_seen[network, name] = self._starts.count(network, name)
+            return True, self.file.served(name)
         # The lock first: who had it before has written by now.
-        return not begins or self._starts.take(network, name), self.file.served(name)
+        before, seen = self._starts.take(network, name), self._starts_seen.pop((network, name), None)
+        if before is not None and before == seen:
+            return True, []
+        return before is not None, self.file.served(name)
 
     def flush(self, within: float = ENDING_S) -> bool:
         """Write what is queued now; False where that takes over ``within`` seconds."""
