@@ -17,7 +17,6 @@ from typing import Any
 from device_connect_edge.messaging import MessagingError
 
 from strands_robots.device_connect.backends import LinkConfig
-from strands_robots.device_connect.process import EventLoopThread
 from strands_robots.safety.orders import PARSED_MAX_BYTES
 from strands_robots.safety.stop_link import (
     ANSWER,
@@ -31,6 +30,7 @@ from strands_robots.safety.stop_link import (
     StopLink,
 )
 from strands_robots.stop_log import stop_logger
+from strands_robots.threads import LoopThread
 from strands_robots.zenoh_session import StopSession
 
 logger = stop_logger(__name__)
@@ -111,7 +111,7 @@ class NatsStopLink:
     def __init__(self, link: LinkConfig) -> None:
         self._link = link
         self._root = f"device-connect.{link.tenant}"
-        self._loop: EventLoopThread | None = None
+        self._loop: LoopThread | None = None
         self._serving: Future[None] | None = None
         self._client: Any = None
         self._up = False
@@ -133,7 +133,7 @@ class NatsStopLink:
 
     def open(self, events: Collection[str], on_event: OnEvent, on_state: OnState) -> None:
         self._on_state = on_state
-        self._loop = EventLoopThread("stop-link")
+        self._loop = LoopThread("stop-link")
         # Kept: a loop itself keeps no task that nothing else refers to.
         self._serving = self._loop.submit(self._serve(events, on_event))
         _OPEN.add(self)
@@ -153,8 +153,7 @@ class NatsStopLink:
         if loop is not None:
             with contextlib.suppress(TimeoutError, MessagingError):
                 loop.submit(self._sent()).result(CLOSE_S)
-            loop.end()
-            loop.join(CLOSE_S)
+            loop.close(CLOSE_S)
         _OPEN.discard(self)
 
     def _set_up(self, up: bool) -> None:
