@@ -10,7 +10,6 @@ import atexit
 import contextlib
 import weakref
 from collections.abc import Collection
-from concurrent.futures import Future
 from dataclasses import replace
 from typing import Any
 
@@ -112,7 +111,8 @@ class NatsStopLink:
         self._link = link
         self._root = f"device-connect.{link.tenant}"
         self._loop: LoopThread | None = None
-        self._serving: Future[None] | None = None
+        self._end = asyncio.Event()
+        self._task: asyncio.Task[None] | None = None
         self._client: Any = None
         self._up = False
         self._on_state: OnState = lambda up: None
@@ -134,8 +134,7 @@ class NatsStopLink:
     def open(self, events: Collection[str], on_event: OnEvent, on_state: OnState) -> None:
         self._on_state = on_state
         self._loop = LoopThread("stop-link")
-        # Kept: a loop itself keeps no task that nothing else refers to.
-        self._serving = self._loop.submit(self._serve(events, on_event))
+        self._loop.submit(self._serve(events, on_event))
         _OPEN.add(self)
 
     def publish(self, source: str, event: str, payload: bytes) -> bool:
@@ -145,14 +144,17 @@ class NatsStopLink:
         subject = f"{self._root}.{source}.event.{event}"
         if event == ESTOP:
             self._stops.add(subject)
-        loop.loop.call_soon_threadsafe(self._send, subject, payload)
+        try:
+            loop.loop.call_soon_threadsafe(self._send, subject, payload)
+        except RuntimeError:  # it was closed just now
+            return False
         return True
 
     def close(self) -> None:
         loop, self._loop = self._loop, None
         if loop is not None:
-            with contextlib.suppress(TimeoutError, MessagingError):
-                loop.submit(self._sent()).result(CLOSE_S)
+            with contextlib.suppress(TimeoutError):
+                loop.submit(self._leave()).result(CLOSE_S)
             loop.close(CLOSE_S)
         _OPEN.discard(self)
 
@@ -163,7 +165,7 @@ class NatsStopLink:
             self._on_state(up)
 
     async def _serve(self, events: Collection[str], on_event: OnEvent) -> None:
-        """Carry events, and connect again after a failure, until it is cancelled."""
+        """Carry events, and connect again after a failure, until the end."""
         from strands_robots.device_connect.backends.nats import NatsBackend  # noqa: PLC0415 - loaded with the first link
 
         def on_message(data: bytes | int, subject: str) -> None:
@@ -177,17 +179,23 @@ class NatsStopLink:
         async def lost() -> None:
             self._set_up(False)
 
-        while True:
+        self._task = asyncio.current_task()
+        ending = asyncio.ensure_future(self._end.wait())
+        while not ending.done():
             client = NatsBackend(self._link)
+            connecting = asyncio.ensure_future(client.connect(servers=[], reconnect_cb=back, disconnect_cb=lost))
             try:
-                await client.connect(servers=[], reconnect_cb=back, disconnect_cb=lost)
+                await asyncio.wait({connecting, ending}, return_when=asyncio.FIRST_COMPLETED)
+                # At the end alone: otherwise it is done.
+                connecting.cancel()
+                await connecting
                 for event in events:
                     await client.listen(f"{self._root}.*.event.{event}", on_message)
                 # The server has the subscriptions when it has answered this.
                 await client.flush()
                 self._client = client
                 self._set_up(True)
-                await asyncio.Event().wait()
+                await ending
             except MessagingError as exc:
                 logger.debug("the e-stop listener's connection does not open yet: %s", exc)
             except Exception:
@@ -197,14 +205,15 @@ class NatsStopLink:
                 self._client = None
                 self._set_up(False)
                 await client.close()
-            await asyncio.sleep(RETRY_S)
+            await asyncio.wait({ending}, timeout=RETRY_S)
 
-    async def _sent(self) -> None:
-        """Return when the server has what was published before."""
+    async def _leave(self) -> None:
+        """Send what was published before, then disconnect."""
         if self._sending:
             await asyncio.wait(self._sending)
-        if self._client is not None:
-            await self._client.flush()
+        self._end.set()
+        if self._task is not None:
+            await asyncio.wait({self._task})
 
     def _send(self, subject: str, payload: bytes) -> None:
         task = asyncio.ensure_future(self._publish(subject, payload))
