@@ -57,7 +57,7 @@ class Bench:
     def start(self, speed: float = 0.5) -> Start:
         """Return the beginning of a motion, with the objects as they are."""
         arm = self.body.arm
-        state = arm.state(self.body.get_joints()).told(arm.told(self.body.targets))
+        state = arm.state(self.body.get_joints()).at_setpoints(arm.setpoints(self.body.targets))
         return Start(arm, state, HZ, speed, self.world.objects("arm"), self.held)
 
     def play(self, motion: Motion) -> str:
@@ -78,7 +78,7 @@ class Bench:
         blocked = self.play(motion)
         looked.after = self.world.objects("arm")
         assert motion.state is not None
-        holding = None if motion.told is None else self.body.arm.holding(motion.state, motion.told)
+        holding = None if motion.opening is None else self.body.arm.holding(motion.state, motion.opening)
         tip = self.body.arm.chain.forward(motion.state.joints).position
         error_mm = None if motion.goal is None else 1000 * float(np.linalg.norm(tip - motion.goal))
         return Told(blocked or motion.problem(error_mm, holding) or looked.problem())

@@ -160,7 +160,7 @@ class Table:
 
     def _start(self) -> Start:
         arm = self._body.arm
-        return Start(arm, arm.state(self._body.get_joints()).told(arm.told(self._body.targets)), HZ, 0.5)
+        return Start(arm, arm.state(self._body.get_joints()).at_setpoints(arm.setpoints(self._body.targets)), HZ, 0.5)
 
     def _play(self, motion: Motion) -> None:
         motion.clock = self._body.clock

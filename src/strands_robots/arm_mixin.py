@@ -525,7 +525,7 @@ class ArmMixin:
 
         def planned_at(hz: float, permit: Permit) -> Motion:
             observed = arm.state(_observed(body)[1])
-            state = observed.told(arm.told(self.targets(body.name)))
+            state = observed.at_setpoints(arm.setpoints(self.targets(body.name)))
             held = self._held.get(body.name) if self._holding(body.name, arm, observed) else None
             until = time.monotonic() + PLAN_S
             going = lambda: permit.valid and time.monotonic() < until  # noqa: E731 - one argument of the next call
@@ -549,7 +549,7 @@ class ArmMixin:
 
         def planned_at(hz: float, permit: Permit) -> Motion:
             space = motion.StatedJoints(tuple(goals))
-            state = space.state(_observed(body)[1]).told(space.told(self.targets(body.name)))
+            state = space.state(_observed(body)[1]).at_setpoints(space.setpoints(self.targets(body.name)))
             still = self.still_action(body.name)
             return motion.move_joints(goals, state, still, joints, hz=hz, speed=speed)
 
@@ -643,16 +643,16 @@ class ArmMixin:
             state: what was observed last; read anew without it.
         """
         task = next((each for each in reversed(self._recent) if self._gripped(each, name)), None)
-        if task is None or task.motion.told is None or arm.jaw is None or task.rollout.running:
+        if task is None or task.motion.opening is None or arm.jaw is None or task.rollout.running:
             return None
-        told = self.targets(name).get(arm.jaw.commanded)
-        if told is None or not arm.jaw.says(told, task.motion.told):
+        command = self.targets(name).get(arm.jaw.commanded)
+        if command is None or not arm.jaw.says(command, task.motion.opening):
             return None
-        return arm.holding(state or arm.state(_observed(self.body(name))[1]), task.motion.told)
+        return arm.holding(state or arm.state(_observed(self.body(name))[1]), task.motion.opening)
 
     @staticmethod
     def _gripped(task: ArmTask, name: str) -> bool:
-        return task.rollout.robot == name and task.motion.told is not None
+        return task.rollout.robot == name and task.motion.opening is not None
 
 
 def _observed(body: Body) -> tuple[float, Mapping[str, float]]:

@@ -84,7 +84,7 @@ def Robot(  # the factory reads as the class it stands for
             (``tabletop``: a table with a red cube and a plate), and ``tip``, the site or body of the model that
             motions place. ``real``:
             ``control_hz``, ``joint_ranges``, ``stop_level``, ``rest_pose``, ``model``, ``speed_limit``, ``detector``
-            (an object with ``detect(frames)``, see ``kinematics.detector``), and every other one goes to the
+            (an object with ``detect(frames)``, see ``kinematics.objects``), and every other one goes to the
             LeRobot configuration of the robot, such as ``port="/dev/ttyACM0"`` and ``id="left"``, with ``cameras`` as
             dictionaries and ``calibration`` (a file or its content; LeRobot's file of the id by default).
             ``reachy_mini``: ``host`` (by default searched on the local network) and the arguments of

@@ -12,7 +12,7 @@ from strands_robots.envelope import Envelope, error, success
 from strands_robots.policies.rollout import STOP_JOIN_S, Body, Rollout
 from strands_robots.policies.task_engine import NewTask, TaskEngine
 from strands_robots.safety.gate import Permit, answered
-from strands_robots.teleoperators.leader import FULL_RANGES_PER_S, InputSink, LeaderPolicy
+from strands_robots.teleoperators import FULL_RANGES_PER_S, InputSink, LeaderPolicy
 from strands_robots.utils import ValidationError, choice, flag, identifier, number, teleoperator_contract_error
 
 METHODS = ("arm", "gamepad", "keyboard", "phone")

@@ -100,7 +100,9 @@ class ReadyThreads(Generic[T]):
 
 
 class WokenThread:
-    """Thread that sleeps until it is woken or something is due; started at its first wake.
+    """Thread that sleeps until it is woken or something is due.
+
+    It starts at its first wake.
 
     Args:
         name: of the thread.

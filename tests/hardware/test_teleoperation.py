@@ -14,7 +14,7 @@ from fixtures.leaders import ScriptedLeader
 from fixtures.waiting import eventually
 
 from strands_robots.hardware import HardwareRobot
-from strands_robots.teleoperators.leader import LeaderPolicy
+from strands_robots.teleoperators import LeaderPolicy
 
 WAVES = {"pan.pos": (20.0, 50.0, 1.0), "lift.pos": (20.0, 50.0, 1.0)}
 

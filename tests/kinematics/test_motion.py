@@ -71,14 +71,14 @@ def test_motion_keeps_the_speed_of_every_joint_in_every_step() -> None:
 
 def test_resting_arm_starts_where_it_was_told_to_be() -> None:
     state = ArmState(np.array([0.0, 1.0, 2.0]), None)
-    told = state.told(np.array([0.02, 1.5, np.nan]))
+    told = state.at_setpoints(np.array([0.02, 1.5, np.nan]))
     assert told.joints == pytest.approx([0.02, 1.0, 2.0])
 
 
 def test_held_object_keeps_the_jaws_from_their_command() -> None:
-    assert ARM.holding(ArmState(ARM.chain.rest, 0.11), told=0.0) is True
-    assert ARM.holding(ArmState(ARM.chain.rest, 0.01), told=0.0) is False
-    assert ARM.holding(ArmState(ARM.chain.rest, None), told=0.0) is None
+    assert ARM.holding(ArmState(ARM.chain.rest, 0.11), opening=0.0) is True
+    assert ARM.holding(ArmState(ARM.chain.rest, 0.01), opening=0.0) is False
+    assert ARM.holding(ArmState(ARM.chain.rest, None), opening=0.0) is None
 
 
 def test_joint_that_cannot_be_read_is_named() -> None:
@@ -90,4 +90,4 @@ def test_motions_are_named_by_what_was_asked() -> None:
     assert go_to(start(), "home", {}).instruction == "goTo place home"
     turned = move_joints(start(), {"shoulder_pan": 45.0, "wrist_roll": -60.0})
     assert turned.instruction == "moveJoints shoulder_pan 45.0 wrist_roll -60.0"
-    assert set_gripper(start(), 0.5).told == 0.5
+    assert set_gripper(start(), 0.5).opening == 0.5

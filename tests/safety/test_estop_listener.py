@@ -11,9 +11,8 @@ from strands_robots.safety.stop_link import BUCKET_CAPACITY, BUCKETS, LATER_EVER
 
 
 def drained(events: FairQueue) -> list[StopEvent]:
-    events.close()
     found = []
-    while (received := events.get()) is not None:
+    while (received := events.take()) is not None:
         found.append(received)
     return found
 
@@ -21,7 +20,7 @@ def drained(events: FairQueue) -> list[StopEvent]:
 def test_event_that_was_put_is_returned() -> None:
     events = FairQueue()
     events.put("emergencyStop", "safety-1", b"x")
-    received = events.get()
+    received = events.take()
     assert received is not None
     assert (received.event, received.source, received.payload) == ("emergencyStop", "safety-1", b"x")
     assert drained(events) == []
@@ -33,7 +32,7 @@ def test_flood_of_one_source_does_not_delay_another() -> None:
         for forged in range(50):
             events.put("emergencyStop", "forger", str(forged).encode())
         events.put("emergencyStop", f"safety-{number}", b"true")
-        taken = [events.get(), events.get()]
+        taken = [events.take(), events.take()]
         assert any(received is not None and received.payload == b"true" for received in taken)
 
 
@@ -64,7 +63,7 @@ def test_flood_of_stops_in_one_bucket_starves_nothing_that_is_not_urgent(vouched
             events.put("emergencyStop", names[0], b"")
         for _ in range(100):
             events.put("safetyCheckIn", names[1], b"", urgent=False)
-        received = events.get()
+        received = events.take()
         assert received is not None
         taken.append(received.event)
     assert taken == ["emergencyStop"] * (LATER_EVERY - 1) + ["safetyCheckIn"]
@@ -81,20 +80,21 @@ def test_two_names_that_share_a_bucket_of_one_queue_need_not_share_one_of_anothe
     assert {kept() for _ in range(64)} == {BUCKET_CAPACITY, 2 * BUCKET_CAPACITY}
 
 
-def test_get_waits_for_an_event_and_ends_with_the_queue() -> None:
+def test_every_event_of_another_thread_is_taken() -> None:
     events, found = FairQueue(), []
 
-    def take() -> None:
-        while (received := events.get()) is not None:
-            found.append(received.payload)
+    def put() -> None:
+        for number in range(100):
+            events.put("emergencyStop", f"s{number}", str(number).encode())
 
-    thread = threading.Thread(target=take)
+    thread = threading.Thread(target=put)
     thread.start()
-    for number in range(100):
-        events.put("emergencyStop", f"s{number}", str(number).encode())
-    events.close()
-    thread.join(20)
-    assert sorted(map(int, found)) == list(range(100))
+    while thread.is_alive():
+        found += drained(events)
+    found += drained(events)
+    assert sorted(int(received.payload) for received in found if isinstance(received.payload, bytes)) == list(
+        range(100)
+    )
 
 
 def test_source_that_signed_is_served_within_two_turns_of_any_crowd() -> None:
@@ -105,7 +105,7 @@ def test_source_that_signed_is_served_within_two_turns_of_any_crowd() -> None:
     events.put("emergencyStop", "safety-1", b"true")
     for number in range(20 * BUCKETS * BUCKET_CAPACITY):
         events.put("emergencyStop", f"forger-{number}", b"forged")
-    assert b"true" in [received.payload for received in (events.get(), events.get()) if received]
+    assert b"true" in [received.payload for received in (events.take(), events.take()) if received]
 
 
 def test_flood_in_the_name_of_a_source_that_signed_leaves_every_second_turn_to_all_others() -> None:
@@ -114,7 +114,7 @@ def test_flood_in_the_name_of_a_source_that_signed_leaves_every_second_turn_to_a
     for _ in range(100):
         events.put("emergencyStop", "safety-1", b"forged")
     events.put("emergencyStop", "safety-2", b"true")
-    assert b"true" in [received.payload for received in (events.get(), events.get()) if received]
+    assert b"true" in [received.payload for received in (events.take(), events.take()) if received]
     assert len(drained(events)) == BUCKET_CAPACITY - 1
 
 

@@ -252,7 +252,7 @@ def test_what_comes_after_a_halt_never_takes_its_place(
 
     class SecondHaltBeforeEachStore(MotionGate):
         def __setattr__(self, name: str, value: Any) -> None:
-            if name == "_generation" and value == 1:
+            if name == "generation" and value == 1:
                 second.start()
                 assert second_ran.wait(20)
             super().__setattr__(name, value)

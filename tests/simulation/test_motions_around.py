@@ -171,7 +171,7 @@ def test_pick_goes_around_its_own_target_on_the_way_to_it(
     start = Start(body.arm, body.arm.state(body.get_joints()), 50, 1.0, seen)
     motion, _ = moves.pick(start, seen[0], None)
     transit = next(segment for segment in motion.segments if segment.name == "hover")
-    path = np.array([body.arm.told(frame) for frame in transit.frames])
+    path = np.array([body.arm.setpoints(frame) for frame in transit.frames])
     assert ContactCheck(beside(body.arm.chain, seen), body.arm.jaw_radians(1.0)).along(path, {}) == ""
 
 

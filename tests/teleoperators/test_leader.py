@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from strands_robots.teleoperators.leader import BoundedLeader, LeaderFinished, LeaderPolicy
+from strands_robots.teleoperators import BoundedLeader, LeaderFinished, LeaderPolicy
 from strands_robots.utils import ValidationError
 
 RANGES = {"pan.pos": (-100.0, 100.0)}

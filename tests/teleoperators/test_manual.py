@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from fixtures.waiting import eventually
 
-from strands_robots.teleoperators.leader import GamepadLeader, KeyboardLeader, LeaderFinished
+from strands_robots.teleoperators import GamepadLeader, KeyboardLeader, LeaderFinished
 from strands_robots.utils import ValidationError
 
 START = {"pan.pos": 0.0, "grip.pos": 50.0}

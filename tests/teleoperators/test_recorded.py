@@ -11,10 +11,9 @@ from fixtures.devices import RecordingDevice
 from fixtures.leaders import write_csv
 from fixtures.waiting import eventually
 
+from strands_robots import teleoperators
 from strands_robots.hardware import HardwareRobot
-from strands_robots.teleoperators import recorded
-from strands_robots.teleoperators.leader import LeaderFinished
-from strands_robots.teleoperators.recorded import RecordedLeader, read_episode, read_frames
+from strands_robots.teleoperators import LeaderFinished, RecordedLeader, read_episode, read_frames
 from strands_robots.utils import ValidationError
 
 NAMES = ["pan.pos", "grip.pos"]
@@ -77,10 +76,10 @@ def test_broken_csv_file_is_refused_with_its_line(tmp_path: Path, content: str, 
 
 def test_csv_file_beyond_a_bound_is_refused_before_it_is_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "run.csv"
-    path.write_text("t,a\n" + "0," + "1" * recorded.LINE_MAX)
+    path.write_text("t,a\n" + "0," + "1" * teleoperators.LINE_MAX)
     with pytest.raises(ValidationError, match="65,536 characters"):
         read_frames(path)
-    monkeypatch.setattr(recorded, "ROWS_MAX", 3)
+    monkeypatch.setattr(teleoperators, "ROWS_MAX", 3)
     path.write_text("t,a\n" + "".join(f"{at},1\n" for at in range(10)))
     with pytest.raises(ValidationError, match="4 rows, and may have 3"):
         read_frames(path)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.control import Control
 
-from strands_robots.cli.command import Seconds, command
+from strands_robots.cli.command import Seconds
 from strands_robots.cli.network import mesh_peer
 from strands_robots.cli.output import POLL_S, CliError, Exit, Screen, table, wait_until
 from strands_robots.cli.record import record_robot
@@ -22,7 +22,7 @@ from strands_robots.envelope import is_error, text_of
 from strands_robots.errors import NoAnswerError, NoSuchRobotError, RefusalError
 from strands_robots.policies.base import Ranges
 from strands_robots.safety.stopping import StopVerdict
-from strands_robots.teleoperators.leader import FULL_RANGES_PER_S, LeaderPolicy
+from strands_robots.teleoperators import FULL_RANGES_PER_S, LeaderPolicy
 from strands_robots.utils import ValidationError, identifier, number
 
 if TYPE_CHECKING:
@@ -76,13 +76,6 @@ class NoFollower:
         raise ValidationError(
             f"FOLLOWER must be a robot for this leader, which starts from the robot's joints, not {NO_FOLLOWER}."
         )
-
-
-def register(app: typer.Typer) -> None:
-    """Add the three commands to the application."""
-    command(app, "teleop")(teleop)
-    command(app, "calibrate")(calibrate)
-    command(app, "replay")(replay)
 
 
 def teleop(
@@ -394,7 +387,7 @@ def _check_stopped(verdict: StopVerdict) -> None:
 def _connected_leader(leader: str, robot: Any, options: dict[str, Any]) -> Iterator[Any]:
     """Yield the leader of that name, ready to lead ``robot``."""
     if leader in _MANUAL:
-        from strands_robots.teleoperators.leader import GamepadLeader, KeyboardLeader  # noqa: PLC0415 - as above
+        from strands_robots.teleoperators import GamepadLeader, KeyboardLeader  # noqa: PLC0415 - as above
 
         body = robot.body()
         present = body.get_joints()
@@ -438,7 +431,7 @@ def _recorded_leader(path: Path, device: str | None = None, speed: float = 1.0) 
         MissingExtraError: the package that reads it is not installed.
     """
     from strands_robots.recording.file import recorded_actions  # noqa: PLC0415 - as above
-    from strands_robots.teleoperators.recorded import RecordedLeader, read_episode, read_frames  # noqa: PLC0415
+    from strands_robots.teleoperators import RecordedLeader, read_episode, read_frames  # noqa: PLC0415
 
     if path.suffix == ".mcap":
         frames = recorded_actions(path, device)

@@ -101,7 +101,7 @@ class ExpertPolicy:
     def _start(self, observation: Mapping[str, Any]) -> Start:
         body = self._world.body(ROBOT)
         arm = body.arm
-        state = arm.state(numbers(observation)).told(arm.told(body.targets))
+        state = arm.state(numbers(observation)).at_setpoints(arm.setpoints(body.targets))
         return Start(arm, state, self._hz, SPEED)
 
 

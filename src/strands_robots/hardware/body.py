@@ -89,7 +89,8 @@ class DeviceBody:
         positions = [key for key in self.bounds if not is_velocity(key)]
         self._speeds = {} if speed_limit is None else checked_speeds(speed_limit, positions)
         self._read_joints = joint_reader(device)
-        self._default_speeds = default_speeds(device)
+        self.speeds = default_speeds(device) | self._speeds
+        """Greatest speed by action key: as given, else 2 rad/s for an angle."""
         self._latest: tuple[float, dict[str, float]] | None = None
         self.targets: dict[str, float] = {}
         """What it was told last by an action, by key; empty once it was frozen or let go."""
@@ -100,11 +101,6 @@ class DeviceBody:
         self._current_lost, self._unread = False, ""
         self.driven = False
         """True from an action until it was frozen or let go."""
-
-    @property
-    def speeds(self) -> dict[str, float]:
-        """Greatest speed by action key: as given, else 2 rad/s for an angle."""
-        return self._default_speeds | self._speeds
 
     @property
     def lost(self) -> bool:
@@ -137,7 +133,7 @@ class DeviceBody:
                 return
             self.bring_up(self.device)
             self._lost, self._was_connected = False, True
-            self._default_speeds = default_speeds(self.device)
+            self.speeds = default_speeds(self.device) | self._speeds
             # A driver that connects switches the torque on.
             self._limp = set()
 
@@ -166,13 +162,19 @@ class DeviceBody:
             self._latest = (began, numbers(observation))
             return observation
 
-    def get_joints(self, tries: int = READ_TRIES) -> dict[str, float]:
+    def get_joints(self, tries: int = READ_TRIES, *, urgent: bool = False) -> dict[str, float]:
         """Read the joints; repeat after a lost answer unless a stop waits for the bus.
 
         Raises what the device raises.
+
+        Args:
+            tries: reads of which one has to be answered.
+            urgent: do not give the bus up to a stop that waits, for this is the stop.
         """
         with self.lock:
-            return self._joints(tries)
+            joints = self._exchange(self._read_joints, tries, urgent=urgent)
+            self._latest = (time.monotonic(), joints)
+            return dict(joints)
 
     def refresh(self, *, led: bool, rate: float) -> str:
         """Read the joints unless they are fresh; return why they were not read, or "".
@@ -348,11 +350,6 @@ class DeviceBody:
     def running(self) -> AbstractContextManager[None]:
         return nullcontext()
 
-    def _joints(self, tries: int, *, urgent: bool = False) -> dict[str, float]:
-        joints = self._exchange(self._read_joints, tries, urgent=urgent)
-        self._latest = (time.monotonic(), joints)
-        return dict(joints)
-
     def _exchange(self, exchange: Callable[[], T], tries: int = READ_TRIES, *, urgent: bool = False) -> T:
         """Repeat an exchange after a lost answer unless a stop waits for the bus."""
         for left in reversed(range(tries)):
@@ -384,19 +381,19 @@ class DeviceBody:
             self._stop_base(still)
         age, known = self.latest_joints or (math.inf, {})
         try:
-            present = self._joints(1)
+            present = self.get_joints(1)
         except ConnectionError:
             # One silent motor must not leave the others running to their goals while it is asked again.
             if age <= HOLD_FRESH_S and (targets := still | self._targets(known)):
                 write_joints(self.device, targets)
-            present = self._joints(READ_TRIES, urgent=urgent)
+            present = self.get_joints(READ_TRIES, urgent=urgent)
         targets = still | self._targets(present)
         if targets:
             # LeRobot cannot send an action to an arm of which no motor is in it.
             write = partial(write_joints, self.device) if self._limp else self.device.send_action
             self._exchange(lambda: write(targets), urgent=urgent)
         # A bus does not confirm targets; what it answers after them shows that it took them.
-        self._joints(READ_TRIES, urgent=urgent)
+        self.get_joints(READ_TRIES, urgent=urgent)
 
     def _stop_base(self, still: Mapping[str, float]) -> None:
         """Stop the wheels before the arm is read, which one silent motor fails."""
@@ -432,7 +429,7 @@ class DeviceBody:
 
     def _stiffen(self) -> None:
         """Switch the torque on again for a motion, with the present position as target."""
-        present, limp = self._joints(READ_TRIES), self._limp
+        present, limp = self.get_joints(READ_TRIES), self._limp
         self._limp = set()
         try:
             targets = self._targets(present)

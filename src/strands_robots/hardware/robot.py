@@ -180,8 +180,10 @@ class HardwareRobot(ArmMixin, TeleopMixin):
 
     @property
     def joint_units(self) -> dict[str, str]:
-        """``normalized`` (-100 to 100), ``percent`` (0 to 100), ``degrees`` or the device's own unit, by action key;
-        a key without a stated unit is left out."""
+        """Return the unit by action key; a key without a stated unit is left out.
+
+        ``normalized`` (-100 to 100), ``percent`` (0 to 100), ``degrees`` or the device's own.
+        """
         return joint_units(self.device)
 
     def get_health(self) -> Envelope:
@@ -369,8 +371,11 @@ class HardwareRobot(ArmMixin, TeleopMixin):
         return error(next(iter([*verdict.not_stopped.values(), *verdict.unknown.values()])), **fields)
 
     def get_task_status(self) -> Envelope:
-        """``task_status`` (idle, running, completed, stopped, error), ``instruction``, ``policy``, ``step_count``,
-        ``duration`` (seconds it has taken), ``error`` and ``outcome`` of the current or last task."""
+        """Return the state of the current or last task.
+
+        ``task_status`` (idle, running, completed, stopped, error), ``instruction``, ``policy``, ``step_count``,
+        ``duration`` (seconds it has taken), ``error`` and ``outcome``.
+        """
         fields = self._task_fields()
         return success(f"Task {fields['task_status']} after {fields['step_count']} steps.", **fields)
 

@@ -164,21 +164,21 @@ class JawMap:
 
     observed: str
     commanded: str
-    seen: tuple[float, float]
-    told: tuple[float, float]
+    observed_range: tuple[float, float]
+    commanded_range: tuple[float, float]
 
     def opening(self, observed: float) -> float:
         """Return an observation as an opening from 0 (closed) to 1 (open)."""
-        closed, opened = self.seen
+        closed, opened = self.observed_range
         return (observed - closed) / (opened - closed)
 
     def says(self, command: float, opening: float) -> bool:
         """True where a command is that of an opening."""
-        return abs(command - self.command(opening)) <= 1e-3 * abs(self.told[1] - self.told[0])
+        return abs(command - self.command(opening)) <= 1e-3 * abs(self.commanded_range[1] - self.commanded_range[0])
 
     def command(self, opening: float) -> float:
         """Return the command of an opening."""
-        closed, opened = self.told
+        closed, opened = self.commanded_range
         return closed + (opened - closed) * opening
 
 
@@ -189,7 +189,7 @@ class ArmState:
     joints: Floats
     opening: float | None
 
-    def told(self, targets: Floats) -> ArmState:
+    def at_setpoints(self, targets: Floats) -> ArmState:
         """Return this state with the joints where they were told to be, if they are near.
 
         A motion that began where the arm sags to would sag further with every motion.
@@ -269,7 +269,7 @@ class Arm:
         known = jaw is not None and jaw.observed in observation
         return ArmState(joints, jaw.opening(observation[jaw.observed]) if jaw is not None and known else None)
 
-    def told(self, targets: Mapping[str, float]) -> Floats:
+    def setpoints(self, targets: Mapping[str, float]) -> Floats:
         """Return the joints that a body was told; NaN where that is not known."""
         return np.array(
             [
@@ -297,12 +297,12 @@ class Arm:
             return None
         return gripper.joint.low + (gripper.joint.high - gripper.joint.low) * min(max(opening, 0.0), 1.0)
 
-    def holding(self, state: ArmState, told: float) -> bool | None:
-        """Return True where something keeps still jaws from their ``told`` opening.
+    def holding(self, state: ArmState, opening: float) -> bool | None:
+        """Return True where something keeps still jaws from their ``opening``.
 
         None without a gripper.
         """
-        return None if state.opening is None else state.opening > told + GRIP_MARGIN
+        return None if state.opening is None else state.opening > opening + GRIP_MARGIN
 
     def reached(self, state: ArmState | None, goal: Floats | None, wanted: Mapping[str, float]) -> dict[str, Any]:
         """Return ``reached``, the pose of the tip and the opening, and ``error_mm``.

@@ -44,7 +44,7 @@ WINDOWS_S = (0.12, 0.22)
 """Times over which a joint is compared with its setpoints; the longer one is for slow motions."""
 
 SLOW_WINDOWS_S = (0.45, 0.9, 1.8)
-"""Such times for joints that go less than :data:`TOLD` in the others, down to 0.0045 rad/s."""
+"""Such times for joints that go less than :data:`SETPOINT_WAY` in the others, down to 0.0045 rad/s."""
 
 SLOW_SHARE = 0.1
 """Least way of a slow joint by that of the fastest: the sag of an arm that others stretch out is no contact."""
@@ -52,7 +52,7 @@ SLOW_SHARE = 0.1
 DELAY_S = 0.12
 """Greatest delay of a servo behind its setpoints."""
 
-TOLD = 0.008
+SETPOINT_WAY = 0.008
 """Least way of the setpoints in such a time by which a joint is judged (rad or m)."""
 
 FOLLOWED = 0.2
@@ -95,13 +95,13 @@ class StallWatch:
         self._reads = True
 
     def stalled(
-        self, now: float, told: Floats, joints: Floats, currents: Callable[[], Floats] | None = None
+        self, now: float, setpoints: Floats, joints: Floats, currents: Callable[[], Floats] | None = None
     ) -> int | None:
         """Return the joint that stands still against its setpoints, if there is one.
 
         Args:
             now: the body's own time in seconds.
-            told: setpoint of each joint (rad or m).
+            setpoints: of each joint (rad or m).
             joints: where they are.
             currents: reads the current of each joint's motor (A, NaN where it is not known), of which the sign does
                 not count. Called only where a joint stands still at less than the full lag, and no more once it
@@ -109,7 +109,7 @@ class StallWatch:
         """
         if self._seen and now <= self._seen[-1][0]:
             return None
-        self._seen.append((now, told, joints))
+        self._seen.append((now, setpoints, joints))
         self._times.append(now)
         # The first look stays, for the distance at the start.
         while len(self._seen) > 2 and self._seen[1][0] < now - DELAY_S - SLOW_WINDOWS_S[-1] - 0.1:
@@ -121,7 +121,7 @@ class StallWatch:
         # Where the lag is enough, nothing is read.
         pressing = self._pressing(np.where(lags >= self._lag, -np.inf, steady), currents)
         self._counts = np.where((lags >= self._lag) | pressing, self._counts + 1, 0)
-        worst = int(np.argmax(np.where(self._counts >= CONFIRMED, np.abs(told - joints), -1.0)))
+        worst = int(np.argmax(np.where(self._counts >= CONFIRMED, np.abs(setpoints - joints), -1.0)))
         return worst if self._counts[worst] >= CONFIRMED else None
 
     def _pressing(self, lags: Floats, currents: Callable[[], Floats] | None) -> np.ndarray[Any, np.dtype[np.bool_]]:
@@ -151,15 +151,17 @@ class StallWatch:
             return np.full((2, len(last[2])), -np.inf)
         # One row for each window: the control thread has no time for one after another.
         before, earliest = ([self._at(now - delay - window) for window in windows] for delay in (0.0, DELAY_S))
-        told = last[1] - np.array([look[1] for look in before])
-        told_before = self._at(now - DELAY_S)[1] - np.array([look[1] for look in earliest])
-        way = np.where(told * told_before > 0, np.sign(told) * np.minimum(np.abs(told), np.abs(told_before)), 0.0)
+        way_now = last[1] - np.array([look[1] for look in before])
+        way_before = self._at(now - DELAY_S)[1] - np.array([look[1] for look in earliest])
+        way = np.where(
+            way_now * way_before > 0, np.sign(way_now) * np.minimum(np.abs(way_now), np.abs(way_before)), 0.0
+        )
         gone = (last[2] - np.array([look[2] for look in before])) * np.sign(way)
         lag = ((last[1] - last[2]) - (first[1] - first[2])) * np.sign(way)
         fast = np.array([[window in WINDOWS_S] for window in windows])
-        way = np.where(fast | (np.abs(way) >= SLOW_SHARE * np.abs(told).max(axis=1, keepdims=True)), way, 0.0)
+        way = np.where(fast | (np.abs(way) >= SLOW_SHARE * np.abs(way_now).max(axis=1, keepdims=True)), way, 0.0)
         most = np.minimum(FOLLOWED * np.abs(way), STILL)
-        behind = (np.abs(way) >= TOLD) & (gone <= most)
+        behind = (np.abs(way) >= SETPOINT_WAY) & (gone <= most)
         found: Floats = np.where([behind, behind & (gone >= -most)], lag, -np.inf).max(axis=1)
         return found
 
@@ -223,10 +225,10 @@ class JointSpace(Protocol):
     def state(self, observation: Mapping[str, float]) -> ArmState:
         """Return the state in an observation; raises :class:`ValidationError`."""
 
-    def told(self, targets: Mapping[str, float]) -> Floats:
+    def setpoints(self, targets: Mapping[str, float]) -> Floats:
         """Return the joints that a body was told; NaN where that is not known."""
 
-    def holding(self, state: ArmState, told: float) -> bool | None:
+    def holding(self, state: ArmState, opening: float) -> bool | None:
         """Return True where something keeps the jaws open; None without a gripper."""
 
     def reached(self, state: ArmState | None, goal: Floats | None, wanted: Mapping[str, float]) -> dict[str, Any]:
@@ -253,7 +255,7 @@ class Motion:
         goal: where the tip shall be in the end (m), None for a motion of the gripper alone.
         end_joints: where the joints shall be in the end (rad); empty for a motion of the gripper alone.
         wanted: where joints shall be in the end, by name (rad or m).
-        told: the last opening that the gripper is told, None for none.
+        opening: the last one that the gripper is told, None for none.
         grasps: something shall be between the jaws in the end.
         stall_lag: least lag of a joint that counts as contact with something (rad or m).
         currents: reads the currents of the body's motors by its observation's keys (A), None where it cannot.
@@ -271,7 +273,7 @@ class Motion:
     goal: Floats | None = None
     end_joints: Floats = field(default_factory=lambda: np.zeros(0))
     wanted: Mapping[str, float] = field(default_factory=dict)
-    told: float | None = None
+    opening: float | None = None
     grasps: bool = False
     clock: Callable[[], float] = time.monotonic
     stall_lag: float = STALL_LAG
@@ -287,7 +289,7 @@ class Motion:
         self._settles_until: float | None = None
         self._still = 0
         self._seen: tuple[float, ArmState] | None = None
-        self._told: Floats | None = None
+        self._setpoints: Floats | None = None
         self._watch: StallWatch | None = None
 
     @property
@@ -353,7 +355,7 @@ class Motion:
             self._still, self._seen = 0, None
             self._watch = StallWatch(self.stall_lag)
         frame = self._frames.popleft()
-        self._told = self.arm.told(frame)
+        self._setpoints = self.arm.setpoints(frame)
         return frame
 
     def _require_progress(self, state: ArmState) -> None:
@@ -362,12 +364,12 @@ class Motion:
         Raises:
             PolicyError: a joint met something; :attr:`contact` has the sentence.
         """
-        if self._told is None or self._watch is None or not self._frames:
+        if self._setpoints is None or self._watch is None or not self._frames:
             return
-        told = np.where(np.isnan(self._told), state.joints, self._told)
+        setpoints = np.where(np.isnan(self._setpoints), state.joints, self._setpoints)
         currents = self.currents
         read = None if currents is None else lambda: self._by_joint(currents())
-        index = self._watch.stalled(self.clock(), told, state.joints, read)
+        index = self._watch.stalled(self.clock(), setpoints, state.joints, read)
         if index is not None:
             joint = self.arm.joints[index]
             at = f"{np.degrees(state.joints[index]):.0f} degrees" if joint.turns else f"{state.joints[index]:.3f} m"
@@ -438,7 +440,7 @@ class StatedJoints:
             raise ValidationError(f"the joints {', '.join(missing)} could not be read.")
         return ArmState(np.array([each.radians(observation[each.observed]) for each in self.maps]), None)
 
-    def told(self, targets: Mapping[str, float]) -> Floats:
+    def setpoints(self, targets: Mapping[str, float]) -> Floats:
         """Return the positions that the robot was told; NaN where that is not known."""
         return np.array([each.radians(targets.get(each.commanded, np.nan)) for each in self.maps])
 
@@ -446,7 +448,7 @@ class StatedJoints:
         """Return the targets of positions."""
         return {each.commanded: each.value(float(at)) for each, at in zip(self.maps, positions, strict=True)}
 
-    def holding(self, state: ArmState, told: float) -> bool | None:
+    def holding(self, state: ArmState, opening: float) -> bool | None:
         """Return None: no joint is known to be a gripper."""
         return None
 

@@ -128,7 +128,7 @@ def set_gripper(start: Start, opening: float) -> Motion:
     """Move the gripper to an opening from 0 (closed) to 1 (open)."""
     before = require_gripper(start)
     segments = [Segment("gripper", start.jaw_frames(before, opening), settles=True)]
-    return Motion(start.arm, "setGripper", {"opening": opening}, segments, start.hz, told=opening)
+    return Motion(start.arm, "setGripper", {"opening": opening}, segments, start.hz, opening=opening)
 
 
 def require_gripper(start: Start) -> float:
@@ -218,7 +218,7 @@ def pick(start: Start, target: SeenObject, approach: float | None) -> tuple[Moti
         )
         goal = start.arm.chain.forward(way[-1]).position
         asked = {"object": target.name, **_point(target.position), "approach": degrees}
-        motion = Motion(start.arm, "pick", asked, segments, start.hz, goal, way[-1], told=0.0, grasps=True)
+        motion = Motion(start.arm, "pick", asked, segments, start.hz, goal, way[-1], opening=0.0, grasps=True)
         return motion, held
     # The refusal is that of the steepest reach to the object's centre, or it is the way that is blocked.
     planner.reach(target.position + np.array([0.0, 0.0, 0.02]), approach)
@@ -258,7 +258,7 @@ def place(start: Start, position: Floats, approach: float | None, held: Held, on
         ]
         goal = chain.forward(way[-1]).position
         asked = {"object": held.name, **_point(position), "approach": degrees}
-        return Motion(start.arm, "place", asked, segments, start.hz, goal, told=release)
+        return Motion(start.arm, "place", asked, segments, start.hz, goal, opening=release)
     planner.reach(centre, approach)
     raise ValidationError(f"no way to put {held.name or 'it'} down at {_shown(position)} is free of contact.")
 

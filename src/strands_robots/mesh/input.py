@@ -18,7 +18,7 @@ from strands_robots.mesh.input_receiver import InputMesh, InputReceiver
 from strands_robots.mesh.security import validate_mesh_identifier
 from strands_robots.mesh.transport import TransportError
 from strands_robots.mesh.wire import WireError
-from strands_robots.teleoperators.leader import teleop_events
+from strands_robots.teleoperators import teleop_events
 from strands_robots.utils import ValidationError, number, shown, teleoperator_contract_error, text
 
 __all__ = ["INPUT_HZ_DEFAULT", "InputPublisher", "InputReceiver", "MeshInputSink"]

@@ -257,7 +257,9 @@ class MockPolicy:
             present = numbers(observation)
             self._start = {key: min(max(present.get(key, (a + b) / 2), a), b) for key, (a, b) in self._ranges.items()}
         seconds = self._step * self._dt
-        share = _smooth_step(seconds / self._fade_s)
+        faded = min(seconds / self._fade_s, 1.0)
+        # The quintic from 0 to 1, smooth in velocity and acceleration.
+        share = faded * faded * faded * (faded * (6 * faded - 15) + 10)
         self._step += 1
         return {key: (1 - share) * self._start[key] + share * self._wave(key, seconds) for key in self._ranges}
 
@@ -273,9 +275,3 @@ class MockPolicy:
         swing = 0.7 * math.sin(math.tau * slow * seconds + slow_phase)
         swing += 0.3 * math.sin(math.tau * fast * seconds + fast_phase)
         return (low + high) / 2 + self._amplitude * (high - low) / 2 * swing
-
-
-def _smooth_step(part: float) -> float:
-    """Return the quintic from 0 to 1, smooth in velocity and acceleration."""
-    x = min(max(part, 0.0), 1.0)
-    return x * x * x * (x * (6 * x - 15) + 10)

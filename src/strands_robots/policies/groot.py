@@ -287,12 +287,12 @@ class GrootPolicy(ServedPolicy):
         video = {picture_key(each): numpy.asarray(seen[picture_key(each)])[axes] for each in self.profile.cameras}
         state = {part: numpy.array([seen[key] for key in keys], kind)[axes] for part, keys in self._state.items()}
         if nested:
-            told: dict[str, Any] = {"video": video, "state": state, "language": {self._language: [[task]]}}
+            request: dict[str, Any] = {"video": video, "state": state, "language": {self._language: [[task]]}}
         else:
-            told = {f"video.{name}": each for name, each in video.items()}
-            told |= {f"state.{name}": each for name, each in state.items()}
-            told[self._language] = [task]
-        return told if self._layout == "n1.5" else {"observation": told, "options": None}
+            request = {f"video.{name}": each for name, each in video.items()}
+            request |= {f"state.{name}": each for name, each in state.items()}
+            request[self._language] = [task]
+        return request if self._layout == "n1.5" else {"observation": request, "options": None}
 
     def actions(self, answer: Any) -> list[Action]:
         if isinstance(answer, Sequence) and not isinstance(answer, str | bytes) and answer:

@@ -389,7 +389,7 @@ class ProfiledPolicy:
         self._inner = inner
         self._now: Callable[[], float] = time.monotonic
         self._scale: dict[str, float] = {}
-        self._told = False
+        self._unanswered_logged = False
         self._limit: SpeedLimit | None = None
         self._last: Action = {}
         self._hz = profile.rate or 0.0
@@ -428,8 +428,8 @@ class ProfiledPolicy:
         found = check_policy(self.profile, statements_of(self.profile), robot)
         if not found.passed:
             raise PolicyCheckError(found)
-        if found.unanswered and not self._told:
-            self._told = True
+        if found.unanswered and not self._unanswered_logged:
+            self._unanswered_logged = True
             questions = ", ".join(dict.fromkeys(row.question for row in found.unanswered))
             logger.warning("%s moves %s, and no source states: %s.", self.profile.name, robot.name, questions)
         keys = {*self.profile.state, *self.profile.environment, *self.profile.action}

@@ -437,7 +437,9 @@ class Rollout:
 
     def _hold(self, state: State) -> State:
         try:
-            self._body.hold(self._permit)
+            # After a halt, which freezes the body, the bus is left to it.
+            if not self._permit.revoked:
+                self._body.hold(self._permit)
         except Exception as exc:  # noqa: BLE001 - a body may raise anything; the rollout ends in error
             logger.critical("%s could not hold its position after its rollout: %s", self.robot, exc)
             self.error = f"{self.error + '; ' if self.error else ''}hold failed: {type(exc).__name__}: {exc}"

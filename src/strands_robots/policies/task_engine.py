@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 from strands_robots.envelope import error, success
 from strands_robots.policies import create_policy, resolve_provider
@@ -38,8 +38,7 @@ from strands_robots.utils import ValidationError
 logger = stop_logger(__name__)
 
 
-@dataclass(frozen=True)
-class NewTask:
+class NewTask(NamedTuple):
     """A task that is to start.
 
     Attributes:

@@ -24,7 +24,7 @@ from strands_robots.policies.decoding import decode_json
 from strands_robots.recording import schemas
 from strands_robots.recording.cameras import Frames, jpeg
 from strands_robots.recording.schemas import Schema
-from strands_robots.teleoperators.recorded import Frame, check_length
+from strands_robots.teleoperators import Frame, check_length
 from strands_robots.utils import ValidationError, number, optional_module, shown
 
 logger = logging.getLogger(__name__)

@@ -228,38 +228,27 @@ class RobotsPort(MissedStopsPort):
         self._plane.hold(seconds)
 
 
+@dataclass(eq=False)
 class ListenerRegistration:
     """Registration of a device with the listener; the last one closes the link."""
 
-    def __init__(
-        self,
-        listener: EstopListener,
-        robot_id: str,
-        key: Hashable,
-        link: StopLink,
-        identity: Callable[[], SigningIdentity | None],
-        *,
-        network: NetworkKey | None,
-        was_here: bool,
-        codec: StopCodec,
-        asks: bool,
-    ) -> None:
-        self.robot_id = robot_id
-        self.codec, self.asks = codec, asks
-        self.network = network
-        self.was_here = was_here
-        self.identity = identity
-        self.key = key
-        self.link = link
-        self._listener = listener
+    listener: EstopListener
+    robot_id: str
+    key: Hashable
+    link: StopLink
+    identity: Callable[[], SigningIdentity | None]
+    network: NetworkKey | None
+    was_here: bool
+    codec: StopCodec
+    asks: bool
 
     def open(self) -> None:
         """Open the link, unless it is open or this registration has ended."""
-        self._listener.open(self)
+        self.listener.open(self)
 
     def close(self) -> None:
         """Unregister. Safe to call twice."""
-        self._listener.unregister(self)
+        self.listener.unregister(self)
 
 
 class OpenLink(NamedTuple):
@@ -268,6 +257,13 @@ class OpenLink(NamedTuple):
     network: str
     codec: StopCodec
     missed: MissedStops
+
+
+class _Inbox(NamedTuple):
+    """Events that wait for the listener's thread, and what wakes it."""
+
+    events: FairQueue
+    woken: threading.Event
 
 
 class EstopListener:
@@ -293,7 +289,7 @@ class EstopListener:
         self._answered: dict[tuple[str, str], float] = {}
         self._redundant: dict[tuple[str, str], None] = {}
         self._repeated: dict[Hashable, bytes] = {}
-        self._queue: FairQueue | None = None
+        self._inbox: _Inbox | None = None
         self._thread: threading.Thread | None = None
         self._end_short_slices: Callable[[], None] = lambda: None
         self._end_watch: Callable[[], None] = lambda: None
@@ -327,13 +323,11 @@ class EstopListener:
             opened: False to have a new link opened by :meth:`ListenerRegistration.open` only.
         """
         with self._registering:
-            if self._queue is None:
+            if self._inbox is None:
                 self._start()
             link = next((each.link for each in self._registrations if each.key == key), None)
             made = make() if link is None else link
-            registration = ListenerRegistration(
-                self, robot_id, key, made, identity, network=network, was_here=was_here, codec=codec, asks=asks
-            )
+            registration = ListenerRegistration(self, robot_id, key, made, identity, network, was_here, codec, asks)
             self._registrations = (*self._registrations, registration)
         if opened:
             registration.open()
@@ -359,17 +353,17 @@ class EstopListener:
             self._registrations = tuple(each for each in self._registrations if each is not registration)
             last_of_link = all(each.key != registration.key for each in self._registrations)
             opened = self._open.pop(registration.key, None) if last_of_link else None
-            events, thread = (self._queue, self._thread) if not self._registrations else (None, None)
-            if events is not None:
-                self._queue = self._thread = None
+            inbox, thread = (None, None) if self._registrations else (self._inbox, self._thread)
+            if inbox is not None:
+                self._inbox = self._thread = None
         if last_of_link:
             registration.link.close()
         if opened is not None:
             opened.missed.close()
-        if events is not None:
+        if inbox is not None:
             self._end_watch()
             self._end_short_slices()
-            events.close()
+            inbox.woken.set()
         if thread is not None and thread is not threading.current_thread():
             thread.join(2.0)
 
@@ -398,7 +392,7 @@ class EstopListener:
         stated = codec.fields(stop.payload) if fields is None else fields
         if self._plane.under_way(stated.get("estop_id")):
             return
-        events = self._queue if path == LISTENER else None
+        events = self._inbox.events if self._inbox is not None and path == LISTENER else None
         if events is None and codec.vouches(self._rules) and not self._budget.allows(source, time.monotonic()):
             return
         order = codec.order(self._rules, stop, stated, path)
@@ -432,19 +426,23 @@ class EstopListener:
             link.missed.receive(event, source, payload)
             return
         network, codec = ("", JSON_RPC) if link is None else (link.network, link.codec)
-        events = self._queue
-        if events is None:
+        inbox = self._inbox
+        if inbox is None:
             return
+        events, woken = inbox
         if not isinstance(payload, int) and len(payload) > PARSED_MAX_BYTES:
             payload = len(payload)
         if event == CHECK_IN_ANSWER:
             if self._heads.take("", time.monotonic()):
                 events.put(event, source, payload, urgent=False)
+                woken.set()
             return
-        if not codec.names_source or self._rules.source_refusal(source) is None:
-            events.put(event, source, payload, urgent=event == ESTOP, network=network, codec=codec)
-        elif self._refusal_due(source):
-            events.put(event, source, payload, urgent=False, codec=codec)
+        counts = not codec.names_source or self._rules.source_refusal(source) is None
+        if counts or self._refusal_due(source):
+            events.put(event, source, payload, urgent=counts and event == ESTOP, network=network, codec=codec)
+            # While it is set, the next look is still to come: most messages of a flood need not wake the thread.
+            if not woken.is_set():
+                woken.set()
 
     def _refusal_due(self, source: str) -> bool:
         """Return True when a refusal of this source should be recorded; else count it."""
@@ -494,12 +492,21 @@ class EstopListener:
         audit_head(), own_log_id(), own_run()  # read from the disk now, so that no stop waits for it
         self._end_short_slices = shorten_time_slices()
         self._end_watch = AWAKE.watch(self.awake)
-        self._queue = FairQueue()
-        self._thread = threading.Thread(target=self._run, args=(self._queue,), name="estop-listener", daemon=True)
+        self._inbox = _Inbox(FairQueue(), threading.Event())
+        self._thread = threading.Thread(target=self._run, args=(self._inbox,), name="estop-listener", daemon=True)
         self._thread.start()
 
-    def _run(self, events: FairQueue) -> None:
-        while (received := events.get()) is not None:
+    def _run(self, inbox: _Inbox) -> None:
+        events, woken = inbox
+        while True:
+            received = events.take()
+            if received is None and self._inbox is not inbox:
+                return
+            if received is None:
+                woken.wait()
+                # What was put between the look and the clearing is found by the next look; what comes later sets it.
+                woken.clear()
+                continue
             try:
                 if received.event == CHECK_IN_ANSWER:
                     for first in self._registrations[:1]:

@@ -222,7 +222,13 @@ class Waiting:
 
 
 class MotionGate:
-    """Gate of one robot; thread-safe."""
+    """Gate of one robot; thread-safe.
+
+    Attributes:
+        generation: rises with every halt; permits of an older one are void.
+        given: rises with every permit that is given. A settling begins only where none was given since its halt.
+        under_way: the robot's own verbs that have not returned.
+    """
 
     def __init__(self, latch: Latch | None = None, awake: AwakeClock = AWAKE) -> None:
         self._awake = awake
@@ -230,16 +236,11 @@ class MotionGate:
         self._latches: tuple[Latch, ...] = () if latch is None else (latch,)
         self._attaching = threading.Lock()
         self._counting = threading.Lock()
-        self._generation = 0
+        self.generation = 0
         self._of_thread = threading.local()
         self._watchers: tuple[Callable[[], None], ...] = ()
-        self._given = 0
+        self.given = 0
         self.under_way = VerbsUnderWay()
-
-    @property
-    def generation(self) -> int:
-        """Rises with every halt; permits of an older one are void."""
-        return self._generation
 
     @property
     def held(self) -> bool:
@@ -282,7 +283,7 @@ class MotionGate:
         """Call ``begins`` before each permit; return a callable that ends that."""
         with self._attaching:
             self._watchers = (*self._watchers, begins)
-        if self._given:
+        if self.given:
             begins()
 
         def unwatch() -> None:
@@ -296,7 +297,7 @@ class MotionGate:
 
         A call that waits for a thread or a connection is thus older than a stop that comes meanwhile.
         """
-        return MotionRequest(self, self._generation)
+        return MotionRequest(self, self.generation)
 
     @contextmanager
     def within(self, request: MotionRequest) -> Iterator[None]:
@@ -317,7 +318,7 @@ class MotionGate:
     def reading(self, verb: str) -> Iterator[None]:
         """Refuse permits on this thread, for the time of a verb that is a read."""
         before = self._outer()
-        self._of_thread.request = MotionRequest(self, self._generation, read=verb)
+        self._of_thread.request = MotionRequest(self, self.generation, read=verb)
         try:
             yield
         finally:
@@ -381,24 +382,16 @@ class MotionGate:
                 raise MotionRefused(refusal)
             # Counted between two looks at the latches: a settling that begins beside this either is a latch that
             # refuses it, or sees that it was given.
-            self._given += 1
+            self.given += 1
         for begins in self._watchers:
             begins()
         return permit
 
-    @property
-    def given(self) -> int:
-        """Number that rises with every permit that is given.
-
-        A settling begins only where none was given since its halt.
-        """
-        return self._given
-
     def revoke(self) -> int:
         """Void every permit given so far; return the generation of this halt."""
         with self._counting:
-            self._generation += 1
-            return self._generation
+            self.generation += 1
+            return self.generation
 
     def settling(self, generation: int) -> Permit:
         """Return leave for the motion that is a part of the halt of ``generation``.
@@ -415,8 +408,8 @@ class MotionGate:
         with self._counting:
             valid = permit.valid
             if valid:
-                self._generation += 1
-            request = MotionRequest(self, self._generation)
+                self.generation += 1
+            request = MotionRequest(self, self.generation)
         refusal = self._refusal(permit.verb, request) if valid else error(_LATE.format(permit.verb))
         if refusal is not None:
             raise MotionRefused(refusal)
@@ -426,7 +419,7 @@ class MotionGate:
         return getattr(self._of_thread, "request", None)
 
     def _dated(self, request: MotionRequest | None) -> MotionRequest:
-        made = MotionRequest(self, self._generation)
+        made = MotionRequest(self, self.generation)
         if request is not None and request.gate is not self:
             # It was made of a robot that has this one inside: a halt of either refuses the motion.
             made.given_up, request = request.overtaken, None
@@ -475,22 +468,19 @@ class VerbsUnderWay:
     """The own motion verbs of one robot that run now; thread-safe.
 
     A verb of ours is a rollout or a plan that a halt ends by itself. A robot's own verb is its author's code: a halt
-    voids its permit and waits until it has returned. One that does not return is a robot that may still move. A halt
-    reads them without a lock.
+    voids its permit and waits until it has returned. One that does not return is a robot that may still move.
+
+    Attributes:
+        calls: that have not returned, the oldest first. A halt reads them without a lock.
     """
 
     def __init__(self) -> None:
-        self._running: dict[VerbCall, None] = {}
+        self.calls: tuple[VerbCall, ...] = ()
         self._beginning = threading.Lock()
         self._observers: tuple[CallObserver, ...] = ()
 
     def __bool__(self) -> bool:
-        return bool(self._running)
-
-    @property
-    def calls(self) -> tuple[VerbCall, ...]:
-        """The calls that have not returned, the oldest first."""
-        return tuple(self._running)
+        return bool(self.calls)
 
     @property
     def name(self) -> str:
@@ -516,16 +506,17 @@ class VerbsUnderWay:
         """
         with self._beginning:
             other = next((each.name for each in self.calls if each.call is not call.call), "")
-            outer = not self._running
+            outer = not self.calls
             if not other:
-                self._running[call] = None
+                self.calls = (*self.calls, call)
         try:
             if not other and outer:
                 self._tell(call)
             yield other
         finally:
             if not other:
-                self._running.pop(call, None)
+                with self._beginning:
+                    self.calls = tuple(each for each in self.calls if each is not call)
                 if outer:
                     self._tell(call)
 

@@ -116,7 +116,7 @@ class LockoutState:
 
     def engage(self, lockout: Lockout) -> LockoutState:
         """Return the state after an emergency stop; a known epoch changes nothing."""
-        if self.can_resume(lockout.epoch):
+        if any(each.epoch == lockout.epoch for each in reversed(self.lockouts)):
             return self
         if lockout.epoch != OVERFLOW and len(self.lockouts) < MAX_EPOCHS:
             return LockoutState((*self.lockouts, lockout), self.overflow)
@@ -193,7 +193,8 @@ class LockoutLatch:
             self.state = self.state.engage(Lockout(epoch, source, reason, self._clock(), scope))
             if self.state.overflow is not None and not crowded:
                 self.crowd = uptime() - SKEW_S, uptime() + SKEW_S
-            self._forget()
+            if len(self._seen) > SEEN_MAX + MAX_EPOCHS:
+                self._forget()
             return True
 
     def inherit(self, state: LockoutState, crowd: Span) -> None:
@@ -234,8 +235,6 @@ class LockoutLatch:
         self.resumed = with_resumed(self.resumed, epochs)
 
     def _forget(self) -> None:
-        if len(self._seen) <= SEEN_MAX + MAX_EPOCHS:
-            return
         active = set(self.state.resumable)
         oldest = next(epoch for epoch in self._seen if epoch not in active)
         del self._seen[oldest]

@@ -413,14 +413,14 @@ class StopRules:
             self._clocks.note(source, self._clock() - (time.monotonic() - received) - sent, received)
 
 
-def params_of(payload: bytes | int) -> dict[str, Any]:
+def params_of(payload: bytes | int | None) -> dict[str, Any]:
     """Return the parameters of a JSON-RPC notification; empty for anything else.
 
     Args:
-        payload: the message, or its number of bytes where there are too many to be read.
+        payload: the message, or its number of bytes where there are too many to be read; None for none.
     """
     try:
-        message = None if isinstance(payload, int) else parsed(payload, PARSED_MAX_BYTES)
+        message = parsed(payload, PARSED_MAX_BYTES) if isinstance(payload, bytes) else None
     except ValueError:
         return {}
     params = message.get("params") if isinstance(message, dict) else None

@@ -45,8 +45,8 @@ REPORTS_KEPT = 64
 HALT_AGAIN_S = 0.25
 """Seconds in which one halt answers for all stops of a robot that is locked by more than it tells apart."""
 
-TOLD_EVERY_S = 10.0
-"""Seconds between two records of the stops that were counted instead of carried out one by one."""
+YIELD_S = 0.0002
+"""Seconds that the halts of a stop have to themselves as they begin."""
 
 KEEP_AGAIN_S = 1.0
 """Seconds between two attempts to write a lockout, or its clearing, that could not be written."""
@@ -253,6 +253,9 @@ class SafetyPlane:
         store: where lockouts are kept.
         deadline_s: seconds a robot has to halt; ``STRANDS_HALT_DEADLINE_S`` by default, read at each stop.
         executor: halts the robots; the process's by default.
+
+    Attributes:
+        robots: that are registered now, by id; the mapping is never changed, only replaced.
     """
 
     def __init__(
@@ -267,24 +270,19 @@ class SafetyPlane:
         self._registering = threading.Lock()
         self._keeping = threading.Lock()
         self._keep_at = 0.0
-        self._robots: dict[str, Registered] = {}
+        self.robots: dict[str, Registered] = {}
         self._reporter: Reporter | None = None
         self._begun: tuple[str, dict[str, Registered]] | None = None
         self._issued: dict[str, int] = {}
-        self._counted = StopCount(TOLD_EVERY_S)
+        self._counted = StopCount()
         self._originals = Originals()
-        self._clearance = ClearanceInbox(lambda: self._robots, self._clear_one)
+        self._clearance = ClearanceInbox(lambda: self.robots, self._clear_one)
         self.checkin = CheckIn(settings.number("STRANDS_CHECKIN_TIMEOUT_S"))
 
     @property
     def executor(self) -> StopExecutor:
         """The executor that halts the robots."""
         return self._executor or stop_executor()
-
-    @property
-    def robots(self) -> dict[str, Registered]:
-        """The robots held now, by id; never changed, only replaced."""
-        return self._robots
 
     def register(
         self, robot_id: str, robot: Stoppable, *, key: str | None = None, wire_id: str = "", cell: str = ""
@@ -306,7 +304,7 @@ class SafetyPlane:
         """
         identifier("robot_id", robot_id)
         with self._registering:
-            known = self._robots.get(robot_id)
+            known = self.robots.get(robot_id)
             if known is not None:
                 if body_of(known.robot) is not body_of(robot):
                     raise ValidationError(f"robot_id {shown(robot_id)} is taken by another robot of this process.")
@@ -335,10 +333,10 @@ class SafetyPlane:
             )
             robot.gate.attach(entry.latch)
             self._inherit(entry)
-            if not self._robots:
+            if not self.robots:
                 self.checkin = CheckIn(settings.number("STRANDS_CHECKIN_TIMEOUT_S"))
                 self._reporter = Reporter(self._tick, self._chore)
-            self._robots = {**self._robots, robot_id: entry}
+            self.robots = {**self.robots, robot_id: entry}
         if entry.locked:
             entry.come_up_locked()
         return entry
@@ -347,13 +345,13 @@ class SafetyPlane:
         """Take a robot out with its last user; the threads end with the last robot."""
         with self._registering:
             entry.users -= 1
-            if entry.users or self._robots.get(entry.robot_id) is not entry:
+            if entry.users or self.robots.get(entry.robot_id) is not entry:
                 return
-            self._robots = {name: each for name, each in self._robots.items() if each is not entry}
+            self.robots = {name: each for name, each in self.robots.items() if each is not entry}
             self._bequeath(entry)
             # Decided here: a robot that registers meanwhile has a reporter of its own, and this one ends all the same.
             last = None
-            if not self._robots:
+            if not self.robots:
                 last, self._reporter = self._reporter, None
         if last is not None:
             last.close()
@@ -361,7 +359,7 @@ class SafetyPlane:
 
     def _inherit(self, entry: Registered) -> None:
         """Lock the entry by lockouts with which its robot left the plane."""
-        living = [each.latch for each in self._robots.values()]
+        living = [each.latch for each in self.robots.values()]
         for latch in entry.robot.gate.latches:
             if isinstance(latch, LockoutLatch) and latch is not entry.latch and latch not in living:
                 entry.latch.inherit(latch.state, latch.crowd)
@@ -373,7 +371,7 @@ class SafetyPlane:
             # Its last stop may not be written yet, and the next registration reads it there.
             self._kept([entry])
         for gate in entry.gates:
-            heirs = [each for each in self._robots.values() if gate in each.gates]
+            heirs = [each for each in self.robots.values() if gate in each.gates]
             for heir in heirs:
                 heir.latch.inherit(entry.latch.state, entry.latch.crowd)
             if heirs or not entry.locked:
@@ -389,9 +387,9 @@ class SafetyPlane:
         if self.under_way(order.epoch):
             return None
         followed = False
-        halted = undisturbed(many=len(self._robots) > UNPACED)
+        halted = undisturbed(many=len(self.robots) > UNPACED)
         try:
-            by_name = self._robots
+            by_name = self.robots
             fresh, known = self._engage(order, by_name)
             reporter = self._reporter
             if reporter is None:
@@ -422,7 +420,7 @@ class SafetyPlane:
             if len(fresh) == len(by_name):
                 # An answer takes it back, and none is in before the first halt is submitted.
                 self._begun = (order.epoch, by_name)
-            executor = self.executor
+            executor = self._executor or stop_executor()
             for entry in fresh:
                 executor.submit(
                     entry.robot,
@@ -433,6 +431,8 @@ class SafetyPlane:
                     answered=functools.partial(reporter.answer, run, entry.robot_id),
                     voided=True,
                 )
+            # Nothing of what follows is urgent, and it would keep the interpreter from the halts.
+            time.sleep(YIELD_S)
             self._note_original(order)
             reporter.begin(run)
             followed = True
@@ -453,7 +453,7 @@ class SafetyPlane:
         A repetition changes nothing then, and the halts need the time that reading it takes.
         """
         begun = self._begun
-        return begun is not None and begun[0] == epoch and begun[1] is self._robots
+        return begun is not None and begun[0] == epoch and begun[1] is self.robots
 
     def _engage(self, order: StopOrder, by_name: dict[str, Registered]) -> tuple[list[Registered], list[Registered]]:
         """Lock the robots in its scope; return those to halt, and those that know it.
@@ -499,7 +499,7 @@ class SafetyPlane:
 
     def resume(self, robot_id: str, assertion: object, path: str) -> Envelope:
         """Check a signed resume for one robot; the answer has no reason."""
-        entry = self._robots.get(robot_id)
+        entry = self.robots.get(robot_id)
         if entry is None:
             return error(REJECTED)
         verdict = entry.verifier.check(assertion, entry.latch.state.resumable)
@@ -524,7 +524,7 @@ class SafetyPlane:
 
     def clear_local(self, who: str, robot_ids: Iterable[str] | None = None) -> dict[str, tuple[Lockout, ...]]:
         """Clear every lockout of these robots, or all, for the operator ``who``."""
-        robots = self._robots
+        robots = self.robots
         cleared: dict[str, tuple[Lockout, ...]] = {}
         for name in robots.keys() & set(robots if robot_ids is None else robot_ids):
             entry = robots[name]
@@ -541,7 +541,7 @@ class SafetyPlane:
 
     def lockouts(self) -> dict[str, tuple[Lockout, ...]]:
         """Return the locked robots and their lockouts."""
-        return {name: entry.latch.state.all for name, entry in self._robots.items() if entry.locked}
+        return {name: entry.latch.state.all for name, entry in self.robots.items() if entry.locked}
 
     def originals(self, network: str) -> list[Original]:
         """Return the stops of ``network`` that lock robots here, as they arrived."""
@@ -553,14 +553,14 @@ class SafetyPlane:
 
     def hold(self, seconds: float) -> None:
         """Hold the motions of every robot for so long; return at once."""
-        for entry in self._robots.values():
+        for entry in self.robots.values():
             for gate in entry.gates:
                 gate.hold(seconds)
 
     def _clear_one(self, who: str, robot_id: str) -> str:
-        entry = self._robots.get(robot_id)
+        entry = self.robots.get(robot_id)
         if entry is None or robot_id not in self.clear_local(who, [robot_id]):
-            return NOT_LOCKED if robot_id in self._robots else LEFT
+            return NOT_LOCKED if robot_id in self.robots else LEFT
         return NOT_KEPT if entry.key and entry.latch.state is not entry.on_disk else CLEARED
 
     def _repeat(self, order: StopOrder, robots: Collection[Registered], on_report: OnReport) -> None:
@@ -619,7 +619,7 @@ class SafetyPlane:
 
     def _held(self, leaving: Iterable[Registered] = ()) -> frozenset[str]:
         """Return the epochs by which a robot of this process is locked."""
-        return frozenset(each for entry in (*self._robots.values(), *leaving) for each in entry.latch.state.resumable)
+        return frozenset(each for entry in (*self.robots.values(), *leaving) for each in entry.latch.state.resumable)
 
     def _kept(self, entries: Iterable[Registered]) -> bool:
         try:
@@ -631,8 +631,8 @@ class SafetyPlane:
 
     def _keep_again(self) -> None:
         """Write what could not be written; the log and the audit say when it is."""
-        due = [each for each in self._robots.values() if each.keep_again or each.crowd_unsaved]
-        new = {each: each.resumed for each in self._robots.values() if each.unrecorded}
+        due = [each for each in self.robots.values() if each.keep_again or each.crowd_unsaved]
+        new = {each: each.resumed for each in self.robots.values() if each.unrecorded}
         if (due or new) and time.monotonic() >= self._keep_at:
             self._keep_at = time.monotonic() + KEEP_AGAIN_S
             with contextlib.suppress(OSError):  # a lockout that is not written was reported at first
@@ -686,7 +686,7 @@ class SafetyPlane:
     def _chore(self) -> None:
         self._keep_again()
         sightings().refresh()
-        if any(entry.locked for entry in self._robots.values()):
+        if any(entry.locked for entry in self.robots.values()):
             self._clearance.look()
 
 

@@ -1,35 +1,39 @@
-"""The process: time slices and garbage collector of its interpreter, and its pauses."""
+"""The process: time slices and collector of its interpreter, and its pauses."""
 
 from __future__ import annotations
 
 import gc
 import sys
 import threading
-from abc import ABC, abstractmethod
 from collections.abc import Callable
+from typing import Generic, TypeVar
 
 from strands_robots.state_files import uptime
 from strands_robots.stop_log import stop_logger
 
 logger = stop_logger(__name__)
 
+T = TypeVar("T")
+
 SWITCH_S = 0.0005
 """Longest time in seconds that a busy Python thread may keep the interpreter from the threads of a stop; Python's own
 default is ten times that, and a stop wakes up to three threads on either side."""
 
 
-class _WhileNeeded(ABC):
-    """A setting of the interpreter that is another one while anyone needs that."""
+class _WhileNeeded(Generic[T]):
+    """A setting of the interpreter that is another one while anyone needs that.
 
-    def __init__(self) -> None:
+    Args:
+        read: returns the setting.
+        change: changes it, given what it was.
+        restore: undoes that, given what it was.
+    """
+
+    def __init__(self, read: Callable[[], T], change: Callable[[T], object], restore: Callable[[T], object]) -> None:
+        self._read, self._change, self._restore = read, change, restore
         self._lock = threading.Lock()
         self._users = 0
-
-    @abstractmethod
-    def _change(self) -> None: ...
-
-    @abstractmethod
-    def _restore(self) -> None: ...
+        self._before = read()
 
     def begin(self) -> Callable[[], None]:
         """Change the setting; return the end of it.
@@ -38,7 +42,8 @@ class _WhileNeeded(ABC):
         """
         with self._lock:
             if not self._users:
-                self._change()
+                self._before = self._read()
+                self._change(self._before)
             self._users += 1
         left = [None]
 
@@ -49,42 +54,33 @@ class _WhileNeeded(ABC):
                 left.clear()
                 self._users -= 1
                 if not self._users:
-                    self._restore()
+                    self._restore(self._before)
 
         return end
 
 
-class ShortTimeSlices(_WhileNeeded):
+class ShortTimeSlices(_WhileNeeded[float]):
     """Time slices of the interpreter in which busy threads give it up early."""
 
     def __init__(self) -> None:
-        super().__init__()
-        self._default_s = SWITCH_S
-
-    def _change(self) -> None:
-        self._default_s = sys.getswitchinterval()
-        self._shorten()
-
-    def _shorten(self) -> None:
-        sys.setswitchinterval(min(self._default_s, SWITCH_S))
-
-    def _restore(self) -> None:
-        sys.setswitchinterval(self._default_s)
+        super().__init__(
+            sys.getswitchinterval, lambda own_s: sys.setswitchinterval(min(own_s, SWITCH_S)), sys.setswitchinterval
+        )
 
     def suspend(self) -> None:
         """Give the slices their own length while they are short."""
         with self._lock:
             if self._users:
-                self._restore()
+                self._restore(self._before)
 
     def go_on(self) -> None:
         """Make the slices short again if anyone still needs that."""
         with self._lock:
             if self._users:
-                self._shorten()
+                self._change(self._before)
 
 
-class LongTimeSlices(_WhileNeeded):
+class LongTimeSlices(_WhileNeeded[None]):
     """Time slices of their own length in place of short ones.
 
     A stop of many robots is a few milliseconds of work on several threads. Short slices would cut it into dozens of
@@ -92,33 +88,17 @@ class LongTimeSlices(_WhileNeeded):
     """
 
     def __init__(self, short: ShortTimeSlices) -> None:
-        super().__init__()
-        self._short = short
-
-    def _change(self) -> None:
-        self._short.suspend()
-
-    def _restore(self) -> None:
-        self._short.go_on()
+        super().__init__(lambda: None, lambda _: short.suspend(), lambda _: short.go_on())
 
 
-class PausedCollector(_WhileNeeded):
+class PausedCollector(_WhileNeeded[bool]):
     """Garbage collector that waits.
 
     A whole collection stops all threads of a large process for 0.1 s and more.
     """
 
     def __init__(self) -> None:
-        super().__init__()
-        self._enabled = True
-
-    def _change(self) -> None:
-        self._enabled = gc.isenabled()
-        gc.disable()
-
-    def _restore(self) -> None:
-        if self._enabled:
-            gc.enable()
+        super().__init__(gc.isenabled, lambda _: gc.disable(), lambda enabled: gc.enable() if enabled else None)
 
 
 _SHORT_SLICES = ShortTimeSlices()

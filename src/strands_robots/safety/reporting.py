@@ -12,7 +12,7 @@ import random
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from strands_robots.safety.orders import RobotReport, StopOrder
@@ -48,33 +48,39 @@ OnReport = Callable[[RobotReport], None]
 OnDone = Callable[["StopRun"], None]
 
 
-@dataclass(eq=False)
 class StopRun:
-    """One emergency stop on its way through the robots of this process."""
+    """One emergency stop on its way through the robots of this process.
 
-    order: StopOrder
-    robot_ids: tuple[str, ...]
-    kept_ids: frozenset[str]
-    deadline_s: float
-    epochs_of: Callable[[str], tuple[str, ...]]
-    on_report: OnReport
-    on_done: OnDone
-    keep: Callable[[], None]
-    on_halted: Callable[[], None] = lambda: None
-    reports: dict[str, RobotReport] = field(default_factory=dict)
-    done: threading.Event = field(default_factory=threading.Event)
-    started: float = field(default_factory=time.monotonic)
-    answers: dict[str, tuple[StopVerdict, float]] = field(default_factory=dict)
-    halting: set[str] = field(default_factory=set)
-    keeping_since: float | None = None
-    kept: bool | None = None
-    keep_at: float = 0.0
-    answer_at: float = 0.0
+    Args:
+        kept_ids: robots whose lockout is kept.
+        keep: writes the lockout file.
+        on_halted: called once every halt has answered, or no longer needs an interpreter of its own.
+    """
 
-    def __post_init__(self) -> None:
-        self.halting.update(self.robot_ids)
-        count = len(self.robot_ids)
+    def __init__(  # noqa: PLR0917 - one value of the stop each
+        self,
+        order: StopOrder,
+        robot_ids: tuple[str, ...],
+        kept_ids: frozenset[str],
+        deadline_s: float,
+        epochs_of: Callable[[str], tuple[str, ...]],
+        on_report: OnReport,
+        on_done: OnDone,
+        keep: Callable[[], None],
+        on_halted: Callable[[], None] = lambda: None,
+    ) -> None:
+        self.order, self.robot_ids, self.kept_ids, self.deadline_s = order, robot_ids, kept_ids, deadline_s
+        self.epochs_of, self.on_report, self.on_done, self.keep = epochs_of, on_report, on_done, keep
+        self.on_halted = on_halted
+        self.reports: dict[str, RobotReport] = {}
+        self.answers: dict[str, tuple[StopVerdict, float]] = {}
+        self.halted: set[str] = set()
+        self.done = threading.Event()
+        self.keeping_since: float | None = None
+        self.kept: bool | None = None
+        count = len(robot_ids)
         pace_s = min(PACE_S * count, PACE_MAX_S) if count > UNPACED else 0.0
+        self.started = time.monotonic()
         self.keep_at = self.started + pace_s
         self.answer_at = self.started + pace_s * random.uniform(1.0, 2.0)
 
@@ -132,8 +138,8 @@ class Reporter:
 
     def answer(self, run: StopRun, robot_id: str, verdict: StopVerdict) -> None:
         """Record the verdict of a halt."""
-        run.halting.discard(robot_id)
-        if not run.halting:
+        run.halted.add(robot_id)
+        if len(run.halted) == len(run.robot_ids):
             # Here, because the reporting thread may be sending the answers to another stop.
             run.on_halted()
         self._inbox.put(_Answer(run, robot_id, verdict, time.monotonic()))
@@ -300,13 +306,13 @@ SOURCES_NAMED = 16
 
 
 class StopCount:
-    """Stops of a flood since the last record of them; thread-safe.
+    """Stops that were counted instead of carried out one by one; thread-safe.
 
     Args:
-        every_s: seconds between two records.
+        every_s: seconds between two records of them.
     """
 
-    def __init__(self, every_s: float) -> None:
+    def __init__(self, every_s: float = 10.0) -> None:
         self._every_s = every_s
         self._counting = threading.Lock()
         self._stops = 0

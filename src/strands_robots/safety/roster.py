@@ -33,6 +33,7 @@ from strands_robots.safety.statements import Purpose, own_key
 from strands_robots.safety.stop_link import STOP_ROSTER, FairQueue
 from strands_robots.state_files import uptime
 from strands_robots.stop_log import stop_logger
+from strands_robots.threads import WokenThread
 from strands_robots.utils import ValidationError, field_values, identifier
 
 logger = stop_logger(__name__)
@@ -510,7 +511,8 @@ class RosterInbox:
         self._lock = threading.Lock()
         self._stops: dict[str, OnReport] = {}
         self._queue = FairQueue()
-        self._started = False
+        self._trusted = frozenset[bytes]()
+        self._worker = WokenThread("roster reports", self._read_all)
 
     def open(self, estop_id: str, on_report: OnReport) -> None:
         """Give reports about this stop to ``on_report``, on the thread of the inbox."""
@@ -527,25 +529,20 @@ class RosterInbox:
         if isinstance(payload, int) or len(payload) > REPORT_MAX_BYTES or not self._stops:
             return
         self._queue.put(STOP_ROSTER, source, payload, urgent=False)
-        if not self._started:
-            with self._lock:
-                started, self._started = self._started, True
-            if not started:
-                threading.Thread(target=self._run, name="roster reports", daemon=True).start()
+        self._worker.wake()
 
     def end(self) -> None:
         """End the thread."""
-        self._queue.close()
+        self._worker.close()
 
-    def _run(self) -> None:
-        trusted = trusted_controllers()
-        while (event := self._queue.get()) is not None:
+    def _read_all(self) -> None:
+        while (event := self._queue.take()) is not None:
             if not self._stops:
-                trusted = frozenset()
+                self._trusted = frozenset()
                 continue
-            trusted = trusted or trusted_controllers()
+            self._trusted = self._trusted or trusted_controllers()
             fields = self._read(event.payload) if isinstance(event.payload, bytes) else {}
-            report = read_report(event.source, fields, trusted)
+            report = read_report(event.source, fields, self._trusted)
             with self._lock:
                 on_report = None if report is None else self._stops.get(report.estop_id)
             if report is None or not report.trusted:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from strands_robots import settings
@@ -32,10 +32,15 @@ class Scope:
     Attributes:
         only: their names on the network; empty for no choice by name.
         cell: the cell whose robots it is for, besides every robot without a cell; empty for no choice by cell.
+        everything: a stop of every robot.
     """
 
     only: frozenset[str] = frozenset()
     cell: str = ""
+    everything: bool = field(init=False, compare=False, repr=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "everything", not (self.only or self.cell))
 
     @classmethod
     def named(cls, names: Iterable[str]) -> Scope:
@@ -57,11 +62,6 @@ class Scope:
             return EVERY_ROBOT if cell is None else cls(cell=identifier("cell", cell))
         except ValidationError:
             return EVERY_ROBOT
-
-    @property
-    def everything(self) -> bool:
-        """True for a stop of every robot."""
-        return not (self.only or self.cell)
 
     def covers(self, name: str, cells: Collection[str]) -> bool:
         """Return True for a robot that has to stop.

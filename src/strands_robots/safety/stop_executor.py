@@ -106,6 +106,7 @@ class StopExecutor:
         with self._attaching:
             self._watch_deadlines()
             slot, key = self._slot(target, name), target_key(target)
+            has_parts(type(target))  # remembered for the first stop
             if slot.owners == 0:
                 slot.wake, slot.thread = self._ready_thread(name)
                 # What was submitted to the reserve in between waits at the slot.
@@ -170,9 +171,9 @@ class StopExecutor:
             A future of the graded verdict. It is set at the latest when the time is over, and never to an exception.
         """
         limit = settings.number("STRANDS_HALT_DEADLINE_S") if within is None else within
-        slot = self._slot(target, name)
+        slot = self._slots.get(target_key(target)) or self._slot(target, name)
         stop = SubmittedStop(slot, target, name, reason, limit, time.monotonic() if since is None else since, answered)
-        stop.parts = has_parts(target)
+        stop.parts = has_parts(type(target))
         stop.direct = stop.parts and hasattr(type(target), "unanswered")
         stop.future.set_running_or_notify_cancel()
         if answered is not None:
@@ -252,7 +253,7 @@ class StopExecutor:
             self._here.serving = (*outer, slot)
             answer: object = None
             reason, target = stops[0].reason, stops[0].target
-            deadline = max(each.moment(RETURN_SHARE) for each in stops)
+            deadline = max(each.since + RETURN_SHARE * each.within for each in stops)
             verbs = HaltedVerbs(target, [call for each in stops for call in each.verbs], [each.asker for each in stops])
             try:
                 # Nested, an overridden halt has called the one of its class.

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import secrets
-import threading
 import time
 import uuid
 from collections import deque
@@ -102,9 +101,8 @@ class StopCodec:
         """Encode an event of this process."""
         return notification(event, fields)
 
-    def fields(self, payload: bytes | int | None) -> Mapping[str, Any]:
-        """Return the fields of a message; empty for what is none or is too long to be read."""
-        return {} if payload is None else params_of(payload)
+    fields: Callable[[bytes | int | None], Mapping[str, Any]] = staticmethod(params_of)
+    """Returns the fields of a message; empty for what is none or is too long to be read."""
 
     def epoch(self, source: str, fields: Mapping[str, Any]) -> str:
         """Return the epoch that a stop states; empty for none."""
@@ -123,7 +121,7 @@ class StopCodec:
         return rules.order(stop.source, fields, path, stop.payload, stop.at, network=stop.network, age_s=age_s)
 
     def vouches(self, rules: StopRules) -> bool:
-        """Return True where each stop that counts is signed, so that its source has a share of its own."""
+        """Return True where each stop that counts is signed: its source gets its own share."""
         return rules.signed
 
     def refused(self, refused: StopRefused) -> bool:
@@ -193,12 +191,12 @@ class _Share:
 
 
 class FairQueue:
-    """Bounded queue of events from links: fair between sources, newest first.
+    """Bounded queue of events for one reader: fair between sources, newest first.
 
     A flood of forged stops must not delay a true one. Sources share a fixed number of buckets by a keyed hash; buckets
     are served in turn, one event each, the newest stop first. What overflows a bucket is its oldest stop; a controller
     repeats its stop, so a true one arrives again. A source that was vouched for has a bucket of its own, and every
-    second turn is of such a one: names that are made up share the other turns. No method but :meth:`get` blocks.
+    second turn is of such a one: names that are made up share the other turns. No method blocks or takes a lock.
 
     Args:
         buckets: number of those that all sources share.
@@ -213,9 +211,7 @@ class FairQueue:
         self._capacity = capacity
         self._crowd, self._signed = _Share(_Bucket(capacity) for _ in range(buckets)), _Share()
         self._vouched: dict[str, _Bucket] = {}
-        self._waiting = threading.Event()
         self._crowd_next = False
-        self._closed = False
         self.displaced = False
 
     def vouch(self, source: str) -> None:
@@ -240,29 +236,19 @@ class FairQueue:
     ) -> None:
         """Add an event; of those that are not urgent, a full bucket drops the new."""
         received = StopEvent(event, source, payload, time.monotonic(), network, codec)
-        # Within one text: the hash of a pair keeps the same names together whatever the salt.
-        shared = self._crowd.buckets[hash(self._salt + source) % len(self._crowd.buckets)]
-        bucket = self._vouched.get(source, shared)
-        # Adding to a bucket and setting an event are atomic; no lock is shared with the reader's thread.
+        bucket = self._vouched.get(source)
+        if bucket is None:
+            # Within one text: the hash of a pair keeps the same names together whatever the salt.
+            bucket = self._crowd.buckets[hash(self._salt + source) % len(self._crowd.buckets)]
+        # Adding to a bucket is atomic.
         if urgent:
             self.displaced = self.displaced or len(bucket.urgent) == self._capacity
             bucket.urgent.append(received)
         elif len(bucket.later) < self._capacity // 2:
             bucket.later.append(received)
-        # While it is set, the reader's next look is still to come: most messages of a flood need not wake it.
-        if not self._waiting.is_set():
-            self._waiting.set()
-
-    def get(self) -> StopEvent | None:
-        """Return the next event, waiting for one; None once closed and empty."""
-        while (event := self.take()) is None and not self._closed:
-            self._waiting.wait()
-            self._waiting.clear()
-            # What was put between the look and the clearing is found by the next look; what comes later sets it.
-        return event
 
     def take(self) -> StopEvent | None:
-        """Return the next event, of the crowd and of vouched sources in turn; None where there is none."""
+        """Return the next event, of the crowd and of vouched sources in turn, or None."""
         self._crowd_next = not self._crowd_next
         for share in (self._crowd, self._signed) if self._crowd_next else (self._signed, self._crowd):
             buckets = share.buckets
@@ -279,11 +265,7 @@ class FairQueue:
 
     def clear(self) -> None:
         """Forget what waits."""
-        while self.take() is not None:
-            pass
+        for bucket in (*self._crowd.buckets, *self._signed.buckets):
+            bucket.urgent.clear()
+            bucket.later.clear()
         self.displaced = False
-
-    def close(self) -> None:
-        """Let :meth:`get` return None when nothing is left."""
-        self._closed = True
-        self._waiting.set()

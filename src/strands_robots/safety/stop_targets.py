@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import queue
 import threading
 import time
@@ -114,16 +115,16 @@ def revoke_permits(target: object) -> None:
         gate.revoke()
 
 
-def has_parts(target: object) -> bool:
-    """Return whether the executor calls the parts of its halt."""
-    kind = type(target)
+@functools.lru_cache(maxsize=256)
+def has_parts(kind: type) -> bool:
+    """Return whether the executor calls the parts of the halt of such a target."""
     halt = getattr(kind, "halt", None)
     return hasattr(kind, "halt_here") and (halt is None or getattr(halt, "halts_in_parts", False))
 
 
 def target_key(target: Target) -> Hashable:
     """Return an identity that is equal for the same target."""
-    body = body_of(target)
+    body = target.wrapped if issubclass(type(target), RobotWrapper) else target  # type: ignore[union-attr]
     params = getattr(type(body), "__dataclass_params__", None)
     if params is None or not (params.frozen and params.eq):
         return id(body)
@@ -207,20 +208,14 @@ def under_way_of(target: object) -> VerbsUnderWay | None:
 def void_calls(target: object) -> tuple[VerbCall, ...]:
     """Void the permits of the own verbs that run on ``target``; return their calls."""
     under_way = under_way_of(target)
-    calls = under_way.calls if under_way else ()
+    calls = () if under_way is None else under_way.calls
     for each in calls:
         each.void()
     return calls
 
 
-class _Here(threading.local):
-    """Halts under way on this thread, the outermost first."""
-
-    def __init__(self) -> None:
-        self.halts: list[HaltedVerbs] = []
-
-
-_here = _Here()
+_here = threading.local()
+"""Its ``halts`` are the halts under way on this thread, the outermost first."""
 
 
 class HaltedVerbs:
@@ -239,7 +234,7 @@ class HaltedVerbs:
         self._calls = dict.fromkeys((*before, *void_calls(target)))
         # Several stops have one answer, and whoever does not run the verb has to be told of it.
         self._itself = next(iter(asked_by)) if len(set(asked_by)) == 1 else None
-        _here.halts.append(self)
+        _here.__dict__.setdefault("halts", []).append(self)
 
     def asked(self, call: VerbCall) -> bool:
         """Return True for a verb that asks for the halt itself."""
@@ -269,9 +264,10 @@ def verbs_to_end(under_way: VerbsUnderWay) -> Callable[[], bool]:
 
     An inner halt waits for none: the outermost does.
     """
-    if len(_here.halts) != 1:
+    halts: list[HaltedVerbs] = getattr(_here, "halts", [])
+    if len(halts) != 1:
         return lambda: False
-    halted = _here.halts[0]
+    halted = halts[0]
     return lambda: any(not each.valid() and not halted.asked(each) for each in under_way.calls)
 
 

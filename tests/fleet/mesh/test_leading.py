@@ -14,7 +14,7 @@ from strands_robots.fleet.mesh.leading import LedPeer, LimitedFollower, RemoteFo
 from strands_robots.hardware import HardwareRobot
 from strands_robots.mesh.transport import config
 from strands_robots.mesh.transport.config import Posture
-from strands_robots.teleoperators.leader import LeaderPolicy
+from strands_robots.teleoperators import LeaderPolicy
 from strands_robots.utils import ValidationError
 
 

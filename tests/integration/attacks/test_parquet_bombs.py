@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from strands_robots.teleoperators import recorded
+from strands_robots import teleoperators
 from strands_robots.utils import ValidationError
 
 
@@ -38,7 +38,7 @@ def refused(path: Path, monkeypatch: pytest.MonkeyPatch, why: str) -> None:
     monkeypatch.setattr(pq.ParquetFile, "iter_batches", lambda *a, **k: pytest.fail("it was unpacked"))
     began = time.process_time()
     with pytest.raises(ValidationError, match=why):
-        recorded.read_episode(path)
+        teleoperators.read_episode(path)
     assert time.process_time() - began < 5.0
 
 
@@ -67,10 +67,10 @@ def test_lists_of_a_million_values_are_refused_before_they_are_unpacked(
 def test_values_are_counted_as_they_are_unpacked(dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A file may state less of itself than it holds."""
     pq.write_table(table(4000), dataset)
-    assert len(recorded.read_episode(dataset, "0")) == 4000
+    assert len(teleoperators.read_episode(dataset, "0")) == 4000
     counted: list[tuple[str, int]] = []
-    monkeypatch.setattr(recorded, "_within", lambda what, count, most: counted.append((what, count)))
-    recorded.read_episode(dataset)
+    monkeypatch.setattr(teleoperators, "_within", lambda what, count, most: counted.append((what, count)))
+    teleoperators.read_episode(dataset)
     assert [count for what, count in counted if what == "rows"] == [4000, 1024, 2048, 3072, 4000]
 
 
@@ -81,4 +81,4 @@ def test_file_that_was_cut_or_changed_is_refused(dataset: Path, cut: int) -> Non
     for broken in (data[:-cut], data[: len(data) - cut] + b"\xff" * cut):
         dataset.write_bytes(broken)
         with pytest.raises(ValidationError, match=r"file-000\.parquet"):
-            recorded.read_episode(dataset)
+            teleoperators.read_episode(dataset)

@@ -15,7 +15,7 @@ from strands_robots.envelope import Envelope, is_error, text_of
 from strands_robots.errors import NoAnswerError, NoSuchRobotError, RefusalError, RobotError, UnreachableError
 from strands_robots.fleet.mesh.network import MeshNetwork
 from strands_robots.policies.base import Ranges, SpeedLimit, checked_action, numbers
-from strands_robots.teleoperators.leader import UNBOUNDED_PER_S, BoundedLeader, LeaderFinished, LeaderPolicy
+from strands_robots.teleoperators import UNBOUNDED_PER_S, BoundedLeader, LeaderFinished, LeaderPolicy
 from strands_robots.utils import ValidationError, mapping, number, plain_text, shown, text
 
 if TYPE_CHECKING:

@@ -1,1 +1,0 @@
-"""Leaders that drive a follower in place of a policy."""
