@@ -353,15 +353,18 @@ class StateRate:
 
     def begins(self) -> None:
         """Publish at once for the first motion after a rest; called before each permit."""
-        if not self.active:
-            self._wake()
+        now = self._clock()
+        if now >= self._active_until:
+            self._active_until = now + ACTIVE_S
+            self._hurry()
 
     def look(self) -> None:
         """Publish at once after a halt or a change of the lockouts."""
         halts, given = self._halts(), self._gate.given
         if halts != self._seen_halts:
             self._seen_halts = halts
-            self._wake()
+            self._active_until = self._clock() + ACTIVE_S
+            self._hurry()
         if given != self._seen_given:
             self._seen_given = given
             self._active_until = self._clock() + ACTIVE_S
@@ -379,10 +382,6 @@ class StateRate:
         runs = isinstance(task, Mapping) and task.get("status") in RUNNING
         if moved or runs or (isinstance(robots, Mapping) and any(robots.values())):
             self._active_until = self._clock() + ACTIVE_S
-
-    def _wake(self) -> None:
-        self._active_until = self._clock() + ACTIVE_S
-        self._hurry()
 
     def _halts(self) -> object:
         return self._gate.generation, self._epochs()

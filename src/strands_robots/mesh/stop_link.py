@@ -186,8 +186,9 @@ class MeshStopCodec(StopCodec):
             why = _unproven(rules, source, fields)
         if why is not None:
             return StopRefused(source, why)
+        estop_id = fields.get("estop_id")
         return StopOrder(
-            self.epoch(source, fields),
+            str(estop_id) if is_epoch(estop_id) else self.epoch(source, fields),
             source,
             stated_reason(fields) or NO_REASON,
             path,

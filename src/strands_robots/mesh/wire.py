@@ -171,7 +171,10 @@ class Request:
     @classmethod
     def of(cls, body: Mapping[str, Any]) -> Request:
         """Parse ``body``; the time may be missing. Raises WireError."""
-        sender, turn = _identifier(body, "sender_id"), _identifier(body, "turn_id")
+        try:
+            sender, turn = (identifier(name, body.get(name)) for name in ("sender_id", "turn_id"))
+        except ValidationError as exc:
+            raise WireError(str(exc)) from None
         return cls(sender, turn, body.get("command"), finite(body.get("timestamp")), body)
 
 
