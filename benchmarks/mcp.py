@@ -27,10 +27,10 @@ from mcp.client.client import Client
 from benchmarks.table import Row
 from strands_robots.device_connect import FleetClient, loopback_config
 from strands_robots.fleet.adapter import FoundRobot
+from strands_robots.fleet.standing import StandingController
 from strands_robots.mcp.approval import Approvals
 from strands_robots.mcp.caller import SILENCE_S, Caller, ClientAccess
 from strands_robots.mcp.server import RobotResources, build
-from strands_robots.mcp.standing import StandingController
 
 HZ = 200.0
 TIMES, TIMES_QUICK = 100, 5
@@ -321,7 +321,10 @@ async def closed(mover: Mover, url: str) -> float:
         call = {"jsonrpc": "2.0", "id": 2, "method": "tools/call", "params": params}
         stream = http.stream("POST", url, json=call)
         await stream.__aenter__()
-        return await mover.last_write_ms(lambda: stream.__aexit__(None, None, None))
+        took = await mover.last_write_ms(lambda: stream.__aexit__(None, None, None))
+        # The server keeps so many sessions of a token: beyond them, one of another trial would end.
+        (await http.delete(url)).raise_for_status()
+        return took
 
 
 async def killed(mover: Mover, start: Callable[..., Awaitable[int]], way: dict[str, Any]) -> float:
