@@ -15,6 +15,7 @@ from itertools import islice
 from typing import Any
 
 from strands_robots.dashboard.fleet_model import FleetModel, key_of
+from strands_robots.device_connect.process import LOOP_JOIN_TIMEOUT_S, EventLoopThread
 from strands_robots.envelope import Envelope, is_error
 from strands_robots.errors import RefusalError
 from strands_robots.fleet.adapter import (
@@ -35,7 +36,7 @@ from strands_robots.fleet.stops import not_left
 from strands_robots.fleet.verdicts import NetworkVerdict
 from strands_robots.safety.identity import KeyFileError
 from strands_robots.serving.advertised import AdvertisedParameter, AdvertisedVerb, RobotDescription
-from strands_robots.serving.control_verbs import CONTROL_VERBS
+from strands_robots.serving.control_leases import CONTROL_VERBS
 from strands_robots.utils import plain_text
 
 logger = logging.getLogger(__name__)
@@ -184,13 +185,14 @@ class FleetFeed:
         for pool in (self._searcher, self._describers):
             self._stack.callback(pool.shutdown, wait=False, cancel_futures=True)
         try:
-            thread = LoopThread(f"dashboard-{self.network}")
-            self._stack.callback(thread.close)
+            thread = EventLoopThread(f"dashboard-{self.network}")
+            self._stack.callback(thread.join, LOOP_JOIN_TIMEOUT_S)
+            self._stack.callback(thread.end)
             self._stack.callback(there.subscribe(EVERY, self._take))
         except BaseException:
             self._stack.close()
             raise
-        asyncio.run_coroutine_threadsafe(self._run(), thread.loop)
+        thread.submit(self._run())
 
     async def call(self, robot: str, verb: str, params: Mapping[str, Any], seconds: float) -> Envelope:
         """Call a verb; every failure is an answer of status error."""
@@ -359,29 +361,6 @@ class FleetFeed:
             each.pop(name, None)
         for what in ("verbs", "lockout"):
             self._tasks.pop((what, name), None)
-
-
-class LoopThread:
-    """An event loop on a thread of its own, ended by :meth:`close`."""
-
-    def __init__(self, name: str) -> None:
-        self.loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self.loop.run_forever, name=name, daemon=True)
-        self._thread.start()
-
-    def close(self) -> None:
-        """Cancel what runs there, and end the thread."""
-
-        async def cancel() -> None:
-            tasks = [task for task in asyncio.all_tasks() if task is not asyncio.current_task()]
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
-
-        asyncio.run_coroutine_threadsafe(cancel(), self.loop).result(5.0)
-        self.loop.call_soon_threadsafe(self.loop.stop)
-        self._thread.join(5.0)
-        self.loop.close()
 
 
 def page_name(network: str) -> str:
