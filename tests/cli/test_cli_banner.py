@@ -8,8 +8,8 @@ import pytest
 from fixtures.certificates import Authority
 from rich.console import Console
 
-from strands_robots.cli.banner import ServedRobot, commands, flags_elsewhere, show_banner
 from strands_robots.cli.output import Screen
+from strands_robots.cli.serve import ServedRobot, commands, flags_elsewhere, show_banner
 from strands_robots.device_connect.backends import LinkConfig, loopback_config
 
 HERE = loopback_config(7447)

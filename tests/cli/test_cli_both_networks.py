@@ -104,7 +104,7 @@ class TestPeers:
         self, run: Run, far: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         said = {"network": DEVICE_CONNECT, "id": "arm-1", "also_on": "all", "hostname": "\x1b[2Jdesk"}
-        monkeypatch.setattr(far, "find", lambda *_: [FoundRobot("arm-2", facts=said)])
+        monkeypatch.setattr(far, "find", lambda *_, **__: [FoundRobot("arm-2", facts=said)])
         row = json.loads(run("peers", "arm-2", "--json").stdout)["peers"][0]
         assert (row["id"], row["network"], row["also_on"]) == ("arm-2", MESH, [])
         assert "\x1b" not in run("peers").stdout

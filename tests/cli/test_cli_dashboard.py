@@ -8,7 +8,7 @@ import pytest
 from tests.cli.conftest import Run
 
 from strands_robots import settings
-from strands_robots.cli import dashboard
+from strands_robots.cli.demo import example
 from strands_robots.cli.output import Exit, Screen
 
 
@@ -16,7 +16,7 @@ def test_demo_and_its_robots_keep_off_the_mesh_of_the_user(monkeypatch: pytest.M
     # Its settings are for the robots that it starts, too; monkeypatch puts back all of them.
     monkeypatch.setattr(os, "environ", os.environ.copy())
     monkeypatch.setenv("STRANDS_MESH", "true")
-    with dashboard._demo_robots(Screen(machine=True)):
+    with example("page").page_robots(Screen(machine=True)):
         assert settings.raw("STRANDS_MESH") == os.environ["STRANDS_MESH"] == "false"
 
 

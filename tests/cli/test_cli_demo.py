@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from examples.demo.output import BUNCHED_S, PAUSE_S, DemoScreen, draw_motion, frames_within, replayed
+from examples.demo.processes import AgentEvent
+from examples.demo.steps import NEEDED, DemoReport, DriveSteps, SafetySteps, on_plate
 
 from strands_robots.audit import flush_audit, log_safety_event
-from strands_robots.cli.demo.output import BUNCHED_S, PAUSE_S, DemoScreen, draw_motion, frames_within, replayed
-from strands_robots.cli.demo.processes import AgentEvent
-from strands_robots.cli.demo.steps import NEEDED, DemoReport, DriveSteps, SafetySteps, on_plate
 from strands_robots.cli.output import CliError, Screen
 from strands_robots.recording.cameras import jpeg
 from strands_robots.safety.answers import Answer, StopReport

@@ -16,9 +16,9 @@ from tests.cli.conftest import Run
 
 from strands_robots import __version__
 from strands_robots.cli import doctor, readiness
-from strands_robots.cli.certificates import certificate_problem
+from strands_robots.cli.app import other_owners
 from strands_robots.cli.doctor import Finding
-from strands_robots.cli.owners import other_owners
+from strands_robots.cli.readiness import certificate_problem
 from strands_robots.device_connect.backends import LinkConfig
 
 

@@ -12,15 +12,14 @@ from tests.cli.test_cli_safety_controller import drawn
 
 from strands_robots.audit import read_audit_log
 from strands_robots.cli.output import Exit
-from strands_robots.cli.stop_report import exit_code, report_rows, style_of, summary
+from strands_robots.cli.stop import exit_code, report_rows, style_of, summary
 from strands_robots.device_connect.backends import loopback_config
 from strands_robots.device_connect.backends.config import network_of
 from strands_robots.device_connect.client import Peer
 from strands_robots.envelope import Envelope, success
-from strands_robots.fleet.lockout_report import LockoutReport
+from strands_robots.fleet.adapter import LockoutReport
 from strands_robots.fleet.networks import Networks
-from strands_robots.fleet.safety_console import SafetyConsole
-from strands_robots.fleet.watched_robots import WatchedRobots
+from strands_robots.fleet.safety_console import SafetyConsole, WatchedRobots
 from strands_robots.safety import statements
 from strands_robots.safety.answers import Answer, StopReport
 from strands_robots.safety.ed25519 import keygen

@@ -8,7 +8,7 @@ from tests.cli.conftest import Run
 
 from strands_robots.cli.network import Network
 from strands_robots.cli.output import CliError, Exit
-from strands_robots.fleet.link_flags import described
+from strands_robots.fleet.device_connect.config import described
 from strands_robots.utils import MissingExtraError
 
 
@@ -55,7 +55,7 @@ def test_insecure_flag_or_certificates_allow_a_remote_network(tmp_path: Path, mo
 
 
 def test_missing_extra_is_named_in_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("strands_robots.fleet.link_flags.find_spec", lambda _: None)
+    monkeypatch.setattr("strands_robots.fleet.device_connect.config.find_spec", lambda _: None)
     with pytest.raises(MissingExtraError, match=r"the \[device-connect\] extra"):
         Network().link()
 

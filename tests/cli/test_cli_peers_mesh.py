@@ -72,7 +72,7 @@ def test_state_of_a_peer_that_matters_most_is_shown(
     run: Run, barista: Barista, monkeypatch: pytest.MonkeyPatch, facts: dict[str, Any], said: str
 ) -> None:
     found = FoundRobot("arm-1", "robot", status="idle", age_s=0.1, facts=facts)
-    monkeypatch.setattr(MeshNetwork, "listed", lambda *_: [found])
+    monkeypatch.setattr(MeshNetwork, "find", lambda *_, **__: [found])
     assert said in run("peers", "--mesh").stdout
 
 

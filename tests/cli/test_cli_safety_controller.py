@@ -14,13 +14,11 @@ from tests.fleet.scripted_sender import ScriptedSender
 
 from strands_robots.cli import safety_controller
 from strands_robots.cli.safety_controller import ConsoleScreen
-from strands_robots.cli.stop_report import style_of
-from strands_robots.fleet import joining, watched_robots
-from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
-from strands_robots.fleet.lockout_report import LockoutReport
+from strands_robots.cli.stop import style_of
+from strands_robots.fleet import joining, safety_console
+from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH, LockoutReport
 from strands_robots.fleet.networks import Networks
-from strands_robots.fleet.safety_console import SafetyConsole
-from strands_robots.fleet.watched_robots import WatchedRobots
+from strands_robots.fleet.safety_console import SafetyConsole, WatchedRobots
 from strands_robots.safety.answers import Answer, Progress
 from strands_robots.safety.lockout import Lockout
 
@@ -59,7 +57,7 @@ def far() -> ScriptedNetwork:
 @pytest.fixture(autouse=True)
 def seldom_looks(monkeypatch: pytest.MonkeyPatch) -> None:
     """A test says itself what robots report, and a network that is not there is tried again at once."""
-    monkeypatch.setattr(watched_robots, "LOOK_S", 3600.0)
+    monkeypatch.setattr(safety_console, "LOOK_S", 3600.0)
     monkeypatch.setattr(joining, "AGAIN_S", 0.01)
 
 
@@ -141,7 +139,7 @@ def test_screen_shows_lockouts_check_ins_and_gone_robots(
     assert "arm-9" not in output
     assert "SPACE stops everything" in output and "ERROR something" in output
     monkeypatch.setattr(safety_controller, "GONE_S", 0.0)
-    monkeypatch.setattr(watched_robots, "GONE_S", 0.0)
+    monkeypatch.setattr(safety_console, "GONE_S", 0.0)
     fleet.update([LockoutReport("arm-1", problem="no answer")])
     assert "GONE" in drawn(console)
     assert set(fleet.expected()) == {"arm-1", "arm-2"}
@@ -153,7 +151,7 @@ def test_age_of_a_lockouts_report_is_shown_beside_a_fresh_beat(
     console: SafetyConsole, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fleet, clock = robots(console), Turning()
-    for each in (safety_controller, watched_robots):
+    for each in (safety_controller, safety_console):
         monkeypatch.setattr(each, "time", clock)
     fleet.take_beats({"arm-0": clock.now})
     fleet.update([LockoutReport("arm-0", at=clock.now)])

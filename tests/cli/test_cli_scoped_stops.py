@@ -9,12 +9,10 @@ from tests.fleet.scripted_sender import ScriptedSender
 
 from strands_robots.cli.output import Exit
 from strands_robots.cli.safety_controller import ConsoleScreen
-from strands_robots.cli.stop_report import exit_code
-from strands_robots.fleet.lockout_report import LockoutReport
+from strands_robots.cli.stop import exit_code
+from strands_robots.fleet.adapter import LockoutReport
 from strands_robots.fleet.networks import Networks
-from strands_robots.fleet.safety_console import SafetyConsole
-from strands_robots.fleet.stop_button import StopButtons
-from strands_robots.fleet.watched_robots import WatchedRobots
+from strands_robots.fleet.safety_console import SafetyConsole, StopButtons, WatchedRobots
 from strands_robots.safety.answers import Answer, StopReport
 from strands_robots.safety.identity import EnrolledKeys
 from strands_robots.safety.lockout import Lockout, LockoutState

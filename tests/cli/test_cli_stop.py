@@ -17,16 +17,16 @@ from strands_robots import device_connect
 from strands_robots.audit import read_audit_log
 from strands_robots.cli.network import Network
 from strands_robots.cli.output import Exit, Screen
-from strands_robots.cli.stop import show_resume
-from strands_robots.cli.stop_report import exit_code, progress_rows, report_rows, summary
+from strands_robots.cli.stop import exit_code, progress_rows, report_rows, show_resume, summary
 from strands_robots.device_connect import safety_controller
 from strands_robots.device_connect.backends import loopback_config
 from strands_robots.device_connect.backends.config import network_of
 from strands_robots.device_connect.discovery import Peer, RegistryError
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.errors import UnreachableError
+from strands_robots.fleet.adapter import StopRequest
 from strands_robots.fleet.device_connect.network import DeviceConnectNetwork
-from strands_robots.fleet.stop_answers import stop_outcome
+from strands_robots.fleet.verdicts import stop_outcome
 from strands_robots.safety.answers import Answer, Progress, StopReport
 from strands_robots.safety.roster import Sending
 from strands_robots.safety.sightings import sightings
@@ -427,5 +427,5 @@ def test_stop_that_raises_at_once_leaves_no_lookup_behind(monkeypatch: pytest.Mo
     monkeypatch.setattr(device_connect, "FleetClient", lookup)
     monkeypatch.setattr(safety_controller, "safety_controller", lambda *given, **more: Broken(report()))
     with pytest.raises(UnreachableError, match="Too many open files"):
-        DeviceConnectNetwork(loopback_config(), "desk").emergency_stop("")
+        DeviceConnectNetwork(loopback_config(), "desk").emergency_stop(StopRequest())
     assert lookup.left.wait(20)

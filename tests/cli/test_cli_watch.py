@@ -26,7 +26,7 @@ from strands_robots.cli.watch import (
 from strands_robots.device_connect.client import DeviceEvent
 from strands_robots.envelope import error, success
 from strands_robots.fleet.adapter import RobotEvent
-from strands_robots.fleet.device_connect.events import robot_event
+from strands_robots.fleet.device_connect.network import robot_event
 from strands_robots.fleet.networks import Networks
 
 

@@ -14,7 +14,7 @@ from tests.fleet.scripted import OURS, ScriptedNetwork
 from strands_robots.dashboard.feeds import Feeds
 from strands_robots.dashboard.fleet_model import FleetModel
 from strands_robots.dashboard.page_robots import FleetStop, verdict_of
-from strands_robots.fleet import stop_button
+from strands_robots.fleet import safety_console
 from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
 from strands_robots.fleet.networks import Networks
 from strands_robots.safety.answers import Answer, Progress, StopReport
@@ -338,7 +338,7 @@ def test_press_of_long_ago_does_not_leave_on_a_network_that_comes_later(
     page = networked(MESH)
     page.stop.press()
     eventually(lambda: not page.stop.running, what="the stop's end")
-    monkeypatch.setattr(stop_button, "LATE_S", 0.0)
+    monkeypatch.setattr(safety_console, "LATE_S", 0.0)
     page.comes()
     assert page.gone.controller.presses == 0
 

@@ -9,7 +9,7 @@ import pytest
 
 from strands_robots.dashboard import fleet_model
 from strands_robots.dashboard.fleet_model import FleetModel
-from strands_robots.fleet.lockout_report import LockoutReport
+from strands_robots.fleet.adapter import LockoutReport
 from strands_robots.safety.lockout import Lockout
 
 EPOCH = "0" * 31 + "1"

@@ -10,7 +10,7 @@ import pytest
 from strands_robots.dashboard import history
 from strands_robots.dashboard.fleet_model import FleetModel
 from strands_robots.dashboard.history import CHANGES_MAX, SAMPLE_S, SAMPLES, WINDOW_S, States
-from strands_robots.fleet.lockout_report import LockoutReport
+from strands_robots.fleet.adapter import LockoutReport
 from strands_robots.safety.lockout import Lockout
 
 START = 1000.0

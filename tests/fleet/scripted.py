@@ -16,20 +16,22 @@ from strands_robots.fleet.adapter import (
     STOP_S,
     Detail,
     FoundRobot,
+    LockoutReport,
     OnEvent,
+    Place,
     ReceivedCall,
+    Resumed,
     RobotEvent,
+    StopRequest,
 )
-from strands_robots.fleet.lockout_report import LockoutReport, Resumed
 from strands_robots.fleet.refusals import answered
-from strands_robots.fleet.stop_answers import measured, roster_verdict, unanswered
+from strands_robots.fleet.verdicts import measured, roster_verdict, unanswered
 from strands_robots.safety import network_key
-from strands_robots.safety.answers import OnProgress
 from strands_robots.safety.identity import SigningIdentity
 from strands_robots.safety.lockout import Lockout
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.roster import Sending
-from strands_robots.safety.scope import EVERY_ROBOT, KnownRobots, Remembers, Scope
+from strands_robots.safety.scope import EVERY_ROBOT, KnownRobots, Scope
 from strands_robots.safety.statements import Purpose
 from strands_robots.safety.statements import signed as signed_by
 from strands_robots.safety.stop_roster import StopOutcome, StopRoster
@@ -77,6 +79,7 @@ class ScriptedNetwork:
     announces_verbs = True
     reads: Mapping[str, str] = {"status": "getStatus", "state": "getState", "features": "getFeatures"}
     starts = "execute"
+    place = Place("They were looked for in a script.")
 
     def __init__(self, name: str = DEVICE_CONNECT, robots: Mapping[str, object] | None = None) -> None:
         self.name = name
@@ -123,7 +126,7 @@ class ScriptedNetwork:
 
         self.answers["getStatus"] = status
 
-    def find(self, timeout: float = FIND_S) -> list[FoundRobot]:
+    def find(self, timeout: float | None = FIND_S, *, peers: bool = False) -> list[FoundRobot]:
         self.searches += 1
         if self.unreachable:
             raise UnreachableError(self.unreachable)
@@ -134,9 +137,6 @@ class ScriptedNetwork:
 
     def announced(self) -> Collection[str]:
         return tuple(self.robots)
-
-    def listed(self, timeout: float | None = None) -> list[FoundRobot]:
-        return self.find()
 
     def known(self, robot: str) -> FoundRobot:
         return FoundRobot(robot)
@@ -211,18 +211,6 @@ class ScriptedNetwork:
         return key_of(self.name)
 
     @property
-    def reach(self) -> str:
-        return "They were looked for in a script."
-
-    @property
-    def on_this_machine(self) -> bool:
-        return False
-
-    @property
-    def meeting_port(self) -> int | None:
-        return None
-
-    @property
     def stale(self) -> str:
         return ""
 
@@ -230,26 +218,16 @@ class ScriptedNetwork:
         answers = {name: self.stop(name) or error("none") for name in self.robots}
         return answers, measured(answers, self._roster(), Sending())
 
-    def emergency_stop(
-        self,
-        reason: str,
-        *,
-        scope: Scope = EVERY_ROBOT,
-        signing_key: Any = None,
-        estop_id: str = "",
-        remembers: Remembers | None = None,
-        named: Collection[str] = (),
-        deadline_s: float | None = None,
-        on_progress: OnProgress = lambda progress: None,
-    ) -> StopOutcome:
-        self.estops.append((reason, scope, estop_id))
-        self.signers.append(signing_key)
-        self.known_elsewhere = None if remembers is None else KnownRobots(scope, remembers)
+    def emergency_stop(self, request: StopRequest) -> StopOutcome:
+        scope, estop_id = request.scope, request.estop_id
+        self.estops.append((request.reason, scope, estop_id))
+        self.signers.append(request.signing_key)
+        self.known_elsewhere = None if request.remembers is None else KnownRobots(scope, request.remembers)
         if self.unreachable:
             raise UnreachableError(self.unreachable)
         answers = {name: self.stop(name) or error("none") for name in self.robots if scope.covers(name, frozenset())}
         self.locked |= dict.fromkeys(answers, estop_id)
-        return measured(answers, self._roster(scope, named), Sending(), estop_id)
+        return measured(answers, self._roster(scope, request.named), Sending(), estop_id)
 
     def verdict(self, outcome: StopOutcome) -> Envelope:
         return roster_verdict(outcome)

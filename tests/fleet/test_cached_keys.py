@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from strands_robots.fleet import cached_keys
-from strands_robots.fleet.cached_keys import AGAIN_S, CachedKeys
+from strands_robots.fleet import shared_id
+from strands_robots.fleet.shared_id import AGAIN_S, CachedKeys
 
 
 def test_keys_are_read_again_only_after_their_time(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -15,7 +15,7 @@ def test_keys_are_read_again_only_after_their_time(monkeypatch: pytest.MonkeyPat
         reads.append(now[0])
         return {"arm-1": b"key"}
 
-    monkeypatch.setattr(cached_keys.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(shared_id.time, "monotonic", lambda: now[0])
     keys = CachedKeys(load)
     assert [keys.read(), keys.read()] == [{"arm-1": b"key"}] * 2
     now[0] += AGAIN_S

@@ -6,7 +6,7 @@ import pytest
 from tests.fleet.scripted import function
 from tests.serving.test_advertised import HOSTILE
 
-from strands_robots.fleet.description import docstring, python_name, signature
+from strands_robots.fleet.remote_robot import docstring, python_name, signature
 from strands_robots.serving.advertised import RobotDescription
 
 

@@ -13,6 +13,7 @@ import pytest
 from strands_robots.device_connect import safety_controller
 from strands_robots.device_connect.backends import LinkConfig
 from strands_robots.envelope import Envelope, error, success, text_of
+from strands_robots.fleet.adapter import StopRequest
 from strands_robots.fleet.device_connect import stops
 from strands_robots.safety import stop_roster
 from strands_robots.safety.answers import Answer, Progress, StopReport
@@ -91,7 +92,7 @@ def press(monkeypatch: pytest.MonkeyPatch) -> Press:
             return measure(self, *given)
 
         monkeypatch.setattr(stop_roster.StopRoster, "outcome", measured)
-        outcome = stops.stopped_and_locked(fleet.link, fleet.source, lambda: nullcontext(fleet), "test")  # type: ignore[arg-type]
+        outcome = stops.stopped_and_locked(fleet.link, fleet.source, lambda: nullcontext(fleet), StopRequest("test"))  # type: ignore[arg-type]
         answer = safety_controller.outcome_envelope(outcome)
         assert fleet.asked == [name for name in plain if name not in stopped]
         return answer

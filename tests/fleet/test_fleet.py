@@ -15,8 +15,8 @@ from tests.fleet.scripted import OURS, ScriptedNetwork
 from strands_robots import errors
 from strands_robots.envelope import error, success
 from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
+from strands_robots.fleet.device_connect.config import LinkFlags
 from strands_robots.fleet.fleet import Fleet, connect
-from strands_robots.fleet.link_flags import LinkFlags
 from strands_robots.safety.identity import ROBOTS, KeyFile, SigningIdentity
 from strands_robots.safety.statements import Purpose, signed
 from strands_robots.utils import ValidationError
@@ -193,7 +193,7 @@ class Lost(Exception):
 def test_network_that_fails_is_absent_and_the_others_go_on(
     fleet: Fleet, device_connect: ScriptedNetwork, mesh: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def lost(*_arguments: object) -> Any:
+    def lost(*_arguments: object, **_options: object) -> Any:
         raise Lost("cable")
 
     with monkeypatch.context() as patch:

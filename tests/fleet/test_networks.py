@@ -20,16 +20,17 @@ from strands_robots.fleet import networks as module
 from strands_robots.fleet.adapter import (
     CLOSED,
     DEVICE_CONNECT,
-    FIND_S,
     MESH,
     STOP_S,
     FoundRobot,
     NetworkAdapter,
     NetworkBusyError,
+    Place,
+    StopRequest,
 )
-from strands_robots.fleet.all_stops import estop_all, stop_all
 from strands_robots.fleet.fleet import Fleet
 from strands_robots.fleet.networks import Networks
+from strands_robots.fleet.stops import estop_all, stop_all
 from strands_robots.safety.roster import Roster, RosterRow
 from strands_robots.safety.sightings import Known
 
@@ -81,7 +82,7 @@ def test_a_search_waits_for_the_network_that_is_being_joined(networks: Networks,
     assert sorted(found) == ["arm-1", "arm-2", "both"]
 
 
-@pytest.mark.parametrize("stop", [stop_all, lambda networks: estop_all(networks, "test")])
+@pytest.mark.parametrize("stop", [stop_all, lambda networks: estop_all(networks, StopRequest("test"))])
 def test_stop_leaves_on_one_network_while_the_other_is_being_joined(
     stop: Any, networks: Networks, near: ScriptedNetwork, far: SlowNetwork
 ) -> None:
@@ -141,7 +142,7 @@ def test_stated_network_that_is_gone_fails_a_stop_though_no_robot_of_it_is_remem
     far = ScriptedNetwork(MESH, {})
     far.unreachable = "no route"
     with Networks([near, far]) as networks:
-        for verdict in (stop_all(networks), estop_all(networks, "test")):
+        for verdict in (stop_all(networks), estop_all(networks, StopRequest("test"))):
             assert not verdict.ok
             assert verdict.missing == ("the robots on mesh",)
             assert "It did not leave on mesh: no route." in str(verdict)
@@ -153,7 +154,7 @@ def test_network_of_this_machine_without_robots_need_not_list_them_beside_one_wi
     near: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     empty = ScriptedNetwork(MESH, {})
-    monkeypatch.setattr(ScriptedNetwork, "on_this_machine", property(lambda self: self is empty))
+    monkeypatch.setattr(empty, "place", Place("here", local=True))
     sent = empty.emergency_stop
 
     def unlisted(*given: Any, **options: Any) -> Any:
@@ -162,11 +163,11 @@ def test_network_of_this_machine_without_robots_need_not_list_them_beside_one_wi
     monkeypatch.setattr(empty, "emergency_stop", unlisted)
     with Networks([near, empty]) as networks:
         networks.settled()
-        verdict = estop_all(networks, "test")
+        verdict = estop_all(networks, StopRequest("test"))
         assert verdict.ok
         assert [each.network for each in verdict.unreached] == [MESH]
     with Networks([empty]) as networks:
-        assert not estop_all(networks, "test").ok
+        assert not estop_all(networks, StopRequest("test")).ok
 
 
 def test_mesh_that_no_one_asked_for_fails_no_stop(near: ScriptedNetwork) -> None:
@@ -437,7 +438,7 @@ class TestRouting:
     ) -> None:
         for robot, there in {"arm-1": near, "arm-2": far, "both": near}.items():
             assert asyncio.run(networks.of_async(robot)) is there
-            assert asyncio.run(networks.describe_async(robot, 5.0)).functions == OURS
+            assert asyncio.run(there.describe_async(robot, 5.0)).functions == OURS
         assert near.asked == far.asked == []
 
     def test_own_verb_is_called_where_it_was_described(
@@ -558,7 +559,7 @@ def test_search_that_fails_on_one_network_gives_the_robots_of_the_other(
 ) -> None:
     far = ScriptedNetwork(MESH, {"arm-2": OURS})
 
-    def broken(timeout: float = FIND_S) -> list[FoundRobot]:
+    def broken(timeout: float, *, peers: bool) -> list[FoundRobot]:
         raise KeyError("bug")
 
     with Networks([near, far]) as networks:
@@ -594,7 +595,7 @@ class TestBusy:
         monkeypatch.setattr(far, "open", opened)
         return tries
 
-    @pytest.mark.parametrize("stop", [stop_all, lambda networks: estop_all(networks, "test")])
+    @pytest.mark.parametrize("stop", [stop_all, lambda networks: estop_all(networks, StopRequest("test"))])
     def test_stop_is_not_kept_from_it(
         self, stop: Any, tries: list[int], near: ScriptedNetwork, far: SlowNetwork
     ) -> None:
@@ -659,7 +660,7 @@ class TestStopLink:
         networks = Networks([near, far])
         if opened:
             networks.open()
-        verdict = estop_all(networks, "test")
+        verdict = estop_all(networks, StopRequest("test"))
         assert verdict.ok
         assert near.locked["both"] == far.locked["both"] == verdict.estop_id
         assert not far.joined
@@ -680,16 +681,16 @@ class TestStopLink:
 
         monkeypatch.setattr(far, "emergency_stop", unsent)
         networks = Networks([near, far], unasked={MESH})
-        verdict = estop_all(networks, "test")
+        verdict = estop_all(networks, StopRequest("test"))
         assert verdict.ok
         assert [each.network for each in verdict.unreached] == [MESH]
         assert networks.absent == {MESH: "the broker is gone"}
         far.silent.append("arm-9")
-        assert estop_all(networks, "test").missing == ("arm-9",)
+        assert estop_all(networks, StopRequest("test")).missing == ("arm-9",)
 
     def test_named_robot_must_answer_where_it_is_and_is_told_once(self, near: ScriptedNetwork) -> None:
         far = ScriptedNetwork(MESH, {"arm-2": OURS})
-        verdict = estop_all(Networks([near, far]), "test", named=["arm-1", "arm-2", "arm-9"])
+        verdict = estop_all(Networks([near, far]), StopRequest("test", named=["arm-1", "arm-2", "arm-9"]))
         assert verdict.missing == ("arm-9",)
         assert {each.network: list(each.silent) for each in verdict.networks} == {DEVICE_CONNECT: ["arm-9"], MESH: []}
         assert verdict["arm-1"].stopped and verdict["arm-2"].stopped

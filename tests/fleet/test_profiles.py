@@ -13,10 +13,10 @@ from strands_robots import settings
 from strands_robots.device_connect.backends import LinkConfig
 from strands_robots.errors import UnreachableError
 from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
+from strands_robots.fleet.device_connect.config import LinkFlags
 from strands_robots.fleet.fleet import connect
-from strands_robots.fleet.link_flags import LinkFlags
+from strands_robots.fleet.mesh.config import MeshSettings
 from strands_robots.fleet.mesh.network import MeshNetwork
-from strands_robots.fleet.mesh_settings import MeshSettings
 from strands_robots.fleet.profiles import mesh_at, profile_for, profile_names, profiles_folder, read_profile
 from strands_robots.mesh import Mesh, session
 from strands_robots.mesh.transport import MemoryTransport

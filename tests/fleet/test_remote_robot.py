@@ -19,10 +19,9 @@ from tests.fleet.scripted import LEASE, OURS, ScriptedNetwork, function
 from strands_robots import errors
 from strands_robots.envelope import error, success
 from strands_robots.errors import RefusalError
-from strands_robots.fleet import event_feed
+from strands_robots.fleet import reports
 from strands_robots.fleet.adapter import FoundRobot, RobotEvent
-from strands_robots.fleet.description import python_name
-from strands_robots.fleet.remote_robot import RemoteRobot
+from strands_robots.fleet.remote_robot import RemoteRobot, python_name
 from strands_robots.serving.own_verbs import MEMBERS, STOPS
 from strands_robots.utils import WAIT_S, ValidationError
 
@@ -345,8 +344,8 @@ class TestEventsAndPictures:
     def test_waiting_events_are_bounded_in_number_and_bytes(
         self, arm: RemoteRobot, network: ScriptedNetwork, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr(event_feed, "EVENTS_MAX", 3)
-        monkeypatch.setattr(event_feed, "BYTES_MAX", 10_000)
+        monkeypatch.setattr(reports, "EVENTS_MAX", 3)
+        monkeypatch.setattr(reports, "BYTES_MAX", 10_000)
         with arm.events(timeout=0.05) as events:
             for step in range(5):
                 network.subscribers[0](RobotEvent("arm-1", "streamStep", {"step": step}))

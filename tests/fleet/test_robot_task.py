@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from strands_robots.fleet.robot_task import TASK_MAX, task_of
+from strands_robots.fleet.reports import TASK_MAX, task_of
 
 RUNNING = {"left": {"policy": "mock", "instruction": "wave", "step": 7}, "right": {"policy": "act"}}
 

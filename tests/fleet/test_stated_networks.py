@@ -8,7 +8,7 @@ import pytest
 from fixtures.waiting import free_port
 
 from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
-from strands_robots.fleet.stated_networks import networks_of
+from strands_robots.fleet.profiles import networks_of
 
 
 @pytest.fixture(autouse=True)

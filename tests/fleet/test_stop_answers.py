@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 from strands_robots.envelope import error, success
-from strands_robots.fleet.stop_answers import combined_verdict
+from strands_robots.fleet.verdicts import combined_verdict
 
 
 def test_one_silent_robot_makes_a_stop_an_error_that_names_it() -> None:

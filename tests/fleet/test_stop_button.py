@@ -6,8 +6,8 @@ import pytest
 from fixtures.waiting import eventually
 from tests.fleet.scripted_sender import ScriptedSender
 
-from strands_robots.fleet import stop_button
-from strands_robots.fleet.stop_button import StopButton, StopButtons
+from strands_robots.fleet import safety_console
+from strands_robots.fleet.safety_console import StopButton, StopButtons
 from strands_robots.safety.answers import Answer
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
 
@@ -29,7 +29,7 @@ def test_press_stops_the_robots_known_at_that_moment(controller: ScriptedSender)
 
 
 def test_key_held_down_is_one_stop(controller: ScriptedSender, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stop_button, "KEY_REPEAT_S", 60.0)
+    monkeypatch.setattr(safety_console, "KEY_REPEAT_S", 60.0)
     button = made(controller)
     controller.answer.clear()
     for _ in range(50):
@@ -43,7 +43,7 @@ def test_key_held_down_is_one_stop(controller: ScriptedSender, monkeypatch: pyte
 
 
 def test_later_press_is_a_stop_of_its_own(controller: ScriptedSender, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stop_button, "KEY_REPEAT_S", 0.0)
+    monkeypatch.setattr(safety_console, "KEY_REPEAT_S", 0.0)
     button = made(controller)
     controller.answer.clear()
     button.press()
@@ -138,7 +138,7 @@ class TestEveryNetwork:
     ) -> None:
         buttons.press()
         eventually(lambda: not buttons.running)
-        clock.now += stop_button.LATE_S + 0.1
+        clock.now += safety_console.LATE_S + 0.1
         buttons.add("far", far, lambda scope: ())  # type: ignore[arg-type]
         buttons.press(Scope.named(["arm-1"]), ["near"])
         eventually(lambda: not buttons.running)
@@ -180,7 +180,7 @@ class TestEveryNetwork:
     @pytest.fixture
     def clock(self, monkeypatch: pytest.MonkeyPatch) -> Turned:
         clock = Turned()
-        monkeypatch.setattr(stop_button, "time", clock)
+        monkeypatch.setattr(safety_console, "time", clock)
         return clock
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any, ClassVar
 
 import pytest
@@ -15,11 +15,10 @@ from tests.fleet.scripted import ScriptedNetwork, key_of
 from strands_robots import errors
 from strands_robots.envelope import error, success
 from strands_robots.fleet import Fleet
-from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
-from strands_robots.fleet.all_stops import estop_all
-from strands_robots.fleet.enrollment import Enrolled
-from strands_robots.fleet.lockout_report import LockoutReport
+from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH, LockoutReport, StopRequest
+from strands_robots.fleet.lockouts import Enrolled
 from strands_robots.fleet.networks import Networks
+from strands_robots.fleet.stops import estop_all
 from strands_robots.safety.answers import Answer, Progress
 from strands_robots.safety.identity import ROBOTS, EnrolledKeys, KeyFile
 from strands_robots.safety.network_key import NetworkKey
@@ -139,7 +138,7 @@ def test_named_robot_that_a_network_which_is_being_joined_remembers_is_known(
     monkeypatch.setattr(Roster, "of", lambda network, *_: Roster(network, (row,) if network == third else ()))
     # Also one that is a name alone.
     with Networks([near, far], {"third": "no peer"}, {"third": lambda: third}) as networks:
-        stopping = threading.Thread(target=lambda: estop_all(networks, "", scope=Scope.named(["arm-7"])))
+        stopping = threading.Thread(target=lambda: estop_all(networks, StopRequest(scope=Scope.named(["arm-7"]))))
         stopping.start()
         try:
             eventually(lambda: near.remembered, what="the robot, which is remembered on another network")
@@ -153,15 +152,15 @@ def test_named_robot_that_answers_on_another_network_is_known(
 ) -> None:
     """Its network neither remembers nor has found it."""
 
-    def answers(*_: Any, on_progress: Callable[[Progress], None], **__: Any) -> Any:
+    def answers(request: StopRequest) -> Any:
         said = Answer("arm-7", True, 0.0, "stopped")
-        on_progress(Progress("0" * 32, {"arm-7": said}, (), True, 1.0))
+        request.on_progress(Progress("0" * 32, {"arm-7": said}, (), True, 1.0))
         eventually(lambda: far.remembered, what="the robot, which has answered")
         raise OSError("no outcome")
 
     monkeypatch.setattr(near, "emergency_stop", answers)
     with Networks([near, far]) as networks:
-        estop_all(networks, "", scope=Scope.named(["arm-7"]))
+        estop_all(networks, StopRequest(scope=Scope.named(["arm-7"])))
         assert far.remembered
 
 
@@ -221,7 +220,7 @@ def test_robot_that_no_search_finds_is_asked_by_its_id(
 def test_resume_of_one_robot_asks_all_before_it_names_who_is_not_heard(
     fleet: Fleet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from strands_robots.fleet import all_lockouts as module  # noqa: PLC0415 - this test alone
+    from strands_robots.fleet import lockouts as module  # noqa: PLC0415 - this test alone
     from strands_robots.safety.stop_notes import Unheard  # noqa: PLC0415 - as above
 
     heard: list[set[str]] = []
@@ -271,7 +270,7 @@ def test_resume_of_an_absent_robot_is_refused_and_frees_none(fleet: Fleet, near:
 def test_robots_that_are_not_heard_are_named_before_others_are_freed(
     fleet: Fleet, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    from strands_robots.fleet import all_lockouts as module  # noqa: PLC0415 - this test alone
+    from strands_robots.fleet import lockouts as module  # noqa: PLC0415 - this test alone
     from strands_robots.safety.stop_notes import Unheard  # noqa: PLC0415 - as above
 
     monkeypatch.setattr(module, "unheard_now", lambda *_: Unheard(("arm-7",)))

@@ -8,15 +8,15 @@ import pytest
 from fixtures.waiting import eventually
 from tests.fleet.scripted import ScriptedNetwork
 
-from strands_robots.fleet import watched_robots
-from strands_robots.fleet.lockout_report import LockoutReport
-from strands_robots.fleet.watched_robots import WatchedRobots
+from strands_robots.fleet import safety_console
+from strands_robots.fleet.adapter import LockoutReport
+from strands_robots.fleet.safety_console import WatchedRobots
 from strands_robots.safety.lockout import Lockout
 from strands_robots.safety.scope import Scope
 
 
 def test_robots_that_beat_are_asked_in_turn_and_all_others_at_each_look(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(watched_robots, "ASKED_MOST", 3)
+    monkeypatch.setattr(safety_console, "ASKED_MOST", 3)
     fleet, now = WatchedRobots(), time.monotonic()
     names = [f"arm-{number}" for number in range(10)]
     assert fleet.due(names) == names
@@ -42,8 +42,8 @@ class Turning:
 def calm_fleet(monkeypatch: pytest.MonkeyPatch, robots: int) -> tuple[WatchedRobots, Turning, list[str]]:
     """Return robots that have answered, beat, and are asked three at a look."""
     clock = Turning()
-    monkeypatch.setattr(watched_robots, "time", clock)
-    monkeypatch.setattr(watched_robots, "ASKED_MOST", 3)
+    monkeypatch.setattr(safety_console, "time", clock)
+    monkeypatch.setattr(safety_console, "ASKED_MOST", 3)
     names = [f"arm-{number}" for number in range(robots)]
     fleet = WatchedRobots()
     fleet.take_beats(dict.fromkeys(names, 1e9))
@@ -83,7 +83,7 @@ def test_silent_robots_without_a_beat_are_asked_in_turn_and_after_all_others(mon
 def test_robots_that_do_not_answer_a_stop_take_their_turn_again_after_it(monkeypatch: pytest.MonkeyPatch) -> None:
     fleet, clock, names = calm_fleet(monkeypatch, 9)
     fleet.expected()
-    clock.now += watched_robots.GONE_S + 1.0
+    clock.now += safety_console.GONE_S + 1.0
     assert fleet.due(names) == names
     clock.now += 1.0
     assert len(fleet.due(names)) == 3
@@ -106,7 +106,7 @@ def test_all_robots_are_asked_after_one_was_stopped_or_resumed_by_another(
 
 
 def test_poll_goes_on_after_the_network_failed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(watched_robots, "LOOK_S", 0.01)
+    monkeypatch.setattr(safety_console, "LOOK_S", 0.01)
     network, fleet = ScriptedNetwork(), WatchedRobots()
     network.unreachable = "cable"
     fleet.poll(network)

@@ -102,7 +102,10 @@ def tracked() -> set[str]:
 def test_the_wheel_holds_every_file_of_the_package_and_no_other(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         names = {name for name in archive.namelist() if ".dist-info/" not in name}
-    assert names == {name.removeprefix("src/") for name in tracked() if name.startswith("src/")}
+    demo = {
+        name.replace("examples/demo", "strands_robots/_demo") for name in tracked() if name.startswith("examples/demo/")
+    }
+    assert names == {name.removeprefix("src/") for name in tracked() if name.startswith("src/")} | demo
     assert "strands_robots/py.typed" in names
 
 

@@ -20,7 +20,6 @@ from strands_robots.errors import UnknownVerbError, UnreachableError
 from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
 from strands_robots.fleet.device_connect.network import DeviceConnectNetwork
 from strands_robots.fleet.mesh import network
-from strands_robots.fleet.mesh.network import MeshNetwork
 from strands_robots.fleet.networks import Networks
 from strands_robots.mesh import Mesh, init_mesh, safety
 from strands_robots.mesh.session import clear_peers
@@ -499,7 +498,7 @@ class TestDefaultProfile:
             found.append(f"device connect {link.meet_port} {link.tenant}")
             raise UnreachableError("no answer")
 
-        def mesh(_self: MeshNetwork) -> None:
+        def mesh(*_: object, **__: object) -> None:
             found.append(f"mesh {settings.raw('STRANDS_MESH_PORT')} {settings.raw('STRANDS_MESH_NAMESPACE')}")
             raise UnreachableError("no answer")
 
@@ -508,7 +507,7 @@ class TestDefaultProfile:
         monkeypatch.setenv("STRANDS_DC_PORT", "7002")
         for way in ("open", "emergency_stop"):
             monkeypatch.setattr(DeviceConnectNetwork, way, device_connect)
-        monkeypatch.setattr(MeshNetwork, "_dialled", mesh)
+        monkeypatch.setattr(network, "_dialled", mesh)
         return found
 
     @pytest.fixture

@@ -17,7 +17,6 @@ from strands_robots.audit import (
     verify_audit_integrity,
 )
 from strands_robots.audit.verification import FACTS_REPLACED, SIGNATURES
-from strands_robots.cli.command import command
 from strands_robots.cli.output import CliError, Screen, plain, readable, table
 from strands_robots.safety.lockout import utc
 from strands_robots.utils import number, whole
@@ -36,15 +35,6 @@ GRAVE = ("bad", "missing", "gaps", "broken", "tampered")
 NEVER_BEGUN = "There is no audit: nothing was recorded here with this secret yet, or all of it was deleted."
 FIRST_FIELDS = ("stopped", "source", "who", "why", "reason", "estop_id", "epoch")
 HIDDEN_FIELDS = ("device_id", "epochs", "issued", "pressed_at", "timing", "repeated", "late", "road", "persisted")
-
-
-def register(app: typer.Typer) -> None:
-    """Add ``audit`` to the application."""
-    audit = typer.Typer(no_args_is_help=True, help="The safety record of this machine.")
-    command(audit, "tail")(tail)
-    command(audit, "show")(show)
-    command(audit, "verify")(verify)
-    app.add_typer(audit, name="audit")
 
 
 def tail(

@@ -17,17 +17,19 @@ import typer
 from strands_robots.cli.network import Network
 from strands_robots.cli.output import CliError, Exit, Screen
 from strands_robots.errors import StrandsRobotsError
-from strands_robots.fleet.callers import SOURCE
+from strands_robots.fleet.adapter import SOURCE
 from strands_robots.utils import ValidationError, shown
 
 Body = TypeVar("Body", bound=Callable[..., None])
 
 Timeout = Annotated[float, typer.Option("--timeout", help="Seconds to wait for an answer.")]
-OnMesh = Annotated[bool, typer.Option("--mesh", help="On the native mesh alone.")]
 Seconds = Annotated[float | None, typer.Option("--for", help="End after that many seconds.")]
 
 WITHOUT_CHECK = ("stop", "estop", "doctor")
 """Commands that use what they can of a connection profile."""
+
+WITHOUT_MESH = ("doctor",)
+"""Commands that look at every network."""
 
 _JSON = Parameter(
     "machine",
@@ -39,21 +41,26 @@ _SERIAL = re.compile(r"/.|COM\d+\Z", re.IGNORECASE)
 _KEY = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
 
 
-def command(app: typer.Typer, name: str, *, network: bool = False) -> Callable[[Body], Body]:
+def command(app: typer.Typer, name: str) -> Callable[[Body], Body]:
     """Register ``body(screen, [network], ...)`` as the command ``name``.
+
+    A body with a ``network`` gets the flags that say which network, as a :class:`Network`.
 
     Args:
         app: where it is registered.
         name: the word on the command line.
-        network: give it the flags that say which network, as a :class:`Network`.
     """
 
     def register(body: Body) -> Body:
-        own = {name: each for name, each in _parameters(body).items() if name not in ("screen", "network")}
+        own = _parameters(body)
+        network = own.pop("network", None) is not None
+        del own["screen"]
         if network and "source" in own and own["source"].default == SOURCE:
             own["source"] = _profiles_name(own["source"])
         # A command may define a network flag of its own meaning, as serve does with --port.
         shared = {name: each for name, each in _parameters(Network).items() if network and name not in own}
+        if name in WITHOUT_MESH:
+            shared.pop("mesh")
         parameters = [*own.values(), *shared.values(), _JSON]
 
         def run(**arguments: Any) -> None:

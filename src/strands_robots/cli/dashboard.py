@@ -15,29 +15,21 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from strands_robots import settings
 from strands_robots._mesh_switch import mesh_env_request
-from strands_robots.cli.command import command
+from strands_robots.cli.demo import example
 from strands_robots.cli.keys import PassphraseFile, signing_key
 from strands_robots.cli.network import Network
 from strands_robots.cli.output import CliError, Exit, Screen
 from strands_robots.utils import device_id, missing_extra
 
 if TYPE_CHECKING:
-    from strands_robots.cli.demo.processes import RobotProcess
     from strands_robots.dashboard.access import RemoteAddress
     from strands_robots.dashboard.server import Dashboard
 
+
 PORT = 8800
-DEMO_ROBOTS = {"arm-1": "tabletop", "arm-2": "tabletop", "arm-3": "", "arm-4": ""}
-DEMO_TENANT = "dashboard-demo"
 START_S = 10.0
 POLL_S = 0.02
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command to the application."""
-    command(app, "dashboard", network=True)(dashboard)
 
 
 def dashboard(
@@ -64,16 +56,16 @@ def dashboard(
     meet: Annotated[
         int | None, typer.Option("--meet", help="Loopback port where local robots meet.", min=1, max=65535)
     ] = None,
-    with_mesh: Annotated[bool, typer.Option("--mesh", help="Say so where the native mesh is not there.")] = False,
+    mesh: Annotated[bool, typer.Option("--mesh", help="Say so where the native mesh is not there.")] = False,
     demo: Annotated[bool, typer.Option("--demo", help="Serve four simulated robots to try it with.")] = False,
 ) -> None:
     """Show every robot in a browser: watch, drive, stop; on 127.0.0.1 alone."""
     source = device_id("--as", source)
     if operator_key is not None and not operator_key.is_file():
         raise CliError(f"--operator-key {operator_key} is no file.", Exit.USAGE)
-    if demo and (operator_key is not None or meet is not None or with_mesh or network != Network()):
+    if demo and (operator_key is not None or meet is not None or mesh or network != Network()):
         raise CliError("--demo has robots, a network and an operator's key of its own.", Exit.USAGE)
-    if with_mesh and mesh_env_request() is False:
+    if mesh and mesh_env_request() is False:
         raise CliError("--mesh: STRANDS_MESH switches the mesh off.", Exit.USAGE)
     signer = None if key is None else signing_key(key, passphrase_file)
     try:
@@ -85,17 +77,18 @@ def dashboard(
     except ModuleNotFoundError as exc:
         raise missing_extra("The page", "dashboard") from exc
     with ExitStack() as stack:
-        robots: DemoRobots | None = None
+        robots: Any = None
         if demo:
-            robots = stack.enter_context(_demo_robots(screen))
-            meet, operator_key, network = robots.port, robots.key, replace(network, tenant=DEMO_TENANT)
+            page_demo = example("page")
+            robots = stack.enter_context(page_demo.page_robots(screen))
+            meet, operator_key, network = robots.port, robots.key, replace(network, tenant=page_demo.TENANT)
         sockets = [stack.enter_context(_bound("127.0.0.1", port))]
         port = int(sockets[0].getsockname()[1])
         remote = None if listen is None else remote_address(listen, port)
         if remote is not None:
             sockets.append(stack.enter_context(_bound(remote.host, port)))
         model = FleetModel()
-        networks = replace(network, port=meet).networks(source=source, stays=True, with_mesh=with_mesh)
+        networks = replace(network, port=meet).networks(source=source, stays=True, with_mesh=mesh)
         if not networks.stated:
             raise CliError(f"No network is there: {networks.absences}.", Exit.SILENT)
         stack.callback(networks.close)
@@ -106,7 +99,7 @@ def dashboard(
             OperatorKey(operator_key),
             source=source,
             signed=signer is not None,
-            starting=() if robots is None else tuple(DEMO_ROBOTS),
+            starting=() if robots is None else tuple(page_demo.ROBOTS),
         )
         stack.callback(page.close)
         page.feeds.begin()
@@ -136,7 +129,7 @@ def _serve(
     page: Dashboard,
     sockets: list[socket.socket],
     remote: RemoteAddress | None,
-    robots: DemoRobots | None,
+    robots: Any,
     *,
     browser: bool,
 ) -> None:
@@ -195,53 +188,3 @@ def _announce(screen: Screen, url: str, remote: RemoteAddress | None) -> None:
         screen.copyable(f"  {remote.fingerprint}")
     screen.data(facts)
     screen.say("Space stops all robots. Ctrl-C here ends the page, not the robots.")
-
-
-class DemoRobots:
-    """Robots to try the page with, and their operator's key.
-
-    Args:
-        key: file of the operator's key.
-        port: loopback port where they meet.
-    """
-
-    def __init__(self, key: Path, port: int) -> None:
-        self.key, self.port = key, port
-        self._started: list[RobotProcess] = []
-        self._stack = ExitStack()
-
-    def start(self) -> None:
-        """Start them side by side; the page shows each as it is found."""
-        from strands_robots.cli.demo.processes import started_robot  # noqa: PLC0415 - the demo only
-
-        for name, scene in DEMO_ROBOTS.items():
-            robot = started_robot("so100", scene, name, self.port, DEMO_TENANT)
-            self._started.append(self._stack.enter_context(robot))
-
-    def check(self) -> None:
-        """Raise :class:`CliError` when one has ended."""
-        for each in self._started:
-            each.check()
-
-    def close(self) -> None:
-        """End them, all at once."""
-        for each in self._started:
-            each.process.terminate()
-        self._stack.close()
-
-
-@contextmanager
-def _demo_robots(screen: Screen) -> Iterator[DemoRobots]:
-    """Make the demo's key and settings; its robots end with the block."""
-    from strands_robots.cli.demo import free_port  # noqa: PLC0415 - the demo only
-    from strands_robots.cli.demo.steps import demo_operator  # noqa: PLC0415 - as above
-
-    with demo_operator() as (key, passphrase):
-        # Its STOP is for its own robots, not for those of the user's mesh.
-        settings.put("STRANDS_MESH", "false")
-        port = free_port()
-        screen.say("Four simulated robots start while you open the page.")
-        screen.data({"event": "demo", "passphrase": passphrase, "meet": port})
-        screen.say(f"To free a robot that was stopped, the page asks for this passphrase: {passphrase}", "yellow")
-        with contextlib.closing(DemoRobots(key, port)) as robots:
-            yield robots

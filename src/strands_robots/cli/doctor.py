@@ -14,17 +14,14 @@ from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import typer
-
 from strands_robots import __version__, settings
-from strands_robots.cli.command import command
+from strands_robots.cli.app import IMPORT_PACKAGE, other_owners, owner_remedy
 from strands_robots.cli.network import Network
 from strands_robots.cli.output import CliError, Screen, label, table
-from strands_robots.cli.owners import IMPORT_PACKAGE, other_owners, owner_remedy
 from strands_robots.cli.readiness import LOOPBACK, dial_problem, listen_problem, port_holder, unwritable
 from strands_robots.errors import UnreachableError
 from strands_robots.fleet.adapter import MESH
-from strands_robots.fleet.link_flags import described
+from strands_robots.fleet.device_connect.config import described
 from strands_robots.safety.identity import robots_here
 from strands_robots.safety.orders import ALLOW, REQUIRE_SIGNED, StopRules
 from strands_robots.state_files import state_dir
@@ -95,11 +92,6 @@ class Finding:
 
 
 _STYLE = {Mark.OK: "green", Mark.NOTE: "cyan", Mark.WARN: "yellow", Mark.BROKEN: "bold red"}
-
-
-def register(app: typer.Typer) -> None:
-    """Add ``doctor`` to the application."""
-    command(app, "doctor", network=True)(doctor)
 
 
 def doctor(screen: Screen, network: Network) -> None:
@@ -278,7 +270,7 @@ def _certificates(link: LinkConfig) -> Iterator[Finding]:
     if not used.ca:
         yield Finding("certificates", Mark.OK, "none configured; a network inside this machine needs none")
         return
-    from strands_robots.cli.certificates import (  # noqa: PLC0415 - needs the [device-connect] extra
+    from strands_robots.cli.readiness import (  # noqa: PLC0415 - needs the [device-connect] extra
         certificate_problem,
         valid_until,
     )

@@ -11,7 +11,6 @@ from typing import Annotated, Any, TypeVar
 
 import typer
 
-from strands_robots.cli.command import command
 from strands_robots.cli.output import CliError, Exit, Screen
 from strands_robots.safety.ed25519 import keygen, load_signing_key
 from strands_robots.safety.identity import console_key
@@ -25,23 +24,6 @@ PassphraseFile = Annotated[
 DEFAULT_FOLDER = Path("mesh-keys")
 KeyFile = Annotated[Path, typer.Argument(help="Where the key is written, encrypted; never over a file.")]
 Folder = Annotated[Path, typer.Option("--folder", help="Folder of the authority and the certificates.")]
-
-
-def register(app: typer.Typer) -> None:
-    """Add ``keys`` and ``mesh keys`` to the application."""
-    keys = typer.Typer(no_args_is_help=True, help="Keys that free robots and sign their stops.")
-    command(keys, "resume")(resume)
-    command(keys, "estop")(estop)
-    command(keys, "console")(console)
-    command(keys, "mcp")(mcp)
-    app.add_typer(keys, name="keys")
-    mesh = typer.Typer(no_args_is_help=True, help="The native mesh: certificates and access rules.")
-    mesh_keys = typer.Typer(no_args_is_help=True, help="Certificates for a mesh that leaves this machine.")
-    command(mesh_keys, "init")(init)
-    command(mesh_keys, "issue")(issue)
-    command(mesh_keys, "acl")(acl)
-    mesh.add_typer(mesh_keys, name="keys")
-    app.add_typer(mesh, name="mesh")
 
 
 def resume(screen: Screen, *, file: KeyFile, passphrase_file: PassphraseFile = None) -> None:

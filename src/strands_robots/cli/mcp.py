@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from strands_robots.cli.command import OnMesh, command
 from strands_robots.cli.network import Network
 from strands_robots.cli.output import CliError, Exit, Screen
 from strands_robots.errors import StrandsRobotsError
@@ -16,11 +15,6 @@ from strands_robots.utils import device_id, install_line, port
 
 if TYPE_CHECKING:
     from strands_robots.fleet.networks import Networks
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command to the application."""
-    command(app, "mcp", network=True)(mcp)
 
 
 def mcp(
@@ -37,7 +31,6 @@ def mcp(
     http_name: Annotated[
         list[str] | None, typer.Option("--http-name", help="A host name by which clients reach it (repeat).")
     ] = None,
-    on_mesh: OnMesh = False,
 ) -> None:
     """Serve all robots to an MCP client that starts this (stdio), or over HTTP."""
     name = device_id("--as", source)
@@ -47,7 +40,7 @@ def mcp(
         raise CliError(f"The MCP server needs the extra mcp ({install_line('mcp')}): {missing}.") from missing
 
     def networks_of(caller: str) -> Networks:
-        return network.networks(on_mesh=on_mesh, source=caller, stays=True)
+        return network.networks(source=caller, stays=True)
 
     if http is None:
         with networks_of(name) as networks:

@@ -25,10 +25,9 @@ from strands_robots.errors import (
     UnknownVerbError,
     UnreachableError,
 )
-from strands_robots.fleet.adapter import DEVICE_CONNECT
-from strands_robots.fleet.callers import SOURCE
-from strands_robots.fleet.link_flags import LinkFlags, as_flag
-from strands_robots.fleet.mesh_settings import put_settings
+from strands_robots.fleet.adapter import DEVICE_CONNECT, SOURCE
+from strands_robots.fleet.device_connect.config import LinkFlags, as_flag
+from strands_robots.fleet.mesh.config import put_settings
 from strands_robots.fleet.profiles import FleetProfile, mesh_at, profile_for, profile_name
 from strands_robots.utils import ValidationError, near, port, redacted
 
@@ -38,6 +37,10 @@ if TYPE_CHECKING:
     from strands_robots.mesh import Mesh
 
 logger = logging.getLogger(__name__)
+
+
+OF_NO_LINK = ("profile", "mesh")
+"""Fields of :class:`Network` that are no flags of Device Connect."""
 
 
 def _option(flag: str, text: str, **more: Any) -> Any:
@@ -68,6 +71,7 @@ class Network:
     tls_cert: Annotated[Path | None, _option("--tls-cert", "This side's certificate (PEM).")] = None
     tls_key: Annotated[Path | None, _option("--tls-key", "This side's private key (PEM).")] = None
     credentials: Annotated[Path | None, _option("--credentials", "Device Connect credentials file (JSON).")] = None
+    mesh: Annotated[bool, typer.Option("--mesh", help="On the native mesh alone.")] = False
 
     def link(self) -> LinkConfig:
         """Return the link that the flags describe.
@@ -114,8 +118,8 @@ class Network:
 
     @property
     def _given(self) -> dict[str, Any]:
-        """Return the flags that were given, without the profile's name."""
-        given = {each.name: getattr(self, each.name) for each in fields(self) if each.name != "profile"}
+        """Return the flags of Device Connect that were given."""
+        given = {each.name: getattr(self, each.name) for each in fields(self) if each.name not in OF_NO_LINK}
         return {name: value for name, value in given.items() if value is not None and value not in (False, [])}
 
     @cached_property
@@ -137,7 +141,6 @@ class Network:
     def networks(
         self,
         *,
-        on_mesh: bool = False,
         source: str | None = None,
         stays: bool = False,
         console: bool = False,
@@ -146,7 +149,6 @@ class Network:
         """Return the networks of the flags, not joined yet.
 
         Args:
-            on_mesh: the native mesh alone.
             with_mesh: the native mesh in any case, so that its absence is told.
             source: the caller's name; by default that of :meth:`caller`.
             stays: the command lasts, and goes on trying to join what is not there yet.
@@ -156,10 +158,10 @@ class Network:
             CliError: the flags contradict one another, or leave this machine without authentication.
             MissingExtraError: no network is installed.
         """
-        from strands_robots.fleet.stated_networks import networks_of  # noqa: PLC0415 - loaded when a network is used
+        from strands_robots.fleet.profiles import networks_of  # noqa: PLC0415 - loaded when a network is used
 
         name = self.caller() if source is None else source
-        if on_mesh:
+        if self.mesh:
             self.use_mesh()
             if mesh_env_request() is False:
                 raise CliError("The native mesh is off: STRANDS_MESH switches it off.", Exit.SILENT)
@@ -176,13 +178,10 @@ class Network:
         return networks
 
     @contextmanager
-    def joined(
-        self, *, on_mesh: bool = False, source: str | None = None, stays: bool = False, in_turn: bool = False
-    ) -> Iterator[Networks]:
+    def joined(self, *, source: str | None = None, stays: bool = False, in_turn: bool = False) -> Iterator[Networks]:
         """Join the networks of the flags, or those of them that are there.
 
         Args:
-            on_mesh: the native mesh alone.
             source: the caller's name, as in :meth:`networks`.
             stays: as in :meth:`networks`.
             in_turn: as in :meth:`Networks.open`.
@@ -191,7 +190,7 @@ class Network:
             CliError: none can be reached, all fail in use, or the flags cannot be used.
         """
         try:
-            with closing(self.networks(on_mesh=on_mesh, source=source, stays=stays)) as networks:
+            with closing(self.networks(source=source, stays=stays)) as networks:
                 networks.open(in_turn=in_turn)
                 yield networks
         except UnreachableError as refusal:
@@ -216,7 +215,7 @@ class Network:
     @property
     def flags(self) -> str:
         """The flags as given, without passwords, for another command."""
-        words = list[str]()
+        words = ["--mesh"] if self.mesh else list[str]()
         for name, value in {"fleet": profile_name(self.profile, self._given), **self._given}.items():
             flag = as_flag(name)
             if isinstance(value, list):

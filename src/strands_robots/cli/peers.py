@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -11,16 +12,18 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 import typer
 from rich.text import Text
 
-from strands_robots.cli.command import OnMesh, Timeout, assignments, command
+from strands_robots import settings
+from strands_robots.cli.command import Timeout, assignments
 from strands_robots.cli.network import Network, answering, say_missing
 from strands_robots.cli.output import LATE_S, CliError, Exit, Screen, label, plain, readable, table
 from strands_robots.envelope import is_error, text_of
-from strands_robots.fleet.adapter import FIND_S
-from strands_robots.fleet.callers import SOURCE
+from strands_robots.fleet.adapter import FIND_S, SOURCE
+from strands_robots.fleet.device_connect.config import as_flag, described
 from strands_robots.fleet.networks import STILL
+from strands_robots.fleet.profiles import profile_names, profiles_folder, read_profile
 from strands_robots.serving.known_verbs import QUICK, STOPS, TEXTS, VERBS, WAITING
 from strands_robots.serving.refused import RefusalReason
-from strands_robots.utils import WAIT_S, ValidationError, identifier, number
+from strands_robots.utils import WAIT_S, MissingExtraError, ValidationError, identifier, number
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -32,6 +35,75 @@ if TYPE_CHECKING:
 
     Send = Callable[[str, str, Mapping[str, Any], float], Envelope]
 
+
+def fleets(screen: Screen) -> None:
+    """List the connection profiles that --fleet takes, and their networks."""
+    default, names = settings.raw("STRANDS_FLEET"), profile_names()
+    found = [_profile_facts(name) for name in names]
+    unfit = _problem(default) if default and default not in names else ""
+    screen.data(
+        {
+            "status": "success",
+            "folder": str(profiles_folder()),
+            "default": default or None,
+            "default_problem": unfit,
+            "fleets": found,
+        },
+    )
+    if unfit:
+        screen.say(f"STRANDS_FLEET names none that can be used. {unfit}")
+    if not found:
+        screen.say(f"No connection profile is in {profiles_folder()}; docs/python.md says what one has.")
+        return
+    rows = (
+        (
+            f"{each['name']} (default)" if each["name"] == default else each["name"],
+            label(each["problem"], "bold red") if each["problem"] else each["network"] or "none",
+            each["tenant"] or "",
+            each["caller"] or "",
+            "" if each["mesh"] is None else each["mesh_network"] or "none",
+        )
+        for each in found
+    )
+    screen.show(table(str(profiles_folder()), ("fleet", "Device Connect", "tenant", "caller", "mesh"), rows))
+
+
+def _profile_facts(name: str) -> dict[str, Any]:
+    """Return a profile in words; ``problem`` says why it cannot be used."""
+    absent = ("network", "tenant", "caller", "mesh", "mesh_network")
+    facts: dict[str, Any] = {"name": name, **dict.fromkeys(absent)}
+    try:
+        profile = read_profile(name)
+        facts["file"] = str(profile.file)
+        if profile.reaches_devices({}):
+            link = profile.flags({}).link(as_flag)
+            facts |= {"network": described(link), "tenant": link.tenant}
+        stated = profile.mesh
+        facts |= {"caller": profile.name or SOURCE, "mesh": stated is not None}
+        facts["mesh_network"] = None if stated is None else _mesh_in_words(stated)
+    except (ValidationError, MissingExtraError) as exc:
+        return {**facts, "problem": str(exc)}
+    return {**facts, "problem": ""}
+
+
+def _problem(wanted: str) -> str:
+    try:
+        read_profile(wanted).check()
+    except ValidationError as exc:
+        return str(exc)
+    return ""
+
+
+def _mesh_in_words(stated: Mapping[str, str]) -> str:
+    """Describe in one sentence where the peers of a profile's mesh meet."""
+    ends = {"connects to": stated["STRANDS_MESH_CONNECT"], "listens on": stated["STRANDS_MESH_LISTEN"]}
+    ways = [f"{how} {', '.join(each.split(','))}" for how, each in ends.items() if each != settings.NO_ENDPOINT]
+    hub = [] if ways else [f"meets at 127.0.0.1:{stated['STRANDS_MESH_PORT']}"]
+    multicast = ["finds peers by multicast"] if stated["STRANDS_MESH_MULTICAST"] == "true" else []
+    text = "; ".join((*hub, *ways, *multicast))
+    return f"{text[0].upper()}{text[1:]}."
+
+
 LEASE_ID = "lease_id"
 
 GRAVE = ("estop_unheard", "distrusted", "locked")
@@ -42,18 +114,11 @@ MOTION_S = CALL_S + WAIT_S
 """Seconds to wait for a verb that may wait for the end of a motion."""
 
 
-def register(app: typer.Typer) -> None:
-    """Add both commands to the application."""
-    command(app, "peers", network=True)(peers)
-    command(app, "call", network=True)(call)
-
-
 def peers(
     screen: Screen,
     network: Network,
     device: Annotated[str | None, typer.Argument(help="List the functions of this one.")] = None,
     timeout: Timeout = FIND_S,
-    on_mesh: OnMesh = False,
 ) -> None:
     """List the robots in reach, or what one of them can do.
 
@@ -61,8 +126,8 @@ def peers(
     """
     seconds = number("--timeout", timeout, above=0, high=60)
     wanted = None if device is None else identifier("DEVICE", device)
-    with network.joined(on_mesh=on_mesh) as there:
-        listed = there.listed(seconds) if on_mesh else there.find(seconds)
+    with network.joined() as there:
+        listed = there.find(seconds, peers=network.mesh)
         rows = [_Row.of(*listed[name], there.bearers(name)) for name in sorted(listed) if wanted in (None, name)]
         functions = there.describe(wanted) if wanted is not None and rows else None
         reach, stale, whose = there.reach, there.stale, network.other_user(there)
@@ -70,8 +135,10 @@ def peers(
     facts = {"stale": stale, "absent": there.missing}
     if not rows:
         who = "No robot" if device is None else f"No {device!r}"
-        absent = "No peer is on the mesh of this machine." if on_mesh and device is None else f"{who} answered."
-        raise CliError(f"{absent} {'' if on_mesh else f'{reach} {whose}'}".rstrip(), Exit.SILENT, peers=[], **facts)
+        absent = "No peer is on the mesh of this machine." if network.mesh and device is None else f"{who} answered."
+        raise CliError(
+            f"{absent} {'' if network.mesh else f'{reach} {whose}'}".rstrip(), Exit.SILENT, peers=[], **facts
+        )
     screen.data({"status": "success", "peers": [each.facts for each in rows], **facts, "whose": whose})
     if whose:
         screen.say(whose, "yellow")
@@ -147,7 +214,6 @@ def call(
         typer.Option("--timeout", help=f"Seconds to wait for an answer: {CALL_S:g}, or {MOTION_S:g} for a motion."),
     ] = None,
     source: Annotated[str, typer.Option("--as", help="Name of the caller that goes with the call.")] = SOURCE,
-    on_mesh: OnMesh = False,
 ) -> None:
     """Call a function of a device, or list its functions.
 
@@ -157,8 +223,7 @@ def call(
     given = arguments or []
     params = assignments(given)
     stated = None if timeout is None else number("--timeout", timeout, above=0, high=3600)
-    flags = f"{' --mesh' if on_mesh else ''}{network.flags}"
-    with network.joined(on_mesh=on_mesh, source=source, in_turn=function in STILL - STOPS) as there:
+    with network.joined(source=source, in_turn=function in STILL - STOPS) as there:
         try:
             with answering(there, device, function or ""):
                 if function is None:
@@ -173,7 +238,7 @@ def call(
                     send = place.call
                 params = _typed(verb, given, params)
                 seconds = stated or _wait(function, verb)
-                with _interruptible(f"strands-robots stop {device}{flags}", lambda: _moves(function, verb)):
+                with _interruptible(f"strands-robots stop {device}{network.flags}", lambda: _moves(function, verb)):
                     answer = send(device, function, params, seconds)
         except CliError as failure:
             if failure.code in (Exit.INTERRUPTED, Exit.USAGE):
@@ -251,7 +316,7 @@ def _typed(verb: AdvertisedVerb | None, given: Sequence[str], params: Mapping[st
 def _list_functions(screen: Screen, there: Networks, device: str) -> None:
     functions = there.describe(device, anew=True)
     screen.data({"status": "success", "device": device, "functions": functions})
-    _show_functions(screen, there.known(device), functions)
+    _show_functions(screen, there.of(device).known(device), functions)
 
 
 def _status(robot: FoundRobot) -> str | Text:

@@ -2,33 +2,29 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from strands_robots import settings
-from strands_robots.cli.command import assignments, command
+from strands_robots.cli.command import assignments
 from strands_robots.cli.output import CliError, Screen, label, table
 from strands_robots.policies.base import PolicyError
 from strands_robots.policies.check import PolicyCheck, check_policy, statements_of
 from strands_robots.policies.profiles import Profile, load_profiles
-from strands_robots.utils import ValidationError, number, shown
+from strands_robots.utils import ValidationError, missing_extra, number, shown, whole
+
+if TYPE_CHECKING:
+    from strands_robots.evaluation.episode import Episode
 
 _STYLES = {"ok": "green", "confirmed": "green", "unverified": "yellow", "refused": "bold red"}
 
 PoliciesFile = Annotated[
     Path | None, typer.Option("--policies", help="The file of policy profiles; STRANDS_POLICIES by default.")
 ]
-
-
-def register(app: typer.Typer) -> None:
-    """Add ``policy`` to the application."""
-    group = typer.Typer(help="Look at trained policies before a robot moves by them.", no_args_is_help=True)
-    command(group, "check")(check)
-    command(group, "bench")(bench)
-    app.add_typer(group, name="policy")
 
 
 def check(
@@ -110,3 +106,67 @@ def show(screen: Screen, found: PolicyCheck) -> None:
         for row in found.rows
     ]
     screen.show(table("", ("question", "policy", "robot", "result", "to do"), rows))
+
+
+EPISODES_MAX = 10_000
+
+
+def evaluate(
+    screen: Screen,
+    *,
+    policy: Annotated[
+        list[str], typer.Option("--policy", help="A profile, mock, or expert:TASK; several are compared.")
+    ],
+    task: Annotated[str, typer.Option("--task", help="reach, push_cube or pick_place.")],
+    episodes: Annotated[int, typer.Option("--episodes", help="Episodes of each policy.")] = 20,
+    robot: Annotated[str, typer.Option("--robot", help="so100 or so101.")] = "so100",
+    seed: Annotated[int, typer.Option("--seed", help="Seed of the first episode.")] = 0,
+    hz: Annotated[float, typer.Option("--hz", help="Control rate.")] = 50.0,
+    latency: Annotated[float, typer.Option("--latency", help="Simulated seconds that each answer takes.")] = 0.0,
+    output: Annotated[
+        Path | None, typer.Option("--output", help="A new folder for recordings and plot; evaluation-TIME by default.")
+    ] = None,
+    policies: PoliciesFile = None,
+) -> None:
+    """Let policies try a task in simulation, recorded, and print success rates."""
+    count = whole("--episodes", episodes, low=1, high=EPISODES_MAX)
+    first = whole("--seed", seed, low=0, high=2**31)
+    rate = number("--hz", hz, low=5, high=250)
+    delay = number("--latency", latency, low=0, high=10)
+    try:
+        import mujoco  # noqa: F401, PLC0415 - a simulation is needed by this command alone
+    except ModuleNotFoundError as exc:
+        raise missing_extra("An evaluation", "sim") from exc
+    from strands_robots.evaluation.episode import HEADINGS, rows_of, run_episode, write_plot  # noqa: PLC0415 - MuJoCo
+
+    if policies is not None:
+        settings.put("STRANDS_POLICIES", str(policies))
+    folder = output or Path(f"evaluation-{time.strftime('%Y%m%d-%H%M%S')}")
+    try:
+        folder.mkdir(parents=True)
+    except FileExistsError:
+        raise ValidationError(f"--output must be a new folder; {folder} is there already.") from None
+    found: dict[str, list[Episode]] = {}
+    for name in policy:
+        kept = folder / name.replace(":", "-")
+        kept.mkdir()
+        found[name] = []
+        for index in range(count):
+            episode = run_episode(
+                name,
+                task,
+                first + index,
+                robot=robot,
+                hz=rate,
+                latency_s=delay,
+                recording=kept / f"{index:04}.mcap",
+            )
+            found[name].append(episode)
+            screen.data({"policy": name, **asdict(episode)})
+    plot = folder / "success.svg"
+    write_plot(plot, f"{task} on {robot}, {count} episodes", found)
+    screen.show(table("", HEADINGS, rows_of(found)))
+    screen.say(f"Recordings and plot: {folder}/")
+    failed = {name: error for name, each in found.items() if (error := next((e.error for e in each if e.error), ""))}
+    if failed:
+        raise CliError("; ".join(f"{name} failed: {error}" for name, error in failed.items()))

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from strands_robots.cli.command import Seconds, command
+from strands_robots.cli.command import Seconds
 from strands_robots.cli.network import Network, say_missing
 from strands_robots.cli.output import CliError, Exit, Screen, progress_bar, table
 from strands_robots.errors import RefusalError
@@ -31,11 +31,6 @@ NO_CAMERAS = "none"
 _POLL_S = 0.2
 
 
-def register(app: typer.Typer) -> None:
-    """Add ``record`` to the application."""
-    command(app, "record", network=True)(record)
-
-
 def record(
     screen: Screen,
     network: Network,
@@ -43,16 +38,13 @@ def record(
     devices: Annotated[list[str], typer.Argument(metavar="DEVICE...", help="Ids of the devices, or '*' for all.")],
     out: Annotated[Path, typer.Option("--out", help="A new .mcap file.")],
     seconds: Seconds = None,
-    on_mesh: Annotated[
-        bool, typer.Option("--mesh", help="Peers of the native mesh alone: states, steps, pictures, stops.")
-    ] = False,
 ) -> None:
     """Write every event of some devices into an MCAP file until Ctrl-C: joints, actions, tasks, stops."""
     longest = None if seconds is None else number("--for", seconds, above=0, high=24 * 3600)
     wanted = [each if each == EVERY else identifier("DEVICE", each) for each in devices]
     recorder = Recorder(out)
     with ExitStack() as stack:
-        there = stack.enter_context(network.joined(on_mesh=on_mesh, stays=True))
+        there = stack.enter_context(network.joined(stays=True))
         stack.enter_context(recorder)
         there.on_joined(lambda joined: _record_network(there, joined, wanted, recorder))
         there.settled()

@@ -8,29 +8,24 @@ from typing import Annotated
 
 import typer
 
-from strands_robots.cli.command import OnMesh, Timeout, command
+from strands_robots.cli.command import Timeout
 from strands_robots.cli.keys import PassphraseFile, signing_key
-from strands_robots.cli.network import Network, say_missing
+from strands_robots.cli.network import Network, answering, say_missing
 from strands_robots.cli.output import CliError, Exit, Screen, label, plain, table
 from strands_robots.cli.readiness import state_problem
-from strands_robots.fleet.all_lockouts import ask_lockouts, by_robot, resume_all, unheard_in
-from strands_robots.fleet.lockout_report import LockoutReport
+from strands_robots.envelope import is_error, text_of
+from strands_robots.fleet.adapter import LockoutReport
+from strands_robots.fleet.lockouts import ask_lockouts, by_robot, resume_all, unheard_in
 from strands_robots.safety.authorization import GRANT_S, Grants
 from strands_robots.safety.lockout import Lockout, utc
 from strands_robots.safety.persistence import LockoutStore, StoredLockout
 from strands_robots.safety.resume import NOT_LOCKED, clear_here
 from strands_robots.safety.stop_notes import Unheard, unheard_since
+from strands_robots.serving.take_assertion import sign_take
 from strands_robots.state_files import state_dir
 from strands_robots.utils import identifier, number, operator
 
 THEN = "They move again when they get a new command."
-
-
-def register(app: typer.Typer) -> None:
-    """Add the three commands to the application."""
-    command(app, "resume", network=True)(resume)
-    command(app, "lockout", network=True)(lockout)
-    command(app, "grant")(grant)
 
 
 def resume(
@@ -45,7 +40,6 @@ def resume(
     passphrase_file: PassphraseFile = None,
     local: Annotated[bool, typer.Option("--local", help="Robots of this machine, without a key; audited.")] = False,
     timeout: Timeout = 5.0,
-    on_mesh: OnMesh = False,
 ) -> None:
     """Free locked robots: by the operator's key over the network, or here by --local. It starts no motion.
 
@@ -61,7 +55,7 @@ def resume(
         return
     seconds = number("--timeout", timeout, above=0, high=60)
     signer = signing_key(key, passphrase_file)
-    with network.joined(on_mesh=on_mesh) as there:
+    with network.joined() as there:
         reports = ask_lockouts(there, seconds, besides=wanted)
         found = by_robot(reports)
         if not found:
@@ -82,7 +76,6 @@ def lockout(
     *,
     local: Annotated[bool, typer.Option("--local", help="Only this machine's lockout file.")] = False,
     timeout: Timeout = 2.0,
-    on_mesh: OnMesh = False,
 ) -> None:
     """List locked robots, since when and by whom: live ones, and those in this machine's lockout file.
 
@@ -93,7 +86,7 @@ def lockout(
     missing: dict[str, str] = {}
     if not local:
         try:
-            with network.joined(on_mesh=on_mesh) as there:
+            with network.joined() as there:
                 live = list(by_robot(ask_lockouts(there, seconds, look_s=seconds)).values())
                 stale = there.stale
             missing = there.missing
@@ -227,3 +220,36 @@ def _report(
         raise CliError(plain(f"Nothing is locked here: {', '.join(not_locked)}.", 2000), Exit.REFUSED, **facts)
     screen.data({"status": "success", **facts})
     screen.say(then)
+
+
+def take(
+    screen: Screen,
+    network: Network,
+    *,
+    device: Annotated[str, typer.Argument(help="The robot's id.")],
+    key: Annotated[Path | None, typer.Option("--key", help="The operator's key; a simulation may need none.")] = None,
+    passphrase_file: PassphraseFile = None,
+    robot: Annotated[str, typer.Option("--robot", help="Which robot of a simulated world.")] = "",
+    reason: Annotated[
+        str, typer.Option("--reason", help="Told to the one who loses control.")
+    ] = "an operator took over",
+    timeout: Timeout = 5.0,
+) -> None:
+    """Take control of a robot: its motion is halted, and only you may move it then."""
+    name, seconds = identifier("DEVICE", device), number("--timeout", timeout, above=0, high=60)
+    signer = None if key is None else signing_key(key, passphrase_file)
+    which: dict[str, object] = {"robot_name": robot} if robot else {}
+    with network.joined() as there, answering(there, name, "takeControl"):
+        place = there.of(name, "takeControl", moves=True)
+        before = place.call(name, "getControl", which, seconds)
+        if is_error(before):
+            raise CliError(plain(text_of(before), 2000), Exit.REFUSED)
+        asked = {"reason": reason, **which}
+        if signer is not None:
+            asked["assertion"] = sign_take(signer, f"{name}/{robot}" if robot else name, int(before["epoch"]))
+        answer = place.call(name, "takeControl", asked, seconds)
+    if is_error(answer):
+        raise CliError(plain(text_of(answer), 2000), Exit.REFUSED)
+    screen.data(answer)
+    screen.say(f"{name}: {plain(text_of(answer), 400)}")
+    screen.say(f"lease_id {plain(str(answer['lease_id']), 64)}")

@@ -18,15 +18,12 @@ import typer
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from strands_robots.cli.command import OnMesh, command
 from strands_robots.cli.keys import PassphraseFile, signing_key
 from strands_robots.cli.network import Network
 from strands_robots.cli.output import CliError, Exit, Screen, captured_log, label, table
-from strands_robots.cli.stop_report import LATE_MS, SLOW_MS, outcome_lines, style_of, summary
-from strands_robots.fleet.lockout_report import LockoutReport
-from strands_robots.fleet.safety_console import SafetyConsole
-from strands_robots.fleet.stop_button import StopButton
-from strands_robots.fleet.watched_robots import BEAT_FRESH_S, GONE_S
+from strands_robots.cli.stop import LATE_MS, SLOW_MS, outcome_lines, style_of, summary
+from strands_robots.fleet.adapter import LockoutReport
+from strands_robots.fleet.safety_console import BEAT_FRESH_S, GONE_S, SafetyConsole, StopButton
 from strands_robots.safety.answers import Answer
 from strands_robots.safety.lockout import utc
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
@@ -34,11 +31,6 @@ from strands_robots.utils import device_id, number
 
 DRAW_S = 0.1
 COLUMNS = ("lockout", "since, by whom", "last stop", "status", "last seen", "check-in")
-
-
-def register(app: typer.Typer) -> None:
-    """Add ``safety-controller`` to the application."""
-    command(app, "safety-controller", network=True)(safety_controller)
 
 
 def safety_controller(
@@ -54,7 +46,6 @@ def safety_controller(
     ] = "space bar",
     key: Annotated[Path | None, typer.Option("--key", help="Sign stops and check-ins with it.")] = None,
     passphrase_file: PassphraseFile = None,
-    on_mesh: OnMesh = False,
 ) -> None:
     """Stop every robot on every network at once with the SPACE bar.
 
@@ -67,7 +58,7 @@ def safety_controller(
         )
     source = device_id("--id", source)
     every = None if check_in is None else number("--check-in", check_in, low=0.02, high=60)
-    networks = network.networks(on_mesh=on_mesh, source=source, stays=True, console=True)
+    networks = network.networks(source=source, stays=True, console=True)
     signer = None if key is None else signing_key(key, passphrase_file)
     with contextlib.closing(SafetyConsole(networks, signer, reason, every)) as console:
         _run(console, ConsoleScreen(console, source, every), screen)

@@ -3,43 +3,200 @@
 from __future__ import annotations
 
 import shlex
-import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, wait
+from concurrent.futures import wait
 from contextlib import closing, contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich.table import Table
 
-from strands_robots.cli.command import OnMesh, Timeout, command
+from strands_robots.cli.command import Timeout
 from strands_robots.cli.keys import PassphraseFile, operator_key, signing_key
 from strands_robots.cli.network import Network, near_robots, say_missing
 from strands_robots.cli.output import POLL_S, CliError, Exit, Screen, captured_log, label, plain, table
 from strands_robots.cli.readiness import meeting_user
-from strands_robots.cli.stop_report import (
-    LATE_MS,
-    exit_code,
-    failure,
-    outcome_rows,
-    progress_rows,
-    say_outcome,
-    stop_table,
-)
 from strands_robots.envelope import Envelope, error
 from strands_robots.errors import RefusalError
-from strands_robots.fleet.adapter import NetworkAdapter
-from strands_robots.fleet.all_stops import estop_all, stop_all
-from strands_robots.fleet.callers import SOURCE, TOOL
-from strands_robots.fleet.fleet_verdict import FleetVerdict, NetworkVerdict
+from strands_robots.fleet.adapter import SOURCE, TOOL, NetworkAdapter, StopRequest
+from strands_robots.fleet.joining import on_own_thread
 from strands_robots.fleet.networks import Networks
-from strands_robots.fleet.stop_answers import combined_verdict, not_reached, roster_verdict, stop_outcome
-from strands_robots.safety.answers import Progress
+from strands_robots.fleet.stops import estop_all, stop_all
+from strands_robots.fleet.verdicts import (
+    FleetVerdict,
+    NetworkVerdict,
+    combined_verdict,
+    not_reached,
+    roster_verdict,
+    stop_outcome,
+)
+from strands_robots.safety.answers import Answer, Progress, StopReport
 from strands_robots.safety.controller import DEADLINE_S
+from strands_robots.safety.roster import RosterRow, seconds
+from strands_robots.safety.stop_notes import problem_sentence, stop_notes
 from strands_robots.safety.stop_roster import StopOutcome
 from strands_robots.serving.stop_arguments import robot_of_world, stop_reason, stop_robot, stop_scope
 from strands_robots.utils import ValidationError, device_id, number
+
+SLOW_MS = 100.0
+"""An answer that took longer is shown in red."""
+
+LATE_MS = 1000.0
+"""A stop that left later than this after the press says so."""
+
+
+def exit_code(outcome: StopReport | StopOutcome) -> Exit:
+    """Return 0 when all stopped, 1 when one did not, 3 when one has not answered.
+
+    A robot that stopped and is not locked gave no answer to the emergency stop.
+    """
+    report = outcome.report if isinstance(outcome, StopOutcome) else outcome
+    free = isinstance(outcome, StopOutcome) and {*outcome.not_locked} & report.stopped.keys()
+    if report.not_stopped or report.refused or report.alarmed:
+        return Exit.REFUSED
+    return Exit.OK if outcome.ok and not free else Exit.SILENT
+
+
+def style_of(report: StopReport) -> str:
+    """Return green when every robot is still, yellow when some only by a claim."""
+    if report.ok:
+        return "green"
+    only_claimed = not (report.not_stopped or report.refused or report.alarmed or report.silent)
+    return "yellow" if report.claimed and only_claimed else "bold red"
+
+
+def summary(report: StopReport) -> str:
+    """Return the result in one line of counts."""
+    parts = [f"{len(report.stopped)} stopped"]
+    for robots, outcome in (
+        (report.not_stopped, "DID NOT STOP"),
+        (report.refused, "did not act on it"),
+        (report.alarmed, "answered with a WRONG KEY"),
+        (report.claimed, "claimed"),
+        (report.silent, "silent"),
+    ):
+        parts += [f"{len(robots)} {outcome}"] if robots else []
+    late = f" It left {report.left_ms / 1000:.1f} s after the press." if report.left_ms > LATE_MS else ""
+    took = f", in {report.elapsed_ms:.0f} ms" if report.elapsed_ms else ""
+    which = f" Emergency stop {report.estop_id}." if report.estop_id else ""
+    return f"{', '.join(parts)}{took}.{late}{which}"
+
+
+def failure(outcome: StopOutcome) -> str:
+    """Return one line: the robots not known to stand still, and problems."""
+    report = outcome.report
+    groups = (
+        (report.not_stopped, "DID NOT STOP"),
+        (report.refused, "DID NOT ACT ON IT"),
+        (report.alarmed, "WRONG KEY"),
+        (report.claimed, "CLAIMED, NOT SIGNED"),
+        (report.silent, "NO ANSWER"),
+        ({*outcome.not_locked} & report.stopped.keys(), "STOPPED, NOT LOCKED"),
+    )
+    said = [f"{what}: {', '.join(sorted(robots))}." for robots, what in groups if robots]
+    if not report.link:
+        said.append("The stop was not sent: the link is down.")
+    return " ".join([*said, *map(problem_sentence, outcome.problems)]) or "No robot that can be stopped answered."
+
+
+def report_rows(report: StopReport, reasons: Mapping[str, str] | None = None) -> list[tuple[Any, ...]]:
+    """Return one row for each robot of a finished stop, the worst first."""
+    left_ms, why = report.left_ms, reasons or {}
+    worst = [_row(name, each, left_ms) for name, each in sorted({**report.not_stopped, **report.refused}.items())]
+    worst += [_silent_row(name, "WRONG KEY", report.alarms[name]) for name in report.alarmed]
+    worst += [_silent_row(name, "NO ANSWER", why.get(name, "")) for name in report.silent]
+    worst += [_row(name, each, left_ms) for name, each in sorted(report.claimed.items())]
+    slowest = sorted(report.stopped.items(), key=lambda each: -each[1].latency_ms)
+    return [*worst, *(_row(*each, left_ms) for each in slowest)]
+
+
+def outcome_rows(outcome: StopOutcome) -> list[tuple[Any, ...]]:
+    """Return the rows: robots, devices without a stop, and exempt robots."""
+    rows = report_rows(outcome.report, outcome.reasons)
+    rows += [(name, label("has no stop", "yellow"), "", "it cannot be stopped from here") for name in outcome.no_stop]
+    rows += [(row.name, label(_state(row), "yellow"), "", _marked(row)) for row in outcome.roster.exempt]
+    return rows
+
+
+def progress_rows(progress: Progress) -> list[tuple[Any, ...]]:
+    """Return one row for each robot of a stop in progress."""
+    answered = [_row(*each, progress.left_ms) for each in sorted(progress.answered.items())]
+    marks = {name: "WRONG KEY" if name in progress.alarms else "unconfirmed" for name in progress.unconfirmed}
+    return [*(_silent_row(name, mark) for name, mark in marks.items() if name not in progress.answered), *answered]
+
+
+def stop_table(rows: Mapping[str, Sequence[tuple[Any, ...]]], title: str = "", *, timed: bool = True) -> Table:
+    """Return the table of a stop; the network is named where several have rows.
+
+    Args:
+        rows: by network.
+        title: of the table.
+        timed: with the times of answers.
+    """
+    several = sum(map(bool, rows.values())) > 1
+    every = [(row[0], network, *row[1:]) for network, each in rows.items() for row in each]
+    # The mesh times no answer.
+    timed = timed and (not every or any(str(row[3]) for row in every))
+    columns = ("robot", "network", "answer", "ms", "what it said")
+    kept = [at for at, column in enumerate(columns) if (timed or column != "ms") and (several or column != "network")]
+    return table(title, [columns[at] for at in kept], [[row[at] for at in kept] for row in every])
+
+
+def say_outcome(screen: Screen, outcome: StopOutcome) -> None:
+    """Print counts, the roster's size, groups, and other networks."""
+    screen.say(summary(outcome.report), "bold red" if outcome.problems else style_of(outcome.report))
+    screen.say(outcome.sentence, "green" if outcome.ok else "bold red")
+    # The command ends with its problems.
+    problems = {plain(problem_sentence(each), 600) for each in outcome.problems}
+    for line in outcome_lines(outcome):
+        if line not in problems:
+            screen.say(line, "yellow")
+
+
+def outcome_lines(outcome: StopOutcome) -> list[str]:
+    """Return the notes of an outcome, printable."""
+    return [plain(each, 600) for each in stop_notes(outcome)]
+
+
+def _state(row: RosterRow) -> str:
+    return row.exemption.state if row.exemption is not None else "off"
+
+
+def _marked(row: RosterRow) -> str:
+    mark = row.exemption
+    said = f"by {mark.by}: {mark.reason or 'no reason'}" if mark is not None else ""
+    heard = f"; heard under its name {seconds(max(0.0, row.age_s))} ago" if row.age_s is not None else ""
+    return plain(f"{said}{heard}", 300)
+
+
+def _row(name: str, answer: Answer, left_ms: float) -> tuple[Any, ...]:
+    # Connecting takes this command some tenths of a second; the table shows the robots' time, the summary the rest.
+    took_ms = answer.latency_ms - (left_ms if left_ms <= LATE_MS else 0.0)
+    slow = "bold red" if took_ms > SLOW_MS else ""
+    still = "stopped, settling" if answer.facts.get("settling") is True else "stopped"
+    mark = label(still, slow or "green") if answer.stopped else label("DID NOT STOP", "bold red")
+    if answer.stopped is None:
+        mark = label("UNKNOWN", "bold red")
+    said = answer.why or _halted(answer.facts)
+    if answer.claimed and answer.stopped:
+        mark, said = label("claimed", "yellow"), f"not signed by {name}; {said}"
+    if answer.delay_s is not None and answer.delay_s * 1000 > LATE_MS:
+        said = f"{said}; it arrived {answer.delay_s:.1f} s after the press"
+    # The mesh times no answer.
+    return name, mark, label(f"{took_ms:.1f}" if answer.latency_ms else "", slow), said
+
+
+def _silent_row(name: str, mark: str, why: str = "") -> tuple[Any, ...]:
+    return name, label(mark, "bold red"), "", why
+
+
+def _halted(facts: Mapping[str, Any]) -> str:
+    halted = facts.get("halted")
+    names = ", ".join(str(each) for each in halted) if isinstance(halted, list | tuple) else ""
+    return f"halted {names}" if names else "locked; nothing was moving"
+
 
 LOCKED = "They are locked until they are resumed:"
 LOCKED_THERE = "They are locked until they are resumed, at the machine of each robot:"
@@ -53,12 +210,6 @@ KEPT_BY_NONE = (
 CLAIMED = "Claimed is not proven: no enrolled robot signed it. Enroll robots with strands-robots enroll."
 
 
-def register(app: typer.Typer) -> None:
-    """Add both commands to the application."""
-    command(app, "stop", network=True)(stop)
-    command(app, "estop", network=True)(estop)
-
-
 def stop(
     screen: Screen,
     network: Network,
@@ -67,7 +218,6 @@ def stop(
     everything: Annotated[bool, typer.Option("--all", help="Stop every device that answers.")] = False,
     one: Annotated[str, typer.Option("--robot", help="Stop this robot of DEVICE's world alone.")] = "",
     timeout: Timeout = 5.0,
-    on_mesh: OnMesh = False,
 ) -> None:
     """Stop one robot, or all, on every network.
 
@@ -78,7 +228,7 @@ def stop(
     if one and not name:
         unread = unread or "--robot names no robot of a DEVICE's world, so all of it is stopped"
     seconds, unfit = _seconds("--timeout", timeout, 60, 5.0)
-    with _stopping(screen, network, on_mesh=on_mesh) as networks:
+    with _stopping(screen, network) as networks:
         if device:
             answers = networks.stop(device, seconds, name)
             _say_ignored(screen, unread, unfit)
@@ -121,7 +271,6 @@ def estop(
         Path | None, typer.Option("--key", help="Sign it; then only enrolled robots can confirm it.")
     ] = None,
     passphrase_file: PassphraseFile = None,
-    on_mesh: OnMesh = False,
 ) -> None:
     """Stop every robot and lock it, on every network.
 
@@ -136,19 +285,17 @@ def estop(
     scope, unread = stop_scope(only, cell)
     seconds, unfit = _seconds("--deadline", deadline, 600, DEADLINE_S)
     source = device_id("--as", source)
-    with _stopping(screen, network, on_mesh=on_mesh, source=source) as networks:
+    with _stopping(screen, network, source) as networks:
         latest: dict[str, Progress] = {}
-        pressed = partial(
-            estop_all,
-            networks,
+        request = StopRequest(
             reason,
-            scope=scope,
+            scope,
             signing_key=None if key is None else signing_key(key, passphrase_file),
             # What is no device's id answers to nothing, so the report has it as silent.
             named=() if everything else tuple(devices or ()),
             deadline_s=seconds,
-            on_progress=latest.__setitem__,
         )
+        pressed = partial(estop_all, networks, request, on_progress=latest.__setitem__)
         verdict = _watched(screen, networks, pressed, latest) if screen.live else pressed()
         _say_ignored(screen, cut, unread, unfit)
         try:
@@ -157,19 +304,19 @@ def estop(
             # A robot that did not stop is locked all the same.
             locked = {each.network for each in verdict.networks if _locked(each)}
             there = [each for each in networks.stated if each.name in locked]
-            if there and all(each.on_this_machine for each in there):
-                user = meeting_user(there[0].meeting_port)
+            if there and all(each.place.local for each in there):
+                user = meeting_user(there[0].place.meeting_port)
                 screen.say(LOCKED)
                 screen.copyable(f"  sudo -u {user} {RESUME_HERE}" if user else f"  {RESUME_HERE}")
             elif there:
-                show_resume(screen, key, f"{' --mesh' if on_mesh else ''}{network.flags}")
+                show_resume(screen, key, network.flags)
 
 
 @contextmanager
-def _stopping(screen: Screen, network: Network, *, on_mesh: bool, source: str | None = None) -> Iterator[Networks]:
+def _stopping(screen: Screen, network: Network, source: str | None = None) -> Iterator[Networks]:
     """Make the networks of a stop, which joins them itself."""
     try:
-        networks = network.networks(on_mesh=on_mesh, source=TOOL if on_mesh else source)
+        networks = network.networks(source=TOOL if network.mesh else source)
     except CliError as failure:
         raise CliError(failure.reason, failure.code, stopped=None) from failure
     if not networks.stated:
@@ -218,15 +365,7 @@ def _watched(
     screen: Screen, networks: Networks, pressed: Callable[[], FleetVerdict], latest: Mapping[str, Progress]
 ) -> FleetVerdict:
     """Press on a thread that never waits for drawing; draw the answers."""
-    verdict: Future[FleetVerdict] = Future()
-
-    def press() -> None:
-        try:
-            verdict.set_result(pressed())
-        except BaseException as exc:  # noqa: BLE001 - raised again by the future
-            verdict.set_exception(exc)
-
-    threading.Thread(target=press, name="estop", daemon=True).start()
+    verdict = on_own_thread(pressed)
     from rich.live import Live  # noqa: PLC0415 - loaded when a screen is redrawn
 
     with Live(stop_table({}, "EMERGENCY STOP"), console=screen.out, auto_refresh=False) as live:
@@ -321,7 +460,7 @@ def _why(networks: Networks, each: NetworkVerdict, outcome: StopOutcome) -> str:
         said = f"The network does not carry this: {each.absent.rstrip('.')}. {said}"
     there = _usable(networks, each.network)
     if there is not None and not (outcome.size and outcome.report.link):
-        said = f"{said} {there.reach}"
+        said = f"{said} {there.place.text}"
     return said if each.network == networks.stated[0].name else f"On {each.network}: {said}"
 
 

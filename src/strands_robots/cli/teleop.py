@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.control import Control
 
-from strands_robots.cli.command import Seconds, command
+from strands_robots.cli.command import Seconds
 from strands_robots.cli.network import mesh_peer
 from strands_robots.cli.output import POLL_S, CliError, Exit, Screen, table, wait_until
 from strands_robots.cli.record import record_robot
@@ -76,13 +76,6 @@ class NoFollower:
         raise ValidationError(
             f"FOLLOWER must be a robot for this leader, which starts from the robot's joints, not {NO_FOLLOWER}."
         )
-
-
-def register(app: typer.Typer) -> None:
-    """Add the three commands to the application."""
-    command(app, "teleop")(teleop)
-    command(app, "calibrate")(calibrate)
-    command(app, "replay")(replay)
 
 
 def teleop(

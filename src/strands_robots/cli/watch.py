@@ -14,13 +14,13 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from strands_robots.cli.command import OnMesh, Seconds, command
+from strands_robots.cli.command import Seconds
 from strands_robots.cli.network import Network, answering
 from strands_robots.cli.output import LATE_S, CliError, Exit, Screen, label, plain
 from strands_robots.envelope import is_error
 from strands_robots.errors import NoSuchRobotError, RefusalError
 from strands_robots.fleet.adapter import Detail
-from strands_robots.fleet.joint_features import Range, joint_limits
+from strands_robots.fleet.reports import Range, joint_limits
 from strands_robots.utils import number
 
 if TYPE_CHECKING:
@@ -55,21 +55,15 @@ FULL_TURN: Range = (-math.pi, math.pi)
 """Range of the bar of a joint without limits, in radians."""
 
 
-def register(app: typer.Typer) -> None:
-    """Add ``watch`` to the application."""
-    command(app, "watch", network=True)(watch)
-
-
 def watch(
     screen: Screen,
     network: Network,
     device: Annotated[str, typer.Argument(help="The device's id.")],
     seconds: Seconds = None,
-    on_mesh: OnMesh = False,
 ) -> None:
     """Show a device's joints and task as they change, until Ctrl-C. With --json: one event a line."""
     longest = None if seconds is None else number("--for", seconds, above=0, high=7 * 24 * 3600)
-    with network.joined(on_mesh=on_mesh) as networks:
+    with network.joined() as networks:
         with answering(networks, device, ""):
             there = networks.of(device)
             limits = _limits(there, device)

@@ -10,7 +10,6 @@ import threading
 import time
 from collections.abc import Awaitable, Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
 from functools import partial
 from itertools import islice
 from typing import Any
@@ -18,15 +17,22 @@ from typing import Any
 from strands_robots.dashboard.fleet_model import FleetModel, key_of
 from strands_robots.envelope import Envelope, is_error
 from strands_robots.errors import RefusalError
-from strands_robots.fleet.adapter import DEVICE_CONNECT, EVERY, FoundRobot, NetworkAdapter, RobotEvent
-from strands_robots.fleet.all_stops import not_left
-from strands_robots.fleet.fleet_verdict import NetworkVerdict
-from strands_robots.fleet.joint_features import joint_limits, joint_units
-from strands_robots.fleet.lockout_report import Resumed
+from strands_robots.fleet.adapter import (
+    DEVICE_CONNECT,
+    EVERY,
+    FoundRobot,
+    NetworkAdapter,
+    Resumed,
+    RobotEvent,
+    StopSender,
+)
 from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.refusals import answered
-from strands_robots.fleet.robot_task import task_of
-from strands_robots.fleet.stop_button import StopButtons, StopSender
+from strands_robots.fleet.reports import joint_limits, joint_units, task_of
+from strands_robots.fleet.safety_console import StopButtons
+from strands_robots.fleet.standing import StandingController
+from strands_robots.fleet.stops import not_left
+from strands_robots.fleet.verdicts import NetworkVerdict
 from strands_robots.safety.identity import KeyFileError
 from strands_robots.serving.advertised import AdvertisedParameter, AdvertisedVerb, RobotDescription
 from strands_robots.serving.control_verbs import CONTROL_VERBS
@@ -403,20 +409,26 @@ class Feeds:
     """
 
     def __init__(self, model: FleetModel, networks: Networks, signing_key: Any = None) -> None:
-        self._model, self.networks, self._signing_key = model, networks, signing_key
+        self._model, self.networks = model, networks
         self.buttons = StopButtons(REASON)
         self.senders: Mapping[str, StopSender] = {}
         self._feeds: Mapping[str, FleetFeed] = {}
         self._failed: dict[str, str] = {}
-        self._lock, self._closing, self._stack = threading.Lock(), threading.Event(), ExitStack()
+        self._lock, self._closing = threading.Lock(), threading.Event()
+        self._standing = StandingController(
+            "dashboard",
+            networks,
+            signing_key,
+            lambda network: model.expected(page_name(network)),
+            lambda network, sender: self.add_button(page_name(network.name), sender),
+            waits=True,
+        )
         networks.on_joined(self._joined)
 
     def begin(self) -> None:
         """Begin to join the networks; returns at once."""
-        for each in self.networks.stated:
-            if each.has_stop_link:
-                # A press then leaves on it before it is joined.
-                self._try(each, self._stand)
+        # A press leaves where stops have a connection of their own before that network is joined.
+        self._standing.open()
         self.networks.begin()
 
     def add(self, feed: FleetFeed) -> None:
@@ -448,7 +460,7 @@ class Feeds:
     @property
     def unsent(self) -> dict[str, Callable[[], NetworkVerdict]]:
         """Networks without a stop button, each with the verdict of a stop, once called."""
-        absences = {**self.networks.absent, **self._failed}
+        absences = {**self.networks.absent, **self._failures}
         keys = self.networks.keys | {each.name: partial(getattr, each, "key") for each in self.networks.stated}
         without = {page_name(name): (name, key) for name, key in keys.items() if page_name(name) not in self.senders}
         return {
@@ -458,43 +470,39 @@ class Feeds:
     @property
     def missing(self) -> dict[str, str]:
         """Reasons why networks that someone asked for have no feed."""
-        absences = {**self.networks.missing, **self._failed}.items()
+        absences = {**self.networks.missing, **self._failures}.items()
         return {page: why for name, why in absences if (page := page_name(name)) not in self._feeds}
+
+    @property
+    def _failures(self) -> dict[str, str]:
+        return {**{name: _why(exc) for name, exc in self._standing.failures.items()}, **self._failed}
 
     def close(self) -> None:
         """Give up stops that wait for a link, and end the feeds."""
         self.buttons.close()
         with self._lock:
             self._closing.set()
-            stack = self._stack.pop_all()
         for each in self.joined:
             each.close()
-        stack.close()
+        self._standing.close()
 
     def _joined(self, network: NetworkAdapter) -> None:
         """Make the feed of a network, on the thread that has joined it."""
-        while not self._closing.is_set() and not self._try(network, self._show):
+        self._standing.stand(network)
+        while not self._closing.is_set() and not self._show(network):
             self._closing.wait(AGAIN_S)
 
-    def _try(self, network: NetworkAdapter, work: Callable[[NetworkAdapter], None]) -> bool:
+    def _show(self, network: NetworkAdapter) -> bool:
+        """Add the feed of a network; return whether that could be made."""
         try:
-            work(network)
+            self.add(FleetFeed(self._model, network))
         except Exception as exc:  # noqa: BLE001 - the other networks are shown all the same
-            self._failed[network.name] = plain_text(str(exc)) or type(exc).__name__
+            self._failed[network.name] = _why(exc)
             logger.warning("%s cannot be shown: %s", network.name, exc)
             return False
         self._failed.pop(network.name, None)
         return True
 
-    def _show(self, network: NetworkAdapter) -> None:
-        self._stand(network)
-        self.add(FleetFeed(self._model, network))
 
-    def _stand(self, network: NetworkAdapter) -> None:
-        """Give a network its stop button, where it has none."""
-        name = page_name(network.name)
-        with self._lock:
-            if name in self.senders or self._closing.is_set():
-                return
-            known = partial(self._model.expected, name)
-            self.add_button(name, self._stack.enter_context(network.standing(self._signing_key, known)))
+def _why(exc: Exception) -> str:
+    return plain_text(str(exc)) or type(exc).__name__

@@ -16,7 +16,7 @@ from typing import Any
 
 from strands_robots.dashboard.history import HISTORY_HZ, OVERLAP_S, WINDOW_S, History, RobotRow, plain_values
 from strands_robots.envelope import jsonable
-from strands_robots.fleet.lockout_report import LockoutReport
+from strands_robots.fleet.adapter import LockoutReport
 from strands_robots.policies.base import plain_numbers
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.utils import plain_text

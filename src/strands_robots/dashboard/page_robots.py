@@ -20,12 +20,11 @@ from strands_robots.dashboard.fleet_model import FleetModel, key_of
 from strands_robots.dashboard.history import RobotRow
 from strands_robots.envelope import Envelope, error
 from strands_robots.errors import AmbiguousRobotError
-from strands_robots.fleet.adapter import NetworkAdapter
-from strands_robots.fleet.all_stops import for_all
-from strands_robots.fleet.bearers import bears
-from strands_robots.fleet.fleet_verdict import NetworkVerdict
+from strands_robots.fleet.adapter import NetworkAdapter, bears
+from strands_robots.fleet.safety_console import StopButton
 from strands_robots.fleet.shared_id import DECIDED_S, SharedId, decided
-from strands_robots.fleet.stop_button import StopButton
+from strands_robots.fleet.stops import for_all
+from strands_robots.fleet.verdicts import NetworkVerdict
 from strands_robots.safety.answers import Answer, Progress, StopReport
 from strands_robots.safety.controller import UNCONFIRMED_S
 from strands_robots.safety.network_key import NetworkKey
@@ -261,7 +260,7 @@ class FleetStop:
 
     The networks' controllers send on connections and threads of their own. A press runs until every expected robot has
     answered, and a further one meanwhile is part of it. On a network that comes later it leaves as
-    :class:`~strands_robots.fleet.stop_button.StopButtons` says.
+    :class:`~strands_robots.fleet.safety_console.StopButtons` says.
     """
 
     def __init__(self, model: FleetModel, feeds: Feeds) -> None:

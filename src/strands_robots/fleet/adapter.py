@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import logging
+import secrets
+import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
@@ -9,16 +12,56 @@ from enum import Enum
 from typing import TYPE_CHECKING, Any, Protocol
 
 from strands_robots.envelope import Envelope
-from strands_robots.errors import UnreachableError
+from strands_robots.errors import RefusalError, UnreachableError
 from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope
 
 if TYPE_CHECKING:
-    from strands_robots.fleet.lockout_report import LockoutReport, Resumed
-    from strands_robots.fleet.stop_button import StopSender
-    from strands_robots.safety.answers import OnProgress
+    from strands_robots.safety.answers import OnProgress, Press, StopReport
+    from strands_robots.safety.lockout import Lockout
     from strands_robots.safety.network_key import NetworkKey
+    from strands_robots.safety.roster import OnReport, Sending
     from strands_robots.safety.stop_roster import StopOutcome
     from strands_robots.serving.advertised import AdvertisedVerb
+
+SOURCE = "strands-robots"
+"""Name of the command line and of ``connect()``, where none is given."""
+
+TOOL = "robot-mesh-tool"
+"""Name of the agent's tool and of commands on the mesh; an allowlist of a robot must include it."""
+
+
+TOO_MANY = "more stops than it can keep apart; resume --local at its own machine"
+
+
+@dataclass(frozen=True, slots=True)
+class LockoutReport:
+    """Lockouts and status of one robot; ``problem`` is empty if it reports them.
+
+    ``at`` is the time of the report in monotonic seconds.
+    """
+
+    name: str
+    lockouts: tuple[Lockout, ...] = ()
+    problem: str = ""
+    facts: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    round_trip_ms: float = 0.0
+    at: float = field(default_factory=time.monotonic)
+
+
+Resumed = tuple[bool, str]
+"""Whether a robot is free now, and what it said."""
+
+
+def before_resume(robot: LockoutReport) -> Resumed:
+    """Return the outcome of a resume where none can be sent to a robot."""
+    if robot.problem:
+        return False, robot.problem
+    if not robot.lockouts:
+        return True, "was not locked"
+    return False, TOO_MANY
+
+
+logger = logging.getLogger(__name__)
 
 DEVICE_CONNECT, MESH = "device_connect", "mesh"
 
@@ -64,6 +107,21 @@ class FoundRobot:
 
 
 @dataclass(frozen=True, slots=True)
+class Place:
+    """Place where the robots of a network are looked for.
+
+    Attributes:
+        text: one sentence on it.
+        local: all robots are known to be on this machine.
+        meeting_port: the loopback port where they meet; None where it is not known.
+    """
+
+    text: str
+    local: bool = False
+    meeting_port: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class ReceivedCall:
     """A call as its robot receives it, which is what an operator approves.
 
@@ -87,7 +145,7 @@ class RobotEvent:
     Attributes:
         joints: positions by name, not yet checked; None where it has none.
         part: the robot of a world that they belong to.
-        task: what the robot does, as :func:`~strands_robots.fleet.robot_task.task_of` returns it.
+        task: what the robot does, as :func:`~strands_robots.fleet.reports.task_of` returns it.
         load: of the robot's host, 1 for all of its cores.
         frequent: one of many of its kind, which report a state.
         alive: False where a broker may have kept it, so that it proves no life.
@@ -122,6 +180,76 @@ OnEvent = Callable[[RobotEvent], None]
 """Takes an event on a thread of the network: it returns at once and does not raise."""
 
 
+@dataclass(frozen=True, slots=True)
+class StopRequest:
+    """An emergency stop, as its caller asks for it.
+
+    Attributes:
+        reason: sent to the robots.
+        scope: the robots that it is for. Where none of them is there, every robot is stopped.
+        signing_key: an Ed25519 private key that signs it; then only enrolled robots can confirm it.
+        estop_id: 32 hex digits, the epoch of the lockout; a fresh one by default.
+        named: robots that must answer; a network that looks for robots then looks for no further ones.
+        deadline_s: seconds until silence is silence; by default, and where it has its own, the network's.
+        remembers: says whether a robot of ``scope`` is known; by default by the network's roster.
+        on_progress: called with the answers so far, where the network tells them; it returns at once.
+    """
+
+    reason: str = ""
+    scope: Scope = EVERY_ROBOT
+    signing_key: Any = None
+    estop_id: str = field(default_factory=lambda: secrets.token_hex(16))
+    named: Collection[str] = ()
+    deadline_s: float | None = None
+    remembers: Remembers | None = None
+    on_progress: OnProgress = lambda progress: None
+
+
+class StopSender(Protocol):
+    """Sender of emergency stops on one network, such as a ``SafetyController``."""
+
+    @property
+    def controller_id(self) -> str:
+        """The source that robots see."""
+
+    @property
+    def network(self) -> NetworkKey | None:
+        """The network of its stops, whose roster must answer; None where it is not known."""
+
+    @property
+    def link_up(self) -> bool:
+        """True while a stop would leave at once."""
+
+    @property
+    def sending(self) -> Sending:
+        """The way its stops leave."""
+
+    def press(self, estop_id: str) -> Press:
+        """Note the moment of a press, once."""
+
+    def check_in_every(self, interval_s: float) -> None:
+        """Check in with the robots that need a live controller."""
+
+    def stop(
+        self,
+        expected: Collection[str] = (),
+        reason: str = "",
+        *,
+        estop_id: str = "",
+        more: bool = False,
+        on_progress: OnProgress = lambda progress: None,
+        on_report: OnReport = lambda report: None,
+        scope: Scope = EVERY_ROBOT,
+    ) -> StopReport:
+        """Stop every robot, or those of ``scope``, and wait for answers."""
+
+    def expect(self, estop_id: str, names: Collection[str], *, more: bool = False) -> bool:
+        """Name further robots that must answer; False when the stop is over."""
+
+    def review(self, report: StopReport) -> StopReport:
+        """Return the report with what came since."""
+
+
 class NetworkAdapter(Protocol):
     """Robots of one network, as the calling side finds, calls and stops them.
 
@@ -141,6 +269,10 @@ class NetworkAdapter(Protocol):
     reads: Mapping[str, str]
     starts: str
 
+    @property
+    def place(self) -> Place:
+        """The place where robots are looked for."""
+
     def open(self) -> None:
         """Join the network.
 
@@ -148,14 +280,12 @@ class NetworkAdapter(Protocol):
             UnreachableError: it cannot be reached; :class:`NetworkBusyError` where it may be reached later.
         """
 
-    def find(self, timeout: float = FIND_S) -> list[FoundRobot]:
-        """Return the robots in reach."""
-
-    def listed(self, timeout: float | None = None) -> list[FoundRobot]:
-        """Return all that are in reach, peers without a robot included.
+    def find(self, timeout: float | None = FIND_S, *, peers: bool = False) -> list[FoundRobot]:
+        """Return the robots in reach.
 
         Args:
-            timeout: seconds in which they are looked for; by default as long as this network takes to know them.
+            timeout: seconds at most; None for as long as this network takes to know them.
+            peers: peers without a robot, too, for which all of the time is waited.
         """
 
     def known(self, robot: str) -> FoundRobot:
@@ -262,18 +392,6 @@ class NetworkAdapter(Protocol):
         """The name of this network, under which its robots are remembered."""
 
     @property
-    def reach(self) -> str:
-        """One sentence on the place where robots are looked for."""
-
-    @property
-    def on_this_machine(self) -> bool:
-        """True where all robots are known to be on this machine."""
-
-    @property
-    def meeting_port(self) -> int | None:
-        """The loopback port where robots meet; None where it is not known."""
-
-    @property
     def stale(self) -> str:
         """Reason why the last search may have missed robots, or ""."""
 
@@ -284,31 +402,10 @@ class NetworkAdapter(Protocol):
             The answers by id, and the outcome measured by the roster.
         """
 
-    def emergency_stop(
-        self,
-        reason: str,
-        *,
-        scope: Scope = EVERY_ROBOT,
-        signing_key: Any = None,
-        estop_id: str = "",
-        remembers: Remembers | None = None,
-        named: Collection[str] = (),
-        deadline_s: float | None = None,
-        on_progress: OnProgress = lambda progress: None,
-    ) -> StopOutcome:
-        """Stop and lock every robot, or those of ``scope``; return the outcome.
+    def emergency_stop(self, request: StopRequest) -> StopOutcome:
+        """Stop and lock the robots of a request; return the outcome.
 
         The outcome is recorded. A stop that did not leave is an outcome, too.
-
-        Args:
-            reason: sent to the robots.
-            scope: the robots that it is for. Where none of them is there, every robot is stopped.
-            signing_key: an Ed25519 key that signs it.
-            estop_id: 32 hex digits, the epoch of the lockout; a fresh one by default.
-            remembers: says whether a robot of ``scope`` is known; by default by this network's roster.
-            named: robots that must answer; a network that looks for robots then looks for no further ones.
-            deadline_s: seconds until silence is silence; by default, and where it has its own, the network's.
-            on_progress: called with the answers so far, where the network tells them; it returns at once.
         """
 
     def verdict(self, outcome: StopOutcome) -> Envelope:
@@ -374,3 +471,33 @@ class NetworkAdapter(Protocol):
 
     def close(self) -> None:
         """Leave the network; a second call does nothing."""
+
+
+MISSED_BEATS = 3
+"""Beats after which a robot that has left one network counts as gone from another one, too."""
+
+
+def bears(network: NetworkAdapter, robot: str) -> bool:
+    """Return whether a network has a robot now; False for a network that was left."""
+    try:
+        return network.bears(robot)
+    except RefusalError:
+        return False
+
+
+def reaches(network: NetworkAdapter, robot: str) -> bool:
+    """Return whether a robot is in reach, which may be asked."""
+    try:
+        return network.reaches(robot)
+    except RefusalError as exc:
+        logger.debug("%s: %s cannot be looked for: %s", network.name, robot, exc)
+        return False
+
+
+def silent(network: NetworkAdapter, robot: str) -> bool:
+    """Return whether a robot has missed its last beats on a network."""
+    try:
+        last = network.beats([robot]).get(robot)
+        return last is not None and time.monotonic() - last > MISSED_BEATS * network.beats_every(robot)
+    except RefusalError:
+        return True

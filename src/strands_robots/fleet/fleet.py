@@ -8,17 +8,13 @@ from pathlib import Path
 from typing import Any, Self
 
 from strands_robots.errors import NoSuchRobotError
-from strands_robots.fleet.adapter import FIND_S, NetworkAdapter
-from strands_robots.fleet.all_lockouts import ask_lockouts, by_robot, enroll_all, resume_all, unheard_in
-from strands_robots.fleet.all_stops import estop_all, stop_all
-from strands_robots.fleet.callers import SOURCE
-from strands_robots.fleet.enrollment import Enrolment
-from strands_robots.fleet.fleet_verdict import FleetVerdict
-from strands_robots.fleet.lockout_report import LockoutReport, Resumed
+from strands_robots.fleet.adapter import FIND_S, SOURCE, LockoutReport, NetworkAdapter, Resumed, StopRequest
+from strands_robots.fleet.lockouts import Enrolment, ask_lockouts, by_robot, enroll_all, resume_all, unheard_in
 from strands_robots.fleet.networks import Networks
-from strands_robots.fleet.profiles import profile_for
+from strands_robots.fleet.profiles import networks_of, profile_for
 from strands_robots.fleet.remote_robot import RemoteRobot
-from strands_robots.fleet.stated_networks import networks_of
+from strands_robots.fleet.stops import estop_all, stop_all
+from strands_robots.fleet.verdicts import FleetVerdict
 from strands_robots.serving.stop_arguments import stop_reason, stop_scope
 from strands_robots.tags import own_tags
 from strands_robots.utils import DURATION_MAX_S, ValidationError, device_id, near, number, shown
@@ -220,9 +216,7 @@ class Fleet:
         scope, unread = stop_scope(named or None, cell)
         signer, unfit = _signer(signing_key)
         notes = tuple(filter(None, (cut, unread, unfit)))
-        verdict = estop_all(
-            self._networks, why, scope=scope, signing_key=signer, known=tuple(self._robots), ignored=notes
-        )
+        verdict = estop_all(self._networks, StopRequest(why, scope, signer), known=tuple(self._robots), ignored=notes)
         # After the stop: a handler of the log may block.
         for note in notes:
             logger.warning("Ignored: %s.", note)

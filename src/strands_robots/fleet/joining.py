@@ -1,17 +1,82 @@
-"""Joining of one network, tried again where its caller stays."""
+"""Joining of networks, side by side, tried again where their caller stays."""
 
 from __future__ import annotations
 
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from contextlib import suppress
+from functools import partial
+from typing import TypeVar
 
 from strands_robots.errors import UnreachableError
 from strands_robots.fleet.adapter import NetworkAdapter, NetworkBusyError
 from strands_robots.utils import plain_text
 
 logger = logging.getLogger(__name__)
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+def on_own_thread(work: Callable[[], R], *, here: bool = False) -> Future[R]:
+    """Begin ``work`` on a thread of its own, or do it ``here``, as where none starts."""
+    done: Future[R] = Future()
+    # From now on it cannot be cancelled.
+    done.set_running_or_notify_cancel()
+
+    def run() -> None:
+        try:
+            done.set_result(work())
+        except BaseException as exc:  # noqa: BLE001 - it is raised where the result is taken
+            done.set_exception(exc)
+
+    if not here:
+        with suppress(RuntimeError):
+            threading.Thread(target=run, name="fleet-work", daemon=True).start()
+            return done
+    run()
+    return done
+
+
+def side_by_side(work: Callable[[T], R], items: Sequence[T]) -> list[R]:
+    """Return ``work`` of each item, in order; raise the first exception at the end.
+
+    A pool of threads takes no work once the interpreter ends; a stop must be possible even then, so what gets no
+    thread is done one after the other.
+    """
+    last = len(items) - 1
+    begun = [on_own_thread(partial(work, each), here=place == last) for place, each in enumerate(items)]
+    for each in begun:
+        each.exception()
+    return [each.result() for each in begun]
+
+
+def those(test: Callable[[T], bool], items: Sequence[T], *, every: bool) -> list[T]:
+    """Return items for which ``test`` is true: all, or those known at the first one.
+
+    One that raises is none.
+    """
+    found: dict[int, bool] = {}
+    change = threading.Condition()
+
+    def one(place: int) -> None:
+        there = False
+        try:
+            there = test(items[place])
+        finally:
+            with change:
+                found[place] = there
+                change.notify_all()
+
+    for place in range(len(items)):
+        on_own_thread(partial(one, place))
+    with change:
+        change.wait_for(lambda: len(found) == len(items) or (not every and any(found.values())))
+        return [each for place, each in enumerate(items) if found.get(place)]
+
 
 AGAIN_S, AGAIN_MAX_S = 1.0, 5.0
 """Seconds until a network that could not be joined is tried again: the first time, and at most."""

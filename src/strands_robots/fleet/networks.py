@@ -15,10 +15,19 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 from strands_robots.envelope import Envelope, error
 from strands_robots.errors import NoSuchRobotError, RefusalError, UnreachableError
-from strands_robots.fleet.adapter import CLOSED, FIND_S, STOP_S, Detail, FoundRobot, NetworkAdapter, OnEvent
-from strands_robots.fleet.bearers import bears, reaches, silent
-from strands_robots.fleet.joining import Joining
-from strands_robots.fleet.side_by_side import on_own_thread, side_by_side, those
+from strands_robots.fleet.adapter import (
+    CLOSED,
+    FIND_S,
+    STOP_S,
+    Detail,
+    FoundRobot,
+    NetworkAdapter,
+    OnEvent,
+    bears,
+    reaches,
+    silent,
+)
+from strands_robots.fleet.joining import Joining, on_own_thread, side_by_side, those
 from strands_robots.serving.known_verbs import READS, RESUMES, STOPS
 from strands_robots.utils import near, plain_text
 
@@ -64,6 +73,7 @@ class Networks:
     Attributes:
         stated: as given.
         keys: as given.
+        unasked: as given.
         absent: networks that are not joined or do not answer, with the reason.
     """
 
@@ -77,7 +87,7 @@ class Networks:
         unasked: Collection[str] = (),
     ) -> None:
         self.stated = tuple(stated)
-        self._unasked = frozenset(unasked)
+        self.unasked = frozenset(unasked)
         self.absent: dict[str, str] = dict(absent or {})
         self.keys = dict(keys or {})
         self._stays = stays
@@ -200,11 +210,7 @@ class Networks:
     @property
     def missing(self) -> dict[str, str]:
         """The absent networks that someone asked for, with their reasons."""
-        return {name: why for name, why in self.absent.copy().items() if self.asks_for(name)}
-
-    def asks_for(self, network: str) -> bool:
-        """Return whether someone asked for a network, which then has to be there."""
-        return network not in self._unasked
+        return {name: why for name, why in self.absent.copy().items() if name not in self.unasked}
 
     @property
     def absences(self) -> str:
@@ -217,7 +223,7 @@ class Networks:
     @property
     def reach(self) -> str:
         """The places where robots are looked for, in words."""
-        return " ".join(each.reach for each in self.joined)
+        return " ".join(each.place.text for each in self.joined)
 
     @property
     def stale(self) -> str:
@@ -265,17 +271,19 @@ class Networks:
             raise UnreachableError(self.absences)
         return listed
 
-    def find(self, timeout: float = FIND_S) -> dict[str, tuple[FoundRobot, NetworkAdapter]]:
+    def find(
+        self, timeout: float | None = FIND_S, *, peers: bool = False
+    ) -> dict[str, tuple[FoundRobot, NetworkAdapter]]:
         """Look for robots; return each with the network that it is called on.
+
+        Args:
+            timeout: seconds at most, as of :meth:`NetworkAdapter.find`.
+            peers: peers without a robot, too.
 
         Raises:
             UnreachableError: no network answers.
         """
-        return _by_id(self.on_each(lambda each: each.find(timeout), "robots cannot be looked for"))
-
-    def listed(self, timeout: float | None = None) -> dict[str, tuple[FoundRobot, NetworkAdapter]]:
-        """Return all that are in reach, peers without a robot included; as :meth:`find`."""
-        return _by_id(self.on_each(lambda each: each.listed(timeout), "robots cannot be looked for"))
+        return _by_id(self.on_each(lambda each: each.find(timeout, peers=peers), "robots cannot be looked for"))
 
     def bearers(self, robot: str) -> list[NetworkAdapter]:
         """Return the networks on which a robot of this id is known; asks no one."""
@@ -318,10 +326,6 @@ class Networks:
         others = [each for each in self.bearers(robot) if each is not gone and not silent(each, robot)]
         return self._chosen(robot, verb, others, moves=moves) if others else None
 
-    def decides(self, robot: str) -> bool:
-        """Return whether a motion needs a decision which robot it is for; asks no one."""
-        return len(self.bearers(robot)) > 1 or bool(self.enrolled_on_absent(robot))
-
     def enrolled_on_absent(self, robot: str) -> dict[str, bytes]:
         """Return the keys of an id that are enrolled on absent networks, by network."""
         joined, keys = self.joined, dict[str, bytes]()
@@ -338,15 +342,6 @@ class Networks:
         known = self._shared_ids.get(robot)
         return known.decided if known is not None and known.decided in self.bearers(robot) else None
 
-    def session(self, robot: str) -> object:
-        """Return what differs once another robot may answer to this id; asks no one."""
-        return tuple((each.name, each.session(robot)) for each in self.bearers(robot))
-
-    def known(self, robot: str) -> FoundRobot:
-        """Return what is known of a robot; asks no one."""
-        bearers = self.bearers(robot)
-        return bearers[0].known(robot) if bearers else FoundRobot(robot)
-
     def announced(self) -> Collection[str]:
         """Return robots that have announced themselves; asks no one."""
         return {name: None for each in self.joined for name in each.announced()}
@@ -354,10 +349,6 @@ class Networks:
     def describe(self, robot: str, *, anew: bool = False) -> object:
         """Return the robot's functions as they came over the wire; raises as :meth:`of`."""
         return self.of(robot).describe(robot, anew=anew)
-
-    def verb(self, robot: str, name: str) -> AdvertisedVerb | None:
-        """Return a verb as its robot describes it; raises as :meth:`of`."""
-        return self.of(robot, name).verb(robot, name)
 
     def described(self, robot: str, verb: str) -> tuple[NetworkAdapter, AdvertisedVerb | None]:
         """Return the network that a call goes to, and the verb as its robot describes it.
@@ -431,10 +422,6 @@ class Networks:
                 raise
         return await call(other)
 
-    async def describe_async(self, robot: str, within: float) -> FoundRobot:
-        """Return a robot as it describes itself now; raises as :meth:`of`."""
-        return await (await self.of_async(robot)).describe_async(robot, within)
-
     async def of_async(self, robot: str, verb: str = "", *, moves: bool = False) -> NetworkAdapter:
         """Do as :meth:`of`, without blocking the event loop."""
         if (network := self._at_once(robot, moves=moves)) is not None:
@@ -479,8 +466,11 @@ class Networks:
 
     def halt(self, robot: str, robot_name: str = "") -> StopVerdict:
         """Stop every bearer of an id; return the verdict."""
-        from strands_robots.fleet.fleet_verdict import combined, verdict_of_answer  # noqa: PLC0415 - a call need not load it
-        from strands_robots.fleet.stop_answers import by_bearer  # noqa: PLC0415 - as above
+        from strands_robots.fleet.verdicts import (  # noqa: PLC0415 - a call need not load it
+            by_bearer,
+            combined,
+            verdict_of_answer,
+        )
 
         began, answers = time.monotonic(), self.stop(robot, robot_name=robot_name)
         name = f"{robot}/{robot_name}" if robot_name else robot
@@ -519,7 +509,11 @@ class Networks:
         said = {each: None if _absent(each, robot, answer) else answer for each, answer in answers.items()}
         known = await asyncio.wrap_future(on_own_thread(lambda: self._with_silent(robot, said)))
         unknown = {each.name: answer for each, answer in answers.items() if answer is not None}
-        return known or dict(list(unknown.items())[:1]) or {each.name: self._not_left(each) for each in self.stated}
+        return (
+            known
+            or dict(list(unknown.items())[:1])
+            or {each.name: _not_left(each, self.absent) for each in self.stated}
+        )
 
     def subscribe(self, robot: str, on_event: OnEvent, detail: Detail = Detail.EVENTS) -> Callable[[], None]:
         """Receive a robot's events on every network, also on those that are joined later.
@@ -589,12 +583,9 @@ class Networks:
                     return network.stop(robot, timeout, robot_name, insist=insist)
             except Exception as exc:  # noqa: BLE001 - a stop that fails is a verdict, whatever it raised
                 return _failed(exc)
-            return self._not_left(network) if insist and not self.joined else None
+            return _not_left(network, self.absent) if insist and not self.joined else None
 
         return dict(zip(networks, side_by_side(stopped, networks), strict=True))
-
-    def _not_left(self, network: NetworkAdapter) -> Envelope:
-        return error(self.absent.get(network.name) or CLOSED, stopped=None)
 
     def _with_silent(self, robot: str, answers: Mapping[NetworkAdapter, Envelope | None]) -> dict[str, Envelope]:
         """Return the answers by network, also for those that remember the robot.
@@ -608,7 +599,7 @@ class Networks:
         known = {each.name: said for each, said in answers.items() if said is not None}
         if not keys:
             return known
-        from strands_robots.fleet.stop_answers import remembered  # noqa: PLC0415 - loaded once the stop has left
+        from strands_robots.fleet.verdicts import remembered  # noqa: PLC0415 - loaded once the stop has left
 
         joined = {each.name for each in self.joined}
         whys = {name: "" if name in joined else self.absent.get(name) or "it is not joined" for name in keys}
@@ -628,17 +619,13 @@ class Networks:
         absent = self.enrolled_on_absent(robot)
         if len(bearers) == 1 and not absent:
             return bearers[0]
-        from strands_robots.fleet.shared_id import decided  # noqa: PLC0415 - few ids are on two networks
-
-        return decided(self._shared_id(robot), robot, verb, bearers, absent)
-
-    def _shared_id(self, robot: str) -> SharedId:
-        from strands_robots.fleet.shared_id import SharedId  # noqa: PLC0415 - as above
+        from strands_robots.fleet.shared_id import SharedId, decided  # noqa: PLC0415 - few ids are on two networks
 
         with self._change:
             if len(self._shared_ids) >= SHARED_IDS_MAX and robot not in self._shared_ids:
                 del self._shared_ids[next(iter(self._shared_ids))]
-            return self._shared_ids.setdefault(robot, SharedId())
+            shared_id = self._shared_ids.setdefault(robot, SharedId())
+        return decided(shared_id, robot, verb, bearers, absent)
 
 
 def _by_id(listed: Sequence[tuple[NetworkAdapter, list[FoundRobot]]]) -> dict[str, tuple[FoundRobot, NetworkAdapter]]:
@@ -661,10 +648,14 @@ def _meant(arguments: Mapping[str, Any]) -> tuple[str, str]:
 
 
 def _one_answer(robot: str, answers: Mapping[str, Envelope], unread: str) -> Envelope:
-    from strands_robots.fleet.stop_answers import answer_of_bearers  # noqa: PLC0415 - loaded once the stop has left
+    from strands_robots.fleet.verdicts import answer_of_bearers  # noqa: PLC0415 - loaded once the stop has left
     from strands_robots.serving.stop_arguments import noted  # noqa: PLC0415 - as above
 
     return noted(answer_of_bearers(robot, answers), unread)
+
+
+def _not_left(network: NetworkAdapter, absent: Mapping[str, str]) -> Envelope:
+    return error(absent.get(network.name) or CLOSED, stopped=None)
 
 
 def _graded(answer: Envelope | None) -> bool:

@@ -7,32 +7,166 @@ comes over the wire is data: it is bounded, and every text of it is marked as th
 from __future__ import annotations
 
 import base64
+import inspect
 import io
 import logging
+import re
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from keyword import iskeyword
 from typing import TYPE_CHECKING, Any, Self
 
 from strands_robots.envelope import Envelope, is_error
-from strands_robots.errors import NoAnswerError, NoSuchRobotError, RefusalError, RobotError, UnknownVerbError
+from strands_robots.errors import (
+    ControlError,
+    NoAnswerError,
+    NoSuchRobotError,
+    RefusalError,
+    RobotError,
+    UnknownVerbError,
+)
 from strands_robots.fleet.adapter import STOP_S, FoundRobot, NetworkAdapter
-from strands_robots.fleet.description import docstring, python_name, signature
-from strands_robots.fleet.event_feed import EventFeed
-from strands_robots.fleet.lease import HeldLease, SharedLease
 from strands_robots.fleet.networks import STILL, Networks
 from strands_robots.fleet.refusals import refusal_of
+from strands_robots.fleet.reports import EventFeed
 from strands_robots.safety.stopping import StopVerdict
-from strands_robots.serving.advertised import AdvertisedVerb, RobotDescription
+from strands_robots.serving.advertised import PYTHON_TYPES, AdvertisedParameter, AdvertisedVerb, RobotDescription
 from strands_robots.serving.known_verbs import READS, RESUMES, STOPS
 from strands_robots.serving.verbs import LEASE_ID
-from strands_robots.utils import DURATION_MAX_S, START_S, WAIT_S, near, number, optional_module, text
+from strands_robots.utils import DURATION_MAX_S, START_S, WAIT_S, near, number, optional_module, shown, text
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
 logger = logging.getLogger(__name__)
+
+MARK = "(as the robot describes it)"
+
+
+def python_name(name: str) -> str:
+    """Return a verb's name on the wire as Python spells it: ``moveTo``, ``move_to``."""
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", name).lower()
+
+
+def signature(verb: AdvertisedVerb) -> inspect.Signature:
+    """Return the signature of a verb as a method, required parameters first."""
+    named = [each for each in verb.parameters if not iskeyword(each.name)]
+    rows = [_parameter(each) for each in sorted(named, key=lambda each: not each.required)]
+    return inspect.Signature(rows, return_annotation=dict)
+
+
+def docstring(verb: AdvertisedVerb, note: str = "") -> str:
+    """Return the docstring of a verb as a method, marked as the robot's words."""
+    lines = [verb.purpose or verb.name]
+    if verb.parameters:
+        lines += ["", "Args:", *(f"    {each.name}: {_meaning(each)}" for each in verb.parameters)]
+    return "\n".join([*lines, "", *filter(None, [note]), MARK])
+
+
+def _parameter(parameter: AdvertisedParameter) -> inspect.Parameter:
+    empty = inspect.Parameter.empty
+    return inspect.Parameter(
+        parameter.name,
+        inspect.Parameter.POSITIONAL_OR_KEYWORD,
+        default=empty if parameter.required else parameter.schema.get("default"),
+        annotation=PYTHON_TYPES.get(parameter.type, empty),
+    )
+
+
+def _meaning(parameter: AdvertisedParameter) -> str:
+    """Return the line of one parameter: meaning, unit, domain."""
+    unit = f"in {parameter.unit}" if parameter.unit else ""
+    choices = f"one of {', '.join(map(shown, parameter.choices))}" if parameter.choices else ""
+    said = (" ".join(parameter.meaning.split()), unit, parameter.bounds, choices)
+    return "; ".join(filter(None, said)) or "(not described)"
+
+
+RENEWALS = 3
+"""Renewals in the time of a lease."""
+
+RENEWED_S = 5.0
+"""Seconds at most in which a renewal or the release has to be answered."""
+
+Call = Callable[[str, Mapping[str, Any], float], Envelope]
+"""Calls a verb of the robot with arguments within a time; raises :class:`RefusalError`."""
+
+
+class HeldLease:
+    """A lease that is renewed until :meth:`release`.
+
+    Args:
+        robot: its id, for the log.
+        call: calls the robot.
+        lease_id: the secret that the robot gave.
+        ttl_s: seconds after which the robot ends the lease of a silent holder.
+    """
+
+    def __init__(self, robot: str, call: Call, lease_id: str, ttl_s: float) -> None:
+        self.lease_id = lease_id
+        self._robot, self._call, self._ttl_s = robot, call, ttl_s
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._renew, name=f"fleet-lease {robot}", daemon=True)
+        self._thread.start()
+
+    def release(self) -> None:
+        """Free the robot for others; a lease that is not released ends by itself."""
+        self._over.set()
+        try:
+            self._call("releaseControl", {"lease_id": self.lease_id}, min(RENEWED_S, self._ttl_s))
+        except RefusalError as exc:
+            logger.warning("%s: its control lease was not released and ends by itself: %s", self._robot, exc)
+        self._thread.join(RENEWED_S)
+
+    def _renew(self) -> None:
+        pause = self._ttl_s / RENEWALS
+        while not self._over.wait(pause):
+            try:
+                self._call("renewControl", {"lease_id": self.lease_id}, min(RENEWED_S, pause))
+            except NoAnswerError as exc:
+                logger.debug("%s: a renewal is tried again: %s", self._robot, exc)
+            except ControlError as exc:
+                # The next motion carries the lease all the same: the robot's refusal says who holds it.
+                logger.warning("%s: its control lease is lost: %s", self._robot, exc)
+                return
+            except RefusalError as exc:
+                logger.warning("%s: its control lease could not be renewed: %s", self._robot, exc)
+
+
+class SharedLease:
+    """Lease that all blocks of one robot share; the last block releases it."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._held: HeldLease | None = None
+        self._blocks = 0
+
+    @property
+    def lease_id(self) -> str:
+        """The secret of the lease that is held now; empty without one."""
+        held = self._held
+        return "" if held is None else held.lease_id
+
+    @contextmanager
+    def block(self, acquire: Callable[[], HeldLease]) -> Iterator[None]:
+        """Hold the lease for the block, acquired by ``acquire`` where none is held."""
+        with self._lock:
+            if self._held is None:
+                self._held = acquire()
+            self._blocks += 1
+        try:
+            yield
+        finally:
+            # A block that begins meanwhile waits for the release, so that it is not refused for our own lease.
+            with self._lock:
+                self._blocks -= 1
+                held = self._held
+                if held is not None and not self._blocks:
+                    self._held = None
+                    held.release()
+
 
 PIXELS_MAX = 4096 * 4096
 ROBOTS_MAX = 1000
@@ -384,7 +518,7 @@ class RemoteRobot:
 
     def _decide(self, verb: str) -> bool:
         """Use the network that motions go to; True where it is another one."""
-        if not self._networks.decides(self.address):
+        if len(self._networks.bearers(self.address)) < 2 and not self._networks.enrolled_on_absent(self.address):
             return False
         network = self._networks.of(self.address, verb, moves=True)
         if network is self._network:

@@ -6,13 +6,42 @@ import math
 import secrets
 import threading
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from types import MappingProxyType
 
 from strands_robots.errors import AmbiguousRobotError, NoAnswerError, NoSuchRobotError, RefusalError, UnreachableError
 from strands_robots.fleet.adapter import NetworkAdapter
-from strands_robots.fleet.side_by_side import side_by_side
+from strands_robots.fleet.joining import side_by_side
 from strands_robots.safety.statements import Purpose, own_key
+
+AGAIN_S = 2.0
+"""Seconds for which the keys count that were read last."""
+
+Keys = Mapping[str, bytes] | None
+"""Keys by robot; None where they cannot be used, so that nothing can be proven."""
+
+
+class CachedKeys:
+    """Enrolled keys of a network, read again when they are needed.
+
+    Args:
+        load: reads them.
+    """
+
+    def __init__(self, load: Callable[[], Keys]) -> None:
+        self._load = load
+        self._keys: Keys = None
+        self._read_at = float("-inf")
+
+    def read(self) -> Keys:
+        """Return the keys, at most :data:`AGAIN_S` old."""
+        now = time.monotonic()
+        if now - self._read_at >= AGAIN_S:
+            # The time last: another thread must not take the keys of before for these.
+            self._keys = self._load()
+            self._read_at = now
+        return self._keys
+
 
 ASK_S = 5.0
 """Seconds in which both robots have to sign."""

@@ -21,13 +21,12 @@ from strands_robots.arm_mixin import WAIT_S
 from strands_robots.contract import RUNNING
 from strands_robots.envelope import Envelope, error, is_error, success, text_of
 from strands_robots.errors import NoAnswerError, NoSuchRobotError, RefusalError, StrandsRobotsError, UnreachableError
-from strands_robots.fleet.adapter import FoundRobot, NetworkAdapter, ReceivedCall
-from strands_robots.fleet.all_stops import answer_of, estop_all, stop_all
-from strands_robots.fleet.fleet_verdict import FleetVerdict
+from strands_robots.fleet.adapter import FoundRobot, NetworkAdapter, ReceivedCall, StopRequest
 from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.refusals import LEASE_CODES, said
-from strands_robots.fleet.robot_task import runs
-from strands_robots.fleet.stop_answers import answer_of_bearers
+from strands_robots.fleet.reports import runs
+from strands_robots.fleet.stops import answer_of, estop_all, stop_all
+from strands_robots.fleet.verdicts import FleetVerdict, answer_of_bearers
 from strands_robots.mcp.results import refused
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.safety.stopping import Outcome, grade
@@ -249,7 +248,7 @@ class Caller:
         Raises:
             RefusalError: it does not.
         """
-        return await self.networks.describe_async(robot, ANSWER_S)
+        return await (await self.networks.of_async(robot)).describe_async(robot, ANSWER_S)
 
     async def received(self, robot: str, verb: str, params: Mapping[str, Any]) -> ReceivedCall:
         """Return a motion as its robot receives it; raises as :meth:`Networks.of`."""
@@ -346,7 +345,7 @@ class Caller:
 
     async def emergency_stop(self, reason: str, scope: Scope = EVERY_ROBOT) -> Envelope:
         """Stop and lock every robot, or those of ``scope``."""
-        return await self._urgently(lambda: estop_all(self.networks, reason, scope=scope))
+        return await self._urgently(lambda: estop_all(self.networks, StopRequest(reason, scope)))
 
     async def _urgently(self, stop: Callable[[], FleetVerdict]) -> Envelope:
         verdict = await asyncio.get_running_loop().run_in_executor(self._urgent, stop)

@@ -25,12 +25,12 @@ from starlette.types import Message, Receive, Scope, Send
 
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.fleet.networks import Networks
+from strands_robots.fleet.standing import StandingController
 from strands_robots.http_access import Guard, HttpRules, Token, TokenFile, bracketed
 from strands_robots.mcp.approval import Approvals
 from strands_robots.mcp.caller import Caller, ClientAccess
 from strands_robots.mcp.connections import CONNECTION, IDLE_S, BoundedServer, Capacity, Connections, Sessions, listener
 from strands_robots.mcp.server import GONE, MESSAGE_MAX, STOPS, THREADS, RobotResources, build
-from strands_robots.mcp.standing import StandingController
 from strands_robots.utils import is_loopback_host
 
 PATH = "/mcp"

@@ -35,11 +35,11 @@ from strands_robots import __version__
 from strands_robots.envelope import error
 from strands_robots.errors import RefusalError
 from strands_robots.fleet.networks import Networks
+from strands_robots.fleet.standing import StandingController
 from strands_robots.mcp._compat import lowlevel
 from strands_robots.mcp.approval import Approvals
 from strands_robots.mcp.caller import AccessOf, Caller, ClientAccess, PictureFiles
 from strands_robots.mcp.results import facts, quoted, refused, refused_arguments, result, unknown_arguments, with_note
-from strands_robots.mcp.standing import StandingController
 from strands_robots.mcp.tools import add_calls, add_control, add_motions, add_reads, add_stops
 from strands_robots.safety.sightings import flush_sightings
 from strands_robots.serving import robot_verbs  # noqa: F401 - so that the first stop of a client loads nothing

@@ -19,11 +19,11 @@ from mcp.types import InputRequiredResult, ToolAnnotations
 from pydantic import Field
 
 from strands_robots.envelope import Envelope, error, is_error, success
-from strands_robots.fleet.all_lockouts import ask_lockouts, by_robot
+from strands_robots.fleet.lockouts import ask_lockouts, by_robot
+from strands_robots.fleet.standing import StandingController
 from strands_robots.mcp.approval import Approvals, Wish
 from strands_robots.mcp.caller import AccessOf, acquire_arguments
 from strands_robots.mcp.results import INSTEAD, Result, described, facts, picture, quoted, result, row, wanted
-from strands_robots.mcp.standing import StandingController
 from strands_robots.serving.advertised import AdvertisedVerb
 from strands_robots.serving.stop_arguments import stop_reason, stop_scope
 from strands_robots.utils import shown

@@ -17,7 +17,6 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -245,7 +244,8 @@ class TaskEngine:
         given = self.gate.given
         moved = self._halting = dict.fromkeys([*self._moved, *self.moving()])
         self._moved = {}
-        halt = Halt(self.gate.revoke() if revoke else self.gate.generation)
+        halt = Halt()
+        halt.generation = self.gate.revoke() if revoke else self.gate.generation
         loops = self.void()
         try:
             yield halt
@@ -258,7 +258,6 @@ class TaskEngine:
             self._halting = {}
 
 
-@dataclass
 class Halt:
     """A halt under way.
 
@@ -267,8 +266,8 @@ class Halt:
         verdict: on the halt, once it is over.
     """
 
-    generation: int
-    verdict: StopVerdict | PendingVerdict = field(default_factory=StopVerdict)
+    generation = 0
+    verdict: StopVerdict | PendingVerdict = StopVerdict()
 
 
 def _unchanged(verdict: StopVerdict) -> StopVerdict:

@@ -20,14 +20,12 @@ from strands_robots import settings
 from strands_robots.agent_tool import fitted, tool
 from strands_robots.envelope import Envelope, error, is_error, success, text_of
 from strands_robots.errors import NoSuchRobotError, RefusalError, StrandsRobotsError, UnknownVerbError
-from strands_robots.fleet.adapter import STOP_S, FoundRobot
-from strands_robots.fleet.all_stops import answer_of, estop_all, stop_all
-from strands_robots.fleet.callers import TOOL
+from strands_robots.fleet.adapter import STOP_S, TOOL, FoundRobot, StopRequest
 from strands_robots.fleet.networks import Networks
-from strands_robots.fleet.profiles import profile_for
+from strands_robots.fleet.profiles import networks_for_stop, networks_of, profile_for
 from strands_robots.fleet.refusals import near_verbs, said
-from strands_robots.fleet.stated_networks import networks_for_stop, networks_of
-from strands_robots.fleet.stop_answers import by_bearer, combined_verdict
+from strands_robots.fleet.stops import answer_of, estop_all, stop_all
+from strands_robots.fleet.verdicts import by_bearer, combined_verdict
 from strands_robots.serving import known_verbs
 from strands_robots.serving.advertised import RobotDescription, fitting
 from strands_robots.serving.robot_verbs import ARM_VERBS, WORLD_VERBS
@@ -127,7 +125,7 @@ def _peers(there: Networks) -> Envelope:
 
     Verbs of its own come with their parameters, in the robot's words.
     """
-    found = there.listed()
+    found = there.find(None, peers=True)
     functions: dict[str, object] = {}
     for network in there.joined:
         # A robot of a network that is lost in between is listed without its verbs.
@@ -194,7 +192,7 @@ def _emergency_stop(instruction: object, arguments: object) -> dict[str, Any]:
     unknown = unknown_arguments(len(given.keys() - {"only", "cell"}))
     if arguments and not given:
         unread = "arguments is no object"
-    answer = _answer(lambda there: answer_of(estop_all(there, why, scope=scope), there), stops=True)
+    answer = _answer(lambda there: answer_of(estop_all(there, StopRequest(why, scope)), there), stops=True)
     return noted(answer, cut, unread, unknown)
 
 

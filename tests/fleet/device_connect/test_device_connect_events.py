@@ -8,7 +8,7 @@ import pytest
 
 from strands_robots.device_connect.client import DeviceEvent
 from strands_robots.fleet.adapter import RobotEvent
-from strands_robots.fleet.device_connect.events import robot_event
+from strands_robots.fleet.device_connect.network import robot_event
 
 JOINTS = {"pan": 0.5}
 

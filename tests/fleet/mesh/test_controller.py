@@ -12,8 +12,7 @@ import pytest
 from fixtures.mesh_robots import Arm
 from tests.mesh.peers import Fleet, fleet
 
-from strands_robots.fleet.mesh.controller import MeshController
-from strands_robots.fleet.mesh.standing import MeshReports
+from strands_robots.fleet.mesh.stops import MeshController, MeshReports
 from strands_robots.mesh import Mesh
 from strands_robots.safety.orders import new_epoch
 

@@ -15,8 +15,7 @@ from tests.mesh.peers import fleet
 
 from strands_robots.errors import ApprovalError, NoAnswerError, NoSuchRobotError, UnknownVerbError
 from strands_robots.fleet.adapter import CLOSED
-from strands_robots.fleet.mesh.network import MeshNetwork
-from strands_robots.fleet.mesh.requests import IN_FLIGHT
+from strands_robots.fleet.mesh.network import IN_FLIGHT, MeshNetwork
 from strands_robots.mesh import Mesh
 from strands_robots.safety.authorization import Grants, digest
 from strands_robots.state_files import state_dir

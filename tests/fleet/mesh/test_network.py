@@ -13,7 +13,7 @@ import pytest
 
 from strands_robots.envelope import error
 from strands_robots.errors import ArgumentsError, LockoutError, NoSuchRobotError, UnknownVerbError
-from strands_robots.fleet.mesh import descriptions, network
+from strands_robots.fleet.mesh import network, peers
 from strands_robots.fleet.mesh.network import MeshNetwork
 from strands_robots.mesh import session
 from strands_robots.mesh.transport import config
@@ -69,7 +69,7 @@ def quick_discovery(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_silent_peers_hold_up_a_list_for_a_bounded_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(descriptions, "LIST_S", 0.1)
+    monkeypatch.setattr(peers, "LIST_S", 0.1)
     names = [f"bar-{n}" for n in range(100)]
 
     def send(peer: str, command: dict[str, Any], seconds: float) -> dict[str, Any]:
@@ -160,7 +160,7 @@ def test_peer_announces_the_verbs_of_its_kind_and_is_not_asked_for_them() -> Non
 def test_peer_without_a_robot_is_listed_and_not_found() -> None:
     console = {"peer_id": "console", "type": "tool", "reachable": True, "age": 0.1}
     there = joined(FakeMesh([row("arm-1"), console], timeout))
-    assert [each.id for each in there.listed()] == ["arm-1", "console"]
+    assert [each.id for each in there.find(None, peers=True)] == ["arm-1", "console"]
     assert [each.id for each in there.find()] == ["arm-1"]
     assert there.describe_each(["console"]) == {}
 

@@ -9,9 +9,10 @@ from typing import Any
 import pytest
 
 from strands_robots.envelope import Envelope
-from strands_robots.fleet.mesh import discovery, network, stops
+from strands_robots.fleet.adapter import StopRequest
+from strands_robots.fleet.mesh import network, peers, stops
 from strands_robots.fleet.mesh.network import MeshNetwork
-from strands_robots.fleet.mesh.standing import mesh_network
+from strands_robots.fleet.mesh.stops import mesh_network
 from strands_robots.mesh.transport import config
 from strands_robots.mesh.transport.config import Posture
 from strands_robots.safety import stop_roster
@@ -84,7 +85,7 @@ def timed_mesh(monkeypatch: pytest.MonkeyPatch) -> Callable[..., TimedMesh]:
     def make(arrivals: dict[str, float], **options: Any) -> TimedMesh:
         made = TimedMesh(arrivals, **options)
         monkeypatch.setattr(stops, "time", made)
-        monkeypatch.setattr(discovery, "time", made)
+        monkeypatch.setattr(peers, "time", made)
         monkeypatch.setattr(network, "time", made)
         return made
 
@@ -94,7 +95,7 @@ def timed_mesh(monkeypatch: pytest.MonkeyPatch) -> Callable[..., TimedMesh]:
 def locked(mesh: TimedMesh) -> Envelope:
     """Send the emergency stop of a command that has just joined, and return its answer."""
     there = MeshNetwork.joined(mesh)  # type: ignore[arg-type]
-    return there.verdict(there.emergency_stop("a hand"))
+    return there.verdict(there.emergency_stop(StopRequest("a hand")))
 
 
 def test_loopback_estop_is_sent_at_once_and_again_when_a_robot_appears(timed_mesh: Callable[..., TimedMesh]) -> None:
@@ -144,7 +145,7 @@ def test_robot_that_connects_late_to_a_listener_is_stopped(
     mesh = timed_mesh({"arm-1": 0.4, "arm-2": 5.0, "arm-3": 8.5})
     assert locked(mesh)["robots"] == dict.fromkeys(("arm-1", "arm-2", "arm-3"), "stopped")
     for arrival in mesh.arrivals.values():
-        assert any(0 <= at - arrival <= stops.AGAIN_S + discovery.LOOK_S for at in mesh.stops), mesh.stops
+        assert any(0 <= at - arrival <= stops.AGAIN_S + peers.LOOK_S for at in mesh.stops), mesh.stops
     assert len(mesh.stops) == 4
 
 

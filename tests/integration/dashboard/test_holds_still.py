@@ -393,7 +393,7 @@ def test_joints_of_a_motion_are_asked_for_in_their_units(page: Any, served: Serv
 
 
 def test_takeovers_are_among_the_events(page: Any, served: ServedPage) -> None:
-    from strands_robots.fleet.lockout_report import LockoutReport  # noqa: PLC0415 - this test alone
+    from strands_robots.fleet.adapter import LockoutReport  # noqa: PLC0415 - this test alone
 
     served.robot("arm-1")
     for holder in ("", "agent-a", "agent-b", ""):

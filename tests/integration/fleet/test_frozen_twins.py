@@ -17,7 +17,7 @@ from fixtures.waiting import accepts, eventually, free_port
 
 from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
 from strands_robots.fleet.networks import Networks
-from strands_robots.fleet.stated_networks import networks_of
+from strands_robots.fleet.profiles import networks_of
 from strands_robots.mesh.session import clear_peers
 
 DEVICE = """

@@ -12,16 +12,16 @@ from fixtures.waiting import eventually, free_port
 
 from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
 from strands_robots.fleet.networks import Networks
-from strands_robots.fleet.stated_networks import networks_of
+from strands_robots.fleet.profiles import networks_of
 
 LOADED = """
 import sys
-from strands_robots.fleet.stated_networks import networks_of
+from strands_robots.fleet.profiles import networks_of
 with networks_of(None, {"port": int(sys.argv[1])}, "desk", stays=True) as networks:
     networks.find(0.1)
     loaded = {each for each in sys.modules if each.startswith(("strands_robots.mesh", "strands_robots.fleet.mesh."))}
-    # These look for the hub, and load nothing of the mesh themselves.
-    print(*(loaded - {f"strands_robots.fleet.mesh.{each}" for each in ("local", "discovery")}))
+    # This looks for the hub, and loads nothing of the mesh itself.
+    print(*(loaded - {"strands_robots.fleet.mesh.config"}))
 """
 
 

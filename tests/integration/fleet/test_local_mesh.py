@@ -19,7 +19,8 @@ from strands_robots import connect
 from strands_robots.device_connect import init_device_connect_sync, loopback_config, stop_device_connect
 from strands_robots.errors import UnreachableError
 from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
-from strands_robots.fleet.mesh.local import BROADCAST, LocalMesh, no_hub, no_peers
+from strands_robots.fleet.mesh.config import BROADCAST, LocalMesh, no_hub, no_peers
+from strands_robots.fleet.mesh.network import MeshNetwork
 from strands_robots.mesh import topics
 from strands_robots.mesh.session import clear_peers
 
@@ -67,7 +68,7 @@ def test_topic_that_is_looked_for_is_the_one_that_peers_receive() -> None:
 def test_port_that_no_one_has_is_no_mesh(port: int) -> None:
     assert no_hub() == f"no mesh answers on 127.0.0.1:{port}"
     with pytest.raises(UnreachableError, match="no mesh answers"):
-        LocalMesh("console").open()
+        LocalMesh(lambda: MeshNetwork("console")).open()
 
 
 def test_device_connect_alone_at_the_port_is_no_mesh_and_loads_none_of_its_code(arm: ToyRobot) -> None:
@@ -102,7 +103,7 @@ def test_hub_that_hangs_is_given_up_in_a_second(peer: MeshPeer) -> None:
 
 
 def test_mesh_that_is_not_joined_has_a_name_and_no_robots(port: int) -> None:
-    mesh = LocalMesh("console")
+    mesh = LocalMesh(lambda: MeshNetwork("console"))
     assert (mesh.name, str(port) in mesh.key.text) == (MESH, True)
     with pytest.raises(UnreachableError, match="not joined"):
         mesh.find()

@@ -20,7 +20,7 @@ from strands_robots import connect, errors
 from strands_robots.device_connect import init_device_connect_sync, loopback_config, stop_device_connect
 from strands_robots.fleet import Fleet
 from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
-from strands_robots.fleet.enrollment import Enrolled
+from strands_robots.fleet.lockouts import Enrolled
 from strands_robots.mesh import init_mesh
 from strands_robots.mesh.session import clear_peers
 from strands_robots.safety.ed25519 import keygen, load_signing_key

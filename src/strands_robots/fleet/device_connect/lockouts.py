@@ -8,8 +8,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from strands_robots.envelope import Envelope, text_of
-from strands_robots.fleet.cached_keys import Keys
-from strands_robots.fleet.lockout_report import LockoutReport, Resumed, before_resume
+from strands_robots.fleet.adapter import LockoutReport, Resumed, before_resume
+from strands_robots.fleet.shared_id import Keys
 from strands_robots.safety.identity import KeyFileError
 from strands_robots.safety.lockout import OVERFLOW, Lockout
 from strands_robots.safety.orders import new_epoch
@@ -24,11 +24,6 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 KEYS_UNUSABLE = "the enrolled keys cannot be used"
-
-
-def lockable_robots(fleet: FleetClient, seconds: float = 2.0) -> list[str]:
-    """Return the devices on the network that can be locked and resumed."""
-    return [peer.id for peer in fleet.peers(seconds) if peer.lockable]
 
 
 def ask_robots(

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Self
 
 from strands_robots.envelope import Envelope, error
@@ -26,25 +27,54 @@ from strands_robots.fleet.adapter import (
     Detail,
     FoundRobot,
     OnEvent,
+    Place,
     ReceivedCall,
+    RobotEvent,
+    StopRequest,
 )
-from strands_robots.fleet.link_flags import described
-from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope
+from strands_robots.fleet.device_connect.config import described
+from strands_robots.fleet.reports import task_of
 from strands_robots.utils import ValidationError, device_id, plain_text
 
 if TYPE_CHECKING:
     from strands_robots.device_connect.backends import LinkConfig
-    from strands_robots.device_connect.client import FleetClient
+    from strands_robots.device_connect.client import DeviceEvent, FleetClient
     from strands_robots.device_connect.discovery import Peer
-    from strands_robots.fleet.cached_keys import CachedKeys
-    from strands_robots.fleet.lockout_report import LockoutReport, Resumed
-    from strands_robots.fleet.stop_button import StopSender
-    from strands_robots.safety.answers import OnProgress
+    from strands_robots.fleet.adapter import LockoutReport, Resumed, StopSender
+    from strands_robots.fleet.shared_id import CachedKeys
     from strands_robots.safety.network_key import NetworkKey
     from strands_robots.safety.stop_roster import StopOutcome
     from strands_robots.serving.advertised import AdvertisedVerb
 
 logger = logging.getLogger(__name__)
+
+STATE, OBSERVATION, STEP = "stateUpdate", "observationUpdate", "streamStep"
+FREQUENT = frozenset({STATE, OBSERVATION, STEP})
+JOINTS = {OBSERVATION: "joints", STEP: "observation"}
+"""Fields with the joints, by event."""
+
+NAME_MAX = 100
+
+
+def robot_event(event: DeviceEvent) -> RobotEvent:
+    """Return a device's event with what it says of its joints and its task."""
+    facts, part = event.payload, event.payload.get("robot_name")
+    joints = facts.get(JOINTS.get(event.name, ""))
+    return RobotEvent(
+        event.device,
+        _plain(event.name[: 2 * NAME_MAX]),
+        facts,
+        joints=joints if isinstance(joints, Mapping) else None,
+        part=part if isinstance(part, str) else "",
+        task=task_of(facts) if event.name == STATE else None,
+        frequent=event.name in FREQUENT,
+    )
+
+
+@lru_cache(64)
+def _plain(name: str) -> str:
+    return plain_text(name, NAME_MAX)
+
 
 UNKNOWN_METHOD, BAD_PARAMS = -32601, -32602
 """JSON-RPC's codes of an unknown function and of arguments that do not fit."""
@@ -108,16 +138,13 @@ class DeviceConnectNetwork:
             raise UnreachableError(plain_text(str(exc))) from exc
         self._client = client
 
-    def find(self, timeout: float = FIND_S) -> list[FoundRobot]:
-        """Return the devices of the tenant."""
+    def find(self, timeout: float | None = FIND_S, *, peers: bool = False) -> list[FoundRobot]:
+        """Return the devices of the tenant, each of which is one to list."""
+        del peers
         self._discoveries += 1
         with _carried():
-            self._peers = {peer.id: peer for peer in self._connected.peers(timeout)}
+            self._peers = {peer.id: peer for peer in self._connected.peers(FIND_S if timeout is None else timeout)}
         return [_found(peer) for peer in self._peers.values()]
-
-    def listed(self, timeout: float | None = None) -> list[FoundRobot]:
-        """Return the devices of the tenant: each of them is one to list."""
-        return self.find(FIND_S if timeout is None else timeout)
 
     def known(self, robot: str) -> FoundRobot:
         """Return what the device stated last."""
@@ -239,19 +266,9 @@ class DeviceConnectNetwork:
         return network_key(self._link)
 
     @property
-    def reach(self) -> str:
-        """The link in words."""
-        return described(self._link)
-
-    @property
-    def on_this_machine(self) -> bool:
-        """True for a link that does not leave this machine."""
-        return self._link.loopback_only
-
-    @property
-    def meeting_port(self) -> int | None:
-        """The loopback port where robots meet."""
-        return self._link.meet_port
+    def place(self) -> Place:
+        """The link in words, and what is known of it."""
+        return Place(described(self._link), self._link.loopback_only, self._link.meet_port)
 
     @property
     def stale(self) -> str:
@@ -266,18 +283,7 @@ class DeviceConnectNetwork:
         with _carried():
             return stop_found(self._connected, timeout)
 
-    def emergency_stop(
-        self,
-        reason: str,
-        *,
-        scope: Scope = EVERY_ROBOT,
-        signing_key: Any = None,
-        estop_id: str = "",
-        remembers: Remembers | None = None,
-        named: Collection[str] = (),
-        deadline_s: float | None = None,
-        on_progress: OnProgress = lambda progress: None,
-    ) -> StopOutcome:
+    def emergency_stop(self, request: StopRequest) -> StopOutcome:
         """Stop and lock the robots of the tenant, on a connection of its own.
 
         A device in reach that did not act on it gets a plain ``stop`` as well.
@@ -285,19 +291,7 @@ class DeviceConnectNetwork:
         from strands_robots.fleet.device_connect.stops import stopped_and_locked  # noqa: PLC0415 - a call need not load it
 
         with _carried():
-            return stopped_and_locked(
-                self._link,
-                self._source,
-                self._lent,
-                reason,
-                scope,
-                signing_key=signing_key,
-                estop_id=estop_id,
-                remembers=remembers,
-                named=named,
-                deadline_s=deadline_s,
-                on_progress=on_progress,
-            )
+            return stopped_and_locked(self._link, self._source, self._lent, request)
 
     def verdict(self, outcome: StopOutcome) -> Envelope:
         """Return the outcome as a safety controller words it."""
@@ -323,10 +317,8 @@ class DeviceConnectNetwork:
 
     def lockable(self, timeout: float = FIND_S) -> list[str]:
         """Return the devices that have a ``resume``."""
-        from strands_robots.fleet.device_connect.lockouts import lockable_robots  # noqa: PLC0415 - a call need not load it
-
         with _carried():
-            return lockable_robots(self._connected, timeout)
+            return [peer.id for peer in self._connected.peers(timeout) if peer.lockable]
 
     def lockouts(self, robots: Iterable[str], timeout: float, *, signed: bool = False) -> list[LockoutReport]:
         """Ask each device for its status."""
@@ -337,9 +329,9 @@ class DeviceConnectNetwork:
 
     async def lockout_async(self, robot: str, within: float) -> LockoutReport:
         """Ask the device for its status."""
-        from strands_robots.fleet.cached_keys import CachedKeys  # noqa: PLC0415 - a call need not load it
+        from strands_robots.fleet.adapter import LockoutReport  # noqa: PLC0415 - as above
         from strands_robots.fleet.device_connect.lockouts import ask_robot, usable_keys  # noqa: PLC0415 - as above
-        from strands_robots.fleet.lockout_report import LockoutReport  # noqa: PLC0415 - as above
+        from strands_robots.fleet.shared_id import CachedKeys  # noqa: PLC0415 - a call need not load it
 
         if self._keys is None:
             self._keys = CachedKeys(lambda: usable_keys(self._link))
@@ -362,7 +354,6 @@ class DeviceConnectNetwork:
     def subscribe(self, robot: str, on_event: OnEvent, detail: Detail = Detail.EVENTS) -> Callable[[], None]:
         """Receive the device's events, which are all that it sends."""
         del detail
-        from strands_robots.fleet.device_connect.events import robot_event  # noqa: PLC0415 - a call need not load it
 
         with _carried():
             subscription = self._connected.subscription(robot, lambda event: on_event(robot_event(event)))

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from strands_robots.envelope import Envelope
-from strands_robots.fleet.adapter import FIND_S, STOP_S
-from strands_robots.fleet.stop_answers import measured, with_plain_stops, with_reasons
-from strands_robots.safety.answers import OnProgress, Progress, StopReport
-from strands_robots.safety.orders import new_epoch
+from strands_robots.fleet.adapter import FIND_S, STOP_S, StopRequest
+from strands_robots.fleet.verdicts import measured, with_plain_stops, with_reasons
+from strands_robots.safety.answers import Progress, StopReport
 from strands_robots.safety.roster import Sending
-from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope
+from strands_robots.safety.scope import EVERY_ROBOT
 from strands_robots.safety.stop_roster import FoundDevices, RosterSearch, StopOutcome, StopRoster
 
 logger = logging.getLogger(__name__)
@@ -59,15 +58,7 @@ def stopped_and_locked(
     link: LinkConfig,
     source: str,
     connect: Connect,
-    reason: str,
-    scope: Scope = EVERY_ROBOT,
-    *,
-    signing_key: Any = None,
-    estop_id: str = "",
-    remembers: Remembers | None = None,
-    named: Collection[str] = (),
-    deadline_s: float | None = None,
-    on_progress: OnProgress = lambda progress: None,
+    request: StopRequest,
 ) -> StopOutcome:
     """Send an emergency stop at once, on a connection of its own; return the outcome.
 
@@ -78,28 +69,21 @@ def stopped_and_locked(
         link: the network.
         source: the name under which it is sent.
         connect: gives the client that looks for devices, and stops those.
-        reason: sent to the robots.
-        scope: the robots that it is for.
-        signing_key: signs it; then only enrolled robots can confirm it.
-        estop_id: 32 hex digits; a fresh one by default.
-        remembers: says whether a robot of ``scope`` is known; by default by this machine's roster.
-        named: robots that must answer besides the roster; then no further ones are looked for.
-        deadline_s: seconds from when the link is up in which robots answer; then a plain stop has as many.
-        on_progress: called with the answers so far.
+        request: the stop. Its deadline counts from when the link is up, and a plain stop then has as long.
     """
     from strands_robots.device_connect.safety_controller import safety_controller  # noqa: PLC0415 - the network is loaded when it is used
 
-    options: dict[str, Any] = {} if signing_key is None else {"signing_key": signing_key, "require_signed": True}
-    options |= {} if remembers is None else {"remembers": remembers}
+    key, named, deadline_s, estop_id = request.signing_key, request.named, request.deadline_s, request.estop_id
+    options: dict[str, Any] = {} if key is None else {"signing_key": key, "require_signed": True}
+    options |= {} if request.remembers is None else {"remembers": request.remembers}
     controller = safety_controller(source, link, **options)
     seconds = ESTOP_S if deadline_s is None else deadline_s
     look_s = FIND_S if deadline_s is None else min(FIND_S, deadline_s * SEARCH_SHARE)
     lookup = None if named else _Lookup(connect, look_s)
     try:
-        estop_id = estop_id or new_epoch()
         controller.press(estop_id)
         look_up = None if lookup is None else lookup.found.result
-        search = RosterSearch(controller, estop_id, network_key(link), look_up, scope, named=named)
+        search = RosterSearch(controller, estop_id, network_key(link), look_up, request.scope, named=named)
         if lookup is not None:
             lookup.start(search)
 
@@ -107,19 +91,19 @@ def stopped_and_locked(
             search.begin(progress)
             if lookup is not None:
                 lookup.stop_has_left()
-            on_progress(progress)
+            request.on_progress(progress)
 
         # Nothing can leave before the link is up; then the milliseconds are the robots' and not the handshake's.
         controller.wait_link(LINK_WAIT_S)
         report = controller.stop(
             named,
-            reason,
+            request.reason,
             deadline_s=seconds,
             estop_id=estop_id,
             more=True,
             on_progress=progressed,
             on_report=search.take,
-            scope=scope,
+            scope=request.scope,
         )
         sending = replace(controller.sending, left=report.link)
     finally:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from strands_robots.fleet.adapter import EVERY, Detail, OnEvent, RobotEvent
-from strands_robots.fleet.robot_task import task_of
+from strands_robots.fleet.reports import task_of
 from strands_robots.utils import plain_text
 
 if TYPE_CHECKING:

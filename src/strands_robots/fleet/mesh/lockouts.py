@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
-from strands_robots.fleet.cached_keys import Keys
-from strands_robots.fleet.lockout_report import TOO_MANY, LockoutReport, Resumed
+from strands_robots.fleet.adapter import TOO_MANY, LockoutReport, Resumed
+from strands_robots.fleet.shared_id import Keys
 from strands_robots.safety.lockout import OVERFLOW, Lockout
 from strands_robots.safety.orders import new_epoch
 from strands_robots.safety.resume import sign

@@ -6,20 +6,23 @@ stated endpoint or multicast.
 
 from __future__ import annotations
 
+import asyncio
 import json
 import math
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from itertools import count
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 from strands_robots.envelope import Envelope, error, is_error
 from strands_robots.errors import (
     ArgumentsError,
     NoAnswerError,
     NoSuchRobotError,
+    RefusalError,
     UnknownVerbError,
     UnreachableError,
 )
@@ -30,35 +33,43 @@ from strands_robots.fleet.adapter import (
     STOP_S,
     Detail,
     FoundRobot,
+    LockoutReport,
     NetworkBusyError,
     OnEvent,
+    Place,
     ReceivedCall,
+    Resumed,
+    StopRequest,
+    StopSender,
 )
-from strands_robots.fleet.lockout_report import LockoutReport, Resumed
-from strands_robots.fleet.mesh.controller import MeshController
-from strands_robots.fleet.mesh.descriptions import functions_of, functions_of_each, functions_of_kind
-from strands_robots.fleet.mesh.discovery import (
+from strands_robots.fleet.mesh.config import MeshSettings, no_hub
+from strands_robots.fleet.mesh.events import follow
+from strands_robots.fleet.mesh.lockouts import ask_peer, ask_peers, lockable_peers, resume_peers
+from strands_robots.fleet.mesh.peers import (
     CALLER,
     CONSOLE,
     LOOK_S,
     awaited,
     discover,
+    functions_of,
+    functions_of_each,
+    functions_of_kind,
     has_robot,
     in_reach,
     is_in_reach,
 )
-from strands_robots.fleet.mesh.events import follow
-from strands_robots.fleet.mesh.lockouts import ask_peers, lockable_peers, resume_peers
-from strands_robots.fleet.mesh.requests import PeerRequests
-from strands_robots.fleet.mesh.standing import mesh_network, stand_on_mesh
-from strands_robots.fleet.mesh.stops import lock_peers, stop_peer, stop_peers
-from strands_robots.fleet.mesh_settings import MeshSettings, no_hub
+from strands_robots.fleet.mesh.stops import (
+    MeshController,
+    lock_peers,
+    mesh_network,
+    stand_on_mesh,
+    stop_peer,
+    stop_peers,
+)
 from strands_robots.fleet.refusals import refusal_of, refusal_of_text, with_meaning
-from strands_robots.fleet.stop_answers import roster_verdict
-from strands_robots.fleet.stop_button import StopSender
-from strands_robots.safety.answers import OnProgress
+from strands_robots.fleet.shared_id import CachedKeys
+from strands_robots.fleet.verdicts import roster_verdict
 from strands_robots.safety.network_key import NetworkKey
-from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope
 from strands_robots.safety.statements import enrolled_peers, lockout_distrust
 from strands_robots.safety.stop_roster import StopOutcome
 from strands_robots.tags import read_tags
@@ -87,6 +98,85 @@ _ALIASES = {"getStatus": "status", "getState": "state", "getFeatures": "features
 """Reads of every robot by their names on Device Connect, which the mesh has always called otherwise."""
 
 
+IN_FLIGHT = 64
+"""Requests of one kind that wait for an answer at a time; threads are started as they are needed."""
+
+STOPS_IN_FLIGHT = 1024
+"""The same of stops: as many as a page has robots, so that the last one begins as soon as the first."""
+
+T = TypeVar("T")
+
+
+class PeerRequests:
+    """Calls, stops and questions of one peer; none waits for one of another kind."""
+
+    def __init__(self) -> None:
+        self._calls = ThreadPoolExecutor(IN_FLIGHT, "mesh call")
+        self._stops = ThreadPoolExecutor(STOPS_IN_FLIGHT, "mesh stop")
+        self._questions = ThreadPoolExecutor(IN_FLIGHT, "mesh question")
+        self._keys = CachedKeys(enrolled_peers)
+
+    async def call(self, work: Callable[[], Envelope]) -> Envelope:
+        """Return what ``work`` answers.
+
+        Raises:
+            RefusalError: as ``work``; no answer for whatever else it raises.
+        """
+
+        def refused() -> Envelope | RefusalError:
+            try:
+                return work()
+            except RefusalError as refusal:
+                return refusal
+
+        answer = await _done(self._calls, refused, NoAnswerError)
+        if isinstance(answer, RefusalError):
+            raise answer
+        return answer
+
+    async def stop(self, mesh: Mesh, robot: str, seconds: float, robot_name: str = "") -> Envelope:
+        """Stop a peer; *stopped* counts only where an enrolled robot has signed it."""
+        return await _done(
+            self._stops,
+            lambda: stop_peer(mesh, robot, seconds, robot_name),
+            lambda why: error(why, stopped=None),
+        )
+
+    async def lockout(self, mesh: Mesh, robot: str, seconds: float) -> LockoutReport:
+        """Ask a peer for its status."""
+        return await _done(
+            self._questions,
+            lambda: ask_peer(mesh, robot, seconds, self._keys.read()),
+            lambda why: LockoutReport(robot, problem=why),
+        )
+
+    def close(self) -> None:
+        """Begin no more requests."""
+        for pool in (self._calls, self._stops, self._questions):
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+async def _done(pool: ThreadPoolExecutor, work: Callable[[], T], failed: Callable[[str], T]) -> T:
+    """Return what ``work`` returns on a thread of the pool.
+
+    Where it does not, return what ``failed`` makes of the reason.
+    """
+    try:
+        begun = pool.submit(work)
+    except RuntimeError:
+        return failed(CLOSED)
+    try:
+        return await asyncio.wrap_future(begun)
+    except asyncio.CancelledError:
+        # Of the pool that is closed, not of the task that waits.
+        task = asyncio.current_task()
+        if task is not None and task.cancelling():
+            raise
+        return failed(CLOSED)
+    except Exception as exc:  # noqa: BLE001 - a request that fails is answered, whatever it raised
+        return failed(plain_text(str(exc)) or type(exc).__name__)
+
+
 class MeshNetwork:
     """The mesh that this process's settings name.
 
@@ -102,6 +192,8 @@ class MeshNetwork:
     announces_verbs = False
     reads: Mapping[str, str] = {"status": "status", "state": "state", "features": "features"}
     starts = "start"
+    # A hub may relay for other machines, and be another user's peer.
+    place = Place("They were looked for on the native mesh.")
 
     def __init__(self, source: str, stated: Mapping[str, str] | None = None, *, console: bool = False) -> None:
         self._source, self._console = source, console
@@ -127,42 +219,24 @@ class MeshNetwork:
         self._settings.take()
         self._key = mesh_network()
         try:
-            self._mesh = self._dialled()
+            self._mesh = _dialled(self._source, console=self._console)
         except BaseException:
             self._settings.give_back()
             raise
         self._joined, self._requests = time.monotonic(), PeerRequests()
 
-    def _dialled(self) -> Mesh:
-        from strands_robots.mesh import session  # noqa: PLC0415 - the network is loaded when it is used
-        from strands_robots.mesh.core import Mesh, Parts  # noqa: PLC0415 - as above
-        from strands_robots.mesh.transport import TransportError  # noqa: PLC0415 - as above
-        from strands_robots.mesh.transport.config import stated_endpoints  # noqa: PLC0415 - as above
-        from strands_robots.mesh.wire_identity import IdentityError, visitor_id  # noqa: PLC0415 - as above
-
-        try:
-            name, kind = (self._source, CONSOLE) if self._console else (visitor_id(self._source), CALLER)
-            mesh = Mesh(None, name, kind, parts=Parts(acquire=session.dial))
-            try:
-                mesh.start()
-            except BaseException:
-                mesh.close()
-                raise
-        except (TransportError, IdentityError, MissingExtraError, ValueError) as exc:
-            busy = isinstance(exc, TransportError) and not any(stated_endpoints()) and not no_hub()
-            raise (NetworkBusyError if busy else UnreachableError)(plain_text(str(exc))) from exc
-        return mesh
-
-    @property
-    def peer(self) -> Mesh:
-        """This caller as a peer, once it has joined."""
-        return self._joined_mesh
-
-    def find(self, timeout: float = FIND_S) -> list[FoundRobot]:
+    def find(self, timeout: float | None = FIND_S, *, peers: bool = False) -> list[FoundRobot]:
         """Return the robots in reach, once they had the time to announce themselves."""
-        discover(self._joined_mesh, since=self._joined, within=timeout)
+        if timeout is None:
+            discover(self.peer, since=self._fresh)
+        elif peers:
+            time.sleep(max(0.0, self._joined + timeout - time.monotonic()))
+        else:
+            discover(self.peer, since=self._joined, within=timeout)
+        if peers:
+            return [_found(row) for row in _judged(self.peer)]
         self._discoveries += 1
-        lockable, rows = {*lockable_peers(self._joined_mesh)}, {str(row["peer_id"]): row for row in self._judged()}
+        lockable, rows = {*lockable_peers(self.peer)}, {str(row["peer_id"]): row for row in _judged(self.peer)}
         return [
             replace(
                 _found(row),
@@ -173,25 +247,17 @@ class MeshNetwork:
             if has_robot(row)
         ]
 
-    def listed(self, timeout: float | None = None) -> list[FoundRobot]:
-        """Return every peer in reach; ``timeout`` is waited to its end."""
-        if timeout is None:
-            discover(self._joined_mesh, since=self._fresh)
-        else:
-            time.sleep(max(0.0, self._joined + timeout - time.monotonic()))
-        return [_found(row) for row in self._judged()]
-
     def known(self, robot: str) -> FoundRobot:
         """Return what the peer announced last."""
-        return _found(self._joined_mesh.get_peer(robot) or {"peer_id": robot})
+        return _found(self.peer.get_peer(robot) or {"peer_id": robot})
 
     def announced(self) -> Collection[str]:
         """Return the robots in reach."""
-        return [str(row["peer_id"]) for row in self._rows() if has_robot(row)]
+        return [str(row["peer_id"]) for row in self.peer.peers if row["reachable"] and has_robot(row)]
 
     def bears(self, robot: str) -> bool:
         """Return whether a robot of this id is in reach."""
-        mesh = self._joined_mesh
+        mesh = self.peer
         return is_in_reach(mesh, robot) and has_robot(mesh.get_peer(robot) or {})
 
     def reaches(self, robot: str) -> bool:
@@ -200,7 +266,7 @@ class MeshNetwork:
 
     def session(self, robot: str) -> object:
         """Return the session of the peer, and the number of discoveries."""
-        return self._joined_mesh.peer_wire_zid(robot), self._discoveries
+        return self.peer.peer_wire_zid(robot), self._discoveries
 
     def enrolled_key(self, robot: str) -> bytes | None:
         """Return the peer's enrolled key."""
@@ -208,22 +274,22 @@ class MeshNetwork:
 
     def announced_functions(self, robot: str) -> object:
         """Return the functions of the peer's kind."""
-        row = self._joined_mesh.get_peer(robot) or {}
+        row = self.peer.get_peer(robot) or {}
         return functions_of_kind(row, usual="world" if row.get("type") == "sim" else "robot")
 
     def describe(self, robot: str, *, anew: bool = False) -> object:
         """Return the robot's functions, of an older one those of its kind."""
         del anew  # the robot is always asked
-        if not (self._waited_for(robot) and self._linked()):
-            raise self._absent(robot, "describe")
-        functions = functions_of(self._joined_mesh, robot, DESCRIBE_S)
+        if not (self._waited_for(robot) and _linked()):
+            raise _absent(self.peer, robot, "describe")
+        functions = functions_of(self.peer, robot, DESCRIBE_S)
         return self.announced_functions(robot) if functions is None else functions
 
     def describe_each(self, robots: Iterable[str]) -> Mapping[str, object]:
         """Ask many peers at once; of a silent one return the functions of its kind."""
-        rows = self._joined_mesh.peers_by_id
+        rows = self.peer.peers_by_id
         stated = {name: rows[name] for name in robots if "robot_kind" in rows.get(name, ())}
-        functions = functions_of_each(self._joined_mesh, stated)
+        functions = functions_of_each(self.peer, stated)
         return {name: functions[name] if name in functions else functions_of_kind(row) for name, row in stated.items()}
 
     def verb(self, robot: str, name: str) -> AdvertisedVerb | None:
@@ -236,18 +302,18 @@ class MeshNetwork:
         if _ALIASES.get(name, name) in PEER_VERBS:
             return None
         if not self._waited_for(robot):
-            raise self._absent(robot, name)
-        return find_verb(functions_of(self._joined_mesh, robot, VERB_S), name)
+            raise _absent(self.peer, robot, name)
+        return find_verb(functions_of(self.peer, robot, VERB_S), name)
 
     def call(self, robot: str, verb: str, arguments: Mapping[str, Any], timeout: float) -> Envelope:
         """Send the peer an action."""
         arguments = _carried(robot, verb, arguments)
-        mesh = self._joined_mesh
+        mesh = self.peer
         try:
             there = self._waited_for(robot)
-            if verb not in ALWAYS_SENT and not (there and self._linked()):
-                raise self._absent(robot, verb)
-            action = self._action(robot, verb)
+            if verb not in ALWAYS_SENT and not (there and _linked()):
+                raise _absent(self.peer, robot, verb)
+            action = _action(mesh, robot, verb)
         except UnreachableError:
             if self._mesh is mesh:
                 raise
@@ -260,7 +326,7 @@ class MeshNetwork:
             raise NoAnswerError(CLOSED, robot=robot, verb=verb)
         if reply.get("status") == "timeout":
             if not there:
-                raise self._absent(robot, verb)
+                raise _absent(self.peer, robot, verb)
             raise NoAnswerError(f"{robot} did not answer", robot=robot, verb=verb)
         refusal = reply.get("refusal")
         if reply.get("type") == "error" and isinstance(refusal, dict) and is_error(refusal):
@@ -268,19 +334,10 @@ class MeshNetwork:
         why = plain_text(reply.get("error") or reply.get("reason"))
         said = error(f"{robot}: {with_meaning(why) or 'refused'}")
         if reply.get("type") != "error" and why.startswith("validation: "):
-            self._require_verb(robot, verb, action)
+            _require_verb(mesh, robot, verb, action)
         if reply.get("type") == "error" or why.startswith("validation: "):
             raise refusal_of_text(robot, verb, why, said)
         raise UnreachableError(why or "the mesh did not carry the call", robot=robot, verb=verb, envelope=said)
-
-    def _require_verb(self, robot: str, verb: str, action: str) -> None:
-        """Raise :class:`UnknownVerbError` where the robot lacks the verb."""
-        from strands_robots.serving.advertised import verb_names  # noqa: PLC0415 - loaded when it is used
-
-        names = verb_names(functions_of(self._joined_mesh, robot, VERB_S))
-        if names and action not in names:
-            text = f"{robot} has no verb {shown(verb)}.{near(verb, names)}"
-            raise UnknownVerbError(text, robot=robot, verb=verb, envelope=error(text))
 
     def stop(
         self, robot: str, timeout: float = STOP_S, robot_name: str = "", *, insist: bool = False
@@ -289,7 +346,7 @@ class MeshNetwork:
         from strands_robots.mesh.transport.config import DISCOVERY_S, discovery_timeout  # noqa: PLC0415 - loaded when it is used
 
         # It leaves at once, and again until the peers in reach are known: a hub may not have linked it yet.
-        mesh, longest = self._joined_mesh, discovery_timeout(DISCOVERY_S)
+        mesh, longest = self.peer, discovery_timeout(DISCOVERY_S)
         if not is_in_reach(mesh, robot):
             known_in = max(UNSEEN_S, self._joined + (longest if insist else min(longest, FIND_S)) - time.monotonic())
             answer = stop_peer(mesh, robot, known_in, robot_name)
@@ -304,10 +361,11 @@ class MeshNetwork:
         from strands_robots.mesh.security import validate_command  # noqa: PLC0415 - loaded when it is used
         from strands_robots.serving.verbs import LEASE_NAMES  # noqa: PLC0415 - as above
 
-        mesh, action = self._joined_mesh, self._action(robot, verb)
-        given = self._given_to(robot, action, arguments)
+        mesh = self.peer
+        action = _action(mesh, robot, verb)
+        given = _given_to(mesh, robot, action, arguments)
         try:
-            sent = given if self._owns(robot, action) else validate_command({**given, "action": action})
+            sent = given if _owns(mesh, robot, action) else validate_command({**given, "action": action})
         except ValidationError as exc:
             raise ArgumentsError(str(exc), robot=robot, verb=verb) from exc
         left_out = LEASE_NAMES | {"action"}
@@ -318,7 +376,9 @@ class MeshNetwork:
 
         A verb of the robot's own gets them all.
         """
-        return await self._requests.call(lambda: self.call(robot, verb, self._given_to(robot, verb, arguments), within))
+        return await self._requests.call(
+            lambda: self.call(robot, verb, _given_to(self._mesh, robot, verb, arguments), within)
+        )
 
     async def describe_async(self, robot: str, within: float) -> FoundRobot:
         """Return the peer as it describes itself, an older one by its kind."""
@@ -348,21 +408,6 @@ class MeshNetwork:
         return self._key
 
     @property
-    def reach(self) -> str:
-        """The mesh in words."""
-        return "They were looked for on the native mesh."
-
-    @property
-    def on_this_machine(self) -> bool:
-        """False: a hub may relay for other machines."""
-        return False
-
-    @property
-    def meeting_port(self) -> int | None:
-        """None: the hub may be another user's peer."""
-        return None
-
-    @property
     def stale(self) -> str:
         """Nothing: each peer announces itself."""
         return ""
@@ -370,32 +415,14 @@ class MeshNetwork:
     def stop_all(self, timeout: float = STOP_S) -> tuple[dict[str, Envelope], StopOutcome]:
         """Stop all peers in reach, and again while one has not confirmed it."""
         del timeout  # the mesh's own deadlines count
-        return stop_peers(self._joined_mesh, self._fresh)
+        return stop_peers(self.peer, self._fresh)
 
-    def emergency_stop(
-        self,
-        reason: str,
-        *,
-        scope: Scope = EVERY_ROBOT,
-        signing_key: Any = None,
-        estop_id: str = "",
-        remembers: Remembers | None = None,
-        named: Collection[str] = (),
-        deadline_s: float | None = None,
-        on_progress: OnProgress = lambda progress: None,
-    ) -> StopOutcome:
-        """Stop and lock the peers; the mesh tells no progress."""
-        del deadline_s, on_progress  # the mesh's own deadlines count
-        return lock_peers(
-            self._joined_mesh,
-            signing_key,
-            scope,
-            reason=reason,
-            estop_id=estop_id,
-            since=self._fresh,
-            remembers=remembers,
-            named=named,
-        )
+    def emergency_stop(self, request: StopRequest) -> StopOutcome:
+        """Stop and lock the peers.
+
+        The mesh tells no progress, and its own deadlines count.
+        """
+        return lock_peers(self.peer, request, self._fresh)
 
     def verdict(self, outcome: StopOutcome) -> Envelope:
         """Return the outcome with the stop's id and scope."""
@@ -405,28 +432,28 @@ class MeshNetwork:
     @contextmanager
     def standing(self, signing_key: Any, known: Callable[[], Collection[str]]) -> Iterator[StopSender]:
         """Make a controller that stops the peers under this peer's id."""
-        mesh = self._joined_mesh
+        mesh = self.peer
         with closing(stand_on_mesh(mesh, signing_key, known)):
             yield MeshController(mesh, signing_key)
 
     def beats(self, robots: Iterable[str]) -> Mapping[str, float | None]:
         """Return the times of the presence of those in reach."""
-        rows, now = self._joined_mesh.peers_by_id, time.monotonic()
+        rows, now = self.peer.peers_by_id, time.monotonic()
         living = {name: now - row["age"] for name, row in rows.items() if row["reachable"]}
         return {name: living.get(name) for name in robots}
 
     def lockable(self, timeout: float = FIND_S) -> list[str]:
         """Return the peers that have a robot, once those in reach are known."""
         del timeout  # which is the mesh's own
-        discover(self._joined_mesh, since=self._joined)
-        return lockable_peers(self._joined_mesh)
+        discover(self.peer, since=self._joined)
+        return lockable_peers(self.peer)
 
     def lockouts(self, robots: Iterable[str], timeout: float, *, signed: bool = False) -> list[LockoutReport]:
         """Ask each peer for its status; a robot of ours signs in any case."""
         del signed
         # The answer of a peer that was not seen yet is refused.
-        discover(self._joined_mesh, since=self._joined)
-        return ask_peers(self._joined_mesh, robots, timeout)
+        discover(self.peer, since=self._joined)
+        return ask_peers(self.peer, robots, timeout)
 
     async def lockout_async(self, robot: str, within: float) -> LockoutReport:
         """Ask the peer for its status."""
@@ -437,7 +464,7 @@ class MeshNetwork:
 
     def resume(self, reports: Sequence[LockoutReport], signer: Any, timeout: float) -> dict[str, Resumed]:
         """Send the resumes of these peers, which relay them."""
-        return resume_peers(self._joined_mesh, reports, signer, timeout)
+        return resume_peers(self.peer, reports, signer, timeout)
 
     def beats_every(self, robot: str) -> float:
         """Return twice the time between two heartbeats, as one may come late."""
@@ -448,7 +475,7 @@ class MeshNetwork:
 
     def subscribe(self, robot: str, on_event: OnEvent, detail: Detail = Detail.EVENTS) -> Callable[[], None]:
         """Receive a robot's policy steps and safety events, or what all say."""
-        return follow(self._joined_mesh, robot, on_event, next(self._subscriptions), detail)
+        return follow(self.peer, robot, on_event, next(self._subscriptions), detail)
 
     def close(self) -> None:
         """Leave the mesh."""
@@ -464,7 +491,8 @@ class MeshNetwork:
             self._settings.give_back()
 
     @property
-    def _joined_mesh(self) -> Mesh:
+    def peer(self) -> Mesh:
+        """This caller as a peer, once it has joined."""
         if self._mesh is None:
             raise UnreachableError("The mesh is not joined: use the fleet as a context manager")
         return self._mesh
@@ -479,63 +507,99 @@ class MeshNetwork:
 
         return None if self._given and time.monotonic() < self._joined + DISCOVERY_S else self._joined
 
-    def _rows(self) -> list[dict[str, Any]]:
-        """Return the peers in reach, with a robot or without one."""
-        return [row for row in self._joined_mesh.peers if row["reachable"]]
-
-    def _judged(self) -> list[dict[str, Any]]:
-        """Return the peers in reach, each with why its lockout is not believed."""
-        rows, keys = self._rows(), enrolled_peers()
-        for row in rows:
-            row["tags"] = list(read_tags(row.get("tags")))
-            if "locked" in row and (why := lockout_distrust(row["peer_id"], row, row.get("epochs") or [], keys)):
-                row["distrusted"] = why
-        return rows
-
-    def _action(self, robot: str, verb: str) -> str:
-        return verb if self._owns(robot, verb) else _ALIASES.get(verb, verb)
-
-    def _owns(self, robot: str, verb: str) -> bool:
-        own = (self._joined_mesh.get_peer(robot) or {}).get("own_verbs")
-        return isinstance(own, list) and verb in own
-
-    def _given_to(self, robot: str, verb: str, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Return the arguments that an action of ours is sent with."""
-        from strands_robots.serving.known_verbs import STOPS  # noqa: PLC0415 - loaded when it is used
-        from strands_robots.serving.peer_verbs import PEER_VERBS  # noqa: PLC0415 - as above
-
-        mesh = self._mesh
-        if mesh is None or self._owns(robot, verb):
-            return arguments
-        given = {name: value for name, value in arguments.items() if value not in ("", None)}
-        known, names = PEER_VERBS.get(verb), (mesh.get_peer(robot) or {}).get("sim_robots")
-        # Where none is named the first robot of a world is meant; a stop then means all of them.
-        if known is not None and "robot_name" in known.by_name and verb not in STOPS and isinstance(names, list):
-            given = {"robot_name": next(iter(names), ""), **given}
-        return given
-
     def _waited_for(self, robot: str) -> bool:
         """Return whether the peer is in reach, once that can be known."""
         from strands_robots.mesh.transport.config import DISCOVERY_S, discovery_timeout  # noqa: PLC0415 - as above
 
         # A loaded machine gets twice the time.
-        return awaited(self._joined_mesh, robot, self._joined + max(discovery_timeout(DISCOVERY_S), 2 * DISCOVERY_S))
+        return awaited(self.peer, robot, self._joined + max(discovery_timeout(DISCOVERY_S), 2 * DISCOVERY_S))
 
-    @staticmethod
-    def _linked() -> bool:
-        """Return whether the mesh has a hub, once another peer had time to become it."""
-        from strands_robots.mesh import session  # noqa: PLC0415 - loaded when it is used
 
-        until = time.monotonic() + HUB_S
-        while session.cut_off():
-            if time.monotonic() >= until:
-                return False
-            time.sleep(LOOK_S)
-        return True
+def _dialled(source: str, *, console: bool) -> Mesh:
+    """Join the mesh as a peer without a robot.
 
-    def _absent(self, robot: str, verb: str) -> NoSuchRobotError:
-        remedy = near(robot, {*in_reach(self._joined_mesh)} - {robot}).strip()
-        return NoSuchRobotError(f"No peer {robot!r} is on the mesh", robot=robot, verb=verb, remedy=remedy)
+    Raises:
+        UnreachableError: there is none.
+    """
+    from strands_robots.mesh import session  # noqa: PLC0415 - the network is loaded when it is used
+    from strands_robots.mesh.core import Mesh, Parts  # noqa: PLC0415 - as above
+    from strands_robots.mesh.transport import TransportError  # noqa: PLC0415 - as above
+    from strands_robots.mesh.transport.config import stated_endpoints  # noqa: PLC0415 - as above
+    from strands_robots.mesh.wire_identity import IdentityError, visitor_id  # noqa: PLC0415 - as above
+
+    try:
+        name, kind = (source, CONSOLE) if console else (visitor_id(source), CALLER)
+        mesh = Mesh(None, name, kind, parts=Parts(acquire=session.dial))
+        try:
+            mesh.start()
+        except BaseException:
+            mesh.close()
+            raise
+    except (TransportError, IdentityError, MissingExtraError, ValueError) as exc:
+        busy = isinstance(exc, TransportError) and not any(stated_endpoints()) and not no_hub()
+        raise (NetworkBusyError if busy else UnreachableError)(plain_text(str(exc))) from exc
+    return mesh
+
+
+def _require_verb(mesh: Mesh, robot: str, verb: str, action: str) -> None:
+    """Raise :class:`UnknownVerbError` where the robot lacks the verb."""
+    from strands_robots.serving.advertised import verb_names  # noqa: PLC0415 - loaded when it is used
+
+    names = verb_names(functions_of(mesh, robot, VERB_S))
+    if names and action not in names:
+        text = f"{robot} has no verb {shown(verb)}.{near(verb, names)}"
+        raise UnknownVerbError(text, robot=robot, verb=verb, envelope=error(text))
+
+
+def _judged(mesh: Mesh) -> list[dict[str, Any]]:
+    """Return the peers in reach, each with why its lockout is not believed."""
+    rows, keys = [row for row in mesh.peers if row["reachable"]], enrolled_peers()
+    for row in rows:
+        row["tags"] = list(read_tags(row.get("tags")))
+        if "locked" in row and (why := lockout_distrust(row["peer_id"], row, row.get("epochs") or [], keys)):
+            row["distrusted"] = why
+    return rows
+
+
+def _action(mesh: Mesh, robot: str, verb: str) -> str:
+    return verb if _owns(mesh, robot, verb) else _ALIASES.get(verb, verb)
+
+
+def _owns(mesh: Mesh, robot: str, verb: str) -> bool:
+    own = (mesh.get_peer(robot) or {}).get("own_verbs")
+    return isinstance(own, list) and verb in own
+
+
+def _given_to(mesh: Mesh | None, robot: str, verb: str, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the arguments that an action of ours is sent with."""
+    from strands_robots.serving.known_verbs import STOPS  # noqa: PLC0415 - loaded when it is used
+    from strands_robots.serving.peer_verbs import PEER_VERBS  # noqa: PLC0415 - as above
+
+    if mesh is None or _owns(mesh, robot, verb):
+        return arguments
+    given = {name: value for name, value in arguments.items() if value not in ("", None)}
+    known, names = PEER_VERBS.get(verb), (mesh.get_peer(robot) or {}).get("sim_robots")
+    # Where none is named the first robot of a world is meant; a stop then means all of them.
+    if known is not None and "robot_name" in known.by_name and verb not in STOPS and isinstance(names, list):
+        given = {"robot_name": next(iter(names), ""), **given}
+    return given
+
+
+def _linked() -> bool:
+    """Return whether the mesh has a hub, once another peer had time to become it."""
+    from strands_robots.mesh import session  # noqa: PLC0415 - loaded when it is used
+
+    until = time.monotonic() + HUB_S
+    while session.cut_off():
+        if time.monotonic() >= until:
+            return False
+        time.sleep(LOOK_S)
+    return True
+
+
+def _absent(mesh: Mesh, robot: str, verb: str) -> NoSuchRobotError:
+    remedy = near(robot, {*in_reach(mesh)} - {robot}).strip()
+    return NoSuchRobotError(f"No peer {robot!r} is on the mesh", robot=robot, verb=verb, remedy=remedy)
 
 
 def _carried(robot: str, verb: str, arguments: Mapping[str, Any]) -> Mapping[str, Any]:

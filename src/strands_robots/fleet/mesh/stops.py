@@ -1,26 +1,130 @@
-"""Stops of all robots on the mesh, measured by the roster."""
+"""Stops of all robots on the mesh, and its safety controllers."""
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import threading
 import time
 from collections.abc import Callable, Collection, Mapping
+from itertools import count
 from typing import TYPE_CHECKING, Any
 
+from strands_robots.bounded_json import json_object
 from strands_robots.envelope import Envelope, error, success
-from strands_robots.fleet.mesh.discovery import discover, must_answer, only_calls
-from strands_robots.fleet.mesh.standing import MeshReports, mesh_network
-from strands_robots.fleet.stop_answers import measured, unanswered
-from strands_robots.safety.orders import new_epoch
-from strands_robots.safety.roster import Sending
-from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope
-from strands_robots.safety.statements import ALARM, enrolled_peers, stop_distrust
+from strands_robots.fleet.adapter import StopRequest
+from strands_robots.fleet.mesh.lockouts import lockable_peers
+from strands_robots.fleet.mesh.peers import LOOK_S, discover, must_answer, only_calls
+from strands_robots.fleet.verdicts import measured, stop_outcome, unanswered
+from strands_robots.safety.answers import Answer, OnProgress, Press, Presses, Progress, StopReport
+from strands_robots.safety.controller import DEADLINE_S
+from strands_robots.safety.network_key import NetworkKey
+from strands_robots.safety.orders import PARSED_MAX_BYTES, new_epoch
+from strands_robots.safety.roster import OnReport, Roster, RosterInbox, RosterRow, Sending
+from strands_robots.safety.scope import EVERY_ROBOT, Scope
+from strands_robots.safety.standing_roster import StandingRoster, controllers_identity
+from strands_robots.safety.statements import ALARM, enrolled_peers, lockout_distrust, stop_distrust
+from strands_robots.safety.stop_link import ESTOP
 from strands_robots.safety.stop_roster import READ_WITHIN_S, StopOutcome, StopRoster, robots_known_at
 from strands_robots.safety.stopping import explain, grade
 from strands_robots.utils import plain_text
 
 if TYPE_CHECKING:
     from strands_robots.mesh import Mesh
+    from strands_robots.mesh.transport import Sample
+
+REPORTS, STOPS = "missed rosters", "stops of others"
+"""Names of the subscriptions."""
+
+_subscriptions = count()
+
+
+def mesh_network() -> NetworkKey:
+    """Return the key of the mesh that this process joins."""
+    from strands_robots.mesh.session import network  # noqa: PLC0415 - the network is loaded when it is used
+
+    return network()
+
+
+class MeshReports:
+    """Reports of standing controllers about the stops of one peer.
+
+    Args:
+        mesh: the peer.
+    """
+
+    def __init__(self, mesh: Mesh) -> None:
+        self._mesh, self.inbox = mesh, RosterInbox(_fields)
+        # Of two with one name the later would end the earlier one's.
+        self._name = f"{REPORTS} {next(_subscriptions)}"
+
+    def begin(self) -> None:
+        """Receive reports from now on."""
+        from strands_robots.mesh import topics  # noqa: PLC0415 - the network is loaded when it is used
+
+        self._mesh.listen(topics.missed_roster("*"), self._take, self._name)
+
+    def close(self) -> None:
+        """Receive none any more."""
+        self._mesh.unsubscribe(self._name)
+        self.inbox.end()
+
+    def _take(self, sample: Sample) -> None:
+        self.inbox.put(sample.key.split("/")[1], sample.payload)
+
+
+def stand_on_mesh(mesh: Mesh, signing_key: Any, also: Callable[[], Collection[str]] = tuple) -> StandingRoster:
+    """Have a peer without a robot report whom it misses after a stop of another one.
+
+    Args:
+        mesh: the peer.
+        signing_key: of its e-stops, or None.
+        also: returns names that it shows besides its roster.
+    """
+    from strands_robots.mesh import topics  # noqa: PLC0415 - the network is loaded when it is used
+    from strands_robots.mesh.transport import TransportError  # noqa: PLC0415 - as above
+    from strands_robots.mesh.wire import WireError  # noqa: PLC0415 - as above
+
+    where = mesh_network()
+
+    def publish(fields: Mapping[str, Any]) -> None:
+        with contextlib.suppress(TransportError, WireError):  # a link that is down carries no report
+            mesh.publish(topics.missed_roster(mesh.peer_id), dict(fields))
+
+    def unlocked(estop_id: str, rows: Mapping[str, RosterRow]) -> list[str]:
+        peers, keys = mesh.peers_by_id, enrolled_peers()
+        return [name for name in rows if not _locked(name, peers.get(name, {}), estop_id, keys)]
+
+    standing = StandingRoster(
+        mesh.peer_id,
+        publish,
+        roster=lambda: Roster.of(where),
+        keys=dict,
+        identity=functools.cache(lambda: controllers_identity(mesh.peer_id, signing_key)),
+        also=also,
+        read=_stop,
+        unanswered=unlocked,
+    )
+    mesh.listen(topics.estop(), lambda sample: standing.hear(ESTOP, str(sample.session), sample.payload), STOPS)
+    return standing
+
+
+def _fields(payload: bytes) -> Mapping[str, Any]:
+    return json_object(payload, PARSED_MAX_BYTES)
+
+
+def _stop(sender: str, payload: bytes) -> tuple[str, Mapping[str, Any]]:
+    body = json_object(payload, PARSED_MAX_BYTES)
+    return str(body.get("peer_id", ""))[:128], body
+
+
+def _locked(name: str, row: Mapping[str, Any], estop_id: str, keys: Mapping[str, bytes] | None) -> bool:
+    """Return True for a peer that announces this lockout."""
+    epochs = row.get("epochs")
+    if not isinstance(epochs, list) or estop_id not in epochs or row.get("reachable") is not True:
+        return False
+    return not lockout_distrust(name, row, epochs, keys)
+
 
 ESTOP_S = 1.5
 """Seconds in which peers answer a stop; it is repeated until then."""
@@ -46,35 +150,19 @@ def stop_peers(mesh: Mesh, since: float | None = None) -> tuple[dict[str, Envelo
     return answers, outcome
 
 
-def lock_peers(
-    mesh: Mesh,
-    signing_key: Any = None,
-    scope: Scope = EVERY_ROBOT,
-    *,
-    reason: str = "",
-    estop_id: str = "",
-    since: float | None = None,
-    remembers: Remembers | None = None,
-    named: Collection[str] = (),
-) -> StopOutcome:
+def lock_peers(mesh: Mesh, request: StopRequest, since: float | None = None) -> StopOutcome:
     """Send the mesh's emergency stop, again while a peer has not confirmed it.
 
     A peer that was seen and did not answer is named. Every repetition is the same stop.
 
     Args:
         mesh: the peer that sends it.
-        signing_key: signs it.
-        scope: the robots that it is for. Where none of them is there, every robot is stopped.
-        reason: sent to the peers.
-        estop_id: 32 hex digits; a fresh one by default.
+        request: the stop.
         since: as in :func:`stop_peers`.
-        remembers: says whether a robot of ``scope`` is known; by default by this machine's roster.
-        named: robots that must answer besides the roster.
     """
-    epoch = estop_id or new_epoch()
     reports = MeshReports(mesh)
-    roster = StopRoster(mesh_network(), named, scope)
-    reports.inbox.open(epoch, roster.take)
+    roster = StopRoster(mesh_network(), request.named, request.scope)
+    reports.inbox.open(request.estop_id, roster.take)
     listening: list[threading.Thread] = []
 
     def left(replies: list[dict[str, Any]]) -> None:
@@ -85,9 +173,11 @@ def lock_peers(
     def send() -> list[dict[str, Any]]:
         some: dict[str, Any] = {}
         if not roster.scope.everything:
-            known = remembers or robots_known_at(mesh_network)
+            known = request.remembers or robots_known_at(mesh_network)
             some = {"scope": roster.scope, "remembers": known, "on_widened": roster.widen}
-        return mesh.emergency_stop(signing_key, reason=reason, estop_id=epoch, on_answers=left, **some)
+        return mesh.emergency_stop(
+            request.signing_key, reason=request.reason, estop_id=request.estop_id, on_answers=left, **some
+        )
 
     sent = time.monotonic()
     try:
@@ -96,7 +186,7 @@ def lock_peers(
         time.sleep(max(0.0, sent + REPORTED_S - time.monotonic()))
     finally:
         reports.close()
-    outcome = measured(answers, roster, Sending(signed=signing_key is not None), epoch)
+    outcome = measured(answers, roster, Sending(signed=request.signing_key is not None), request.estop_id)
     outcome.record(mesh.peer_id)
     return outcome
 
@@ -197,3 +287,157 @@ def _stop_all(
 def _cells(mesh: Mesh, peer: str) -> frozenset[str]:
     cell = next((row.get("cell") for row in mesh.peers if row["peer_id"] == peer), None)
     return frozenset({cell} if isinstance(cell, str) and cell else ())
+
+
+class MeshController:
+    """A safety controller whose stops and check-ins travel on the mesh.
+
+    Args:
+        mesh: the peer that sends them, under its own id; it may have joined just now.
+        signing_key: Ed25519 private key, for fleets that act on signed stops only.
+    """
+
+    def __init__(self, mesh: Mesh, signing_key: Any = None) -> None:
+        from strands_robots.mesh.transport.config import DISCOVERY_S  # noqa: PLC0415 - the network is loaded when it is used
+
+        self._mesh = mesh
+        self._key = signing_key
+        self._presses = Presses()
+        self._keys = enrolled_peers()
+        self._named: dict[str, frozenset[str]] = {}
+        self.controller_id, self.network = mesh.peer_id, mesh_network()
+        self.sending = Sending(signed=signing_key is not None)
+        self._reports = MeshReports(mesh)
+        self._reports.begin()
+        self._known_at = time.monotonic() + DISCOVERY_S
+
+    @property
+    def link_up(self) -> bool:
+        """True while this peer is on the mesh, and linked to its hub."""
+        from strands_robots.mesh import session  # noqa: PLC0415 - the network is loaded when it is used
+
+        return self._mesh.alive and not session.cut_off()
+
+    def press(self, estop_id: str) -> Press:
+        """Note the moment of a press, from which its answers are counted."""
+        return self._presses.note(estop_id)
+
+    def check_in_every(self, interval_s: float) -> None:
+        """Check in with the robots that need a live controller."""
+        self._mesh.check_in_every(interval_s, self._key)
+
+    def stop(
+        self,
+        expected: Collection[str] = (),
+        reason: str = "",
+        *,
+        estop_id: str = "",
+        more: bool = False,
+        on_progress: OnProgress = lambda progress: None,
+        on_report: OnReport = lambda report: None,
+        scope: Scope = EVERY_ROBOT,
+    ) -> StopReport:
+        """Stop every peer of the mesh, or those of ``scope``, and wait at most 3 s.
+
+        Where no robot in the scope is there, every robot is stopped.
+        """
+        epoch = estop_id or new_epoch()
+        pressed = self.press(epoch)
+        self._named[epoch] = frozenset(expected) | scope.only
+        answers: dict[str, Answer] = {}
+        alarms: dict[str, str] = {}
+        widened: list[bool] = []
+
+        def note(replies: list[dict[str, Any]]) -> None:
+            for reply in replies:
+                name, why = str(reply["responder_id"]), stop_distrust(reply, self._keys)
+                if why.startswith(ALARM):
+                    alarms[name] = why
+                elif name not in answers or answers[name].stopped is not True or answers[name].claimed:
+                    answers[name] = _answer(name, reply, (time.monotonic() - pressed.at) * 1000, claimed=bool(why))
+            silent = tuple(sorted(self._named[epoch] - answers.keys()))
+            elapsed = (time.monotonic() - pressed.at) * 1000
+            on_progress(
+                Progress(
+                    epoch,
+                    dict(answers),
+                    silent,
+                    self.link_up,
+                    elapsed,
+                    alarms=dict(alarms),
+                    scope=scope,
+                    widened=bool(widened),
+                )
+            )
+
+        until = time.monotonic() + DEADLINE_S
+        self._reports.inbox.open(epoch, on_report)
+        # On a thread: a disk that hangs delays no sending.
+        reading = threading.Thread(target=self._load_keys, name="enrolled keys", daemon=True)
+        reading.start()
+
+        def send() -> list[dict[str, Any]]:
+            return self._mesh.emergency_stop(
+                self._key,
+                reason=reason,
+                estop_id=epoch,
+                on_answers=note,
+                scope=scope,
+                remembers=robots_known_at(mesh_network),
+                on_widened=lambda: widened.append(True),
+            )
+
+        replies = send()
+        if time.monotonic() < self._known_at:
+            # Peers that this one did not know yet have stopped, and were not waited for.
+            time.sleep(max(0.0, self._known_at - time.monotonic()))
+            replies = send()
+        up = self.link_up
+        # Without a hub nothing left; a stop that goes on is sent again in the moment it is back.
+        while not up and not self.link_up and time.monotonic() < until:
+            time.sleep(LOOK_S)
+        self._reports.inbox.close(epoch)
+        reading.join(READ_WITHIN_S)
+        # By the keys of now: a robot may have been enrolled since the last stop.
+        answers.clear()
+        note(replies)
+        expected = self._named.pop(epoch)
+        robots = {*expected, *lockable_peers(self._mesh)}
+        told = {name: each for name, each in answers.items() if name in robots}
+        return StopReport(
+            epoch,
+            {name: each for name, each in told.items() if each.stopped is True and not each.claimed},
+            {name: each for name, each in told.items() if each.stopped is not True},
+            {},
+            tuple(sorted(expected - told.keys() - alarms.keys())),
+            up,
+            (time.monotonic() - pressed.at) * 1000,
+            claimed={name: each for name, each in told.items() if each.stopped is True and each.claimed},
+            alarms=alarms,
+            scope=scope,
+            widened=bool(widened),
+        )
+
+    def expect(self, estop_id: str, names: Collection[str], *, more: bool = False) -> bool:
+        """Name further robots that must answer; the mesh asks those in reach by itself."""
+        named = self._named.get(estop_id)
+        if named is None:
+            return False
+        self._named[estop_id] = named | frozenset(names)
+        return True
+
+    def _load_keys(self) -> None:
+        self._keys = enrolled_peers()
+
+    def review(self, report: StopReport) -> StopReport:
+        """Return the report as it is: a peer answers a stop once."""
+        return report
+
+
+def _answer(name: str, reply: dict[str, Any], latency_ms: float, *, claimed: bool) -> Answer:
+    result = reply.get("result")
+    if reply.get("type") != "response" or not isinstance(result, dict):
+        return Answer(name, None, latency_ms, str(reply.get("error", "no answer")))
+    stopped, _ = stop_outcome(result)
+    why = "" if stopped else explain(result)
+    return Answer(name, stopped, latency_ms, why, result, required=claimed, enrolled=claimed)

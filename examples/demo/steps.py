@@ -16,16 +16,17 @@ from typing import Any
 
 from strands_robots import settings
 from strands_robots.audit import verify_audit_integrity
-from strands_robots.cli.demo.output import DemoScreen
-from strands_robots.cli.demo.processes import Agent, AgentEvent, EventStream, RobotProcess
 from strands_robots.cli.output import CliError, first_line, label, plain, table
 from strands_robots.cli.watch import joints_table
-from strands_robots.fleet.joint_features import joint_limits
+from strands_robots.fleet.reports import joint_limits
 from strands_robots.policies.base import plain_numbers
 from strands_robots.safety.controller import SafetyController
 from strands_robots.safety.ed25519 import keygen
 from strands_robots.safety.resume import sign
 from strands_robots.simulation import CUBE, PLATE
+
+from .output import DemoScreen
+from .processes import Agent, AgentEvent, EventStream, RobotProcess
 
 NEEDED = ("getObjects", "getPicture", "pick", "place", "setGripper", "wait", "stop", "getStatus", "getFeatures")
 CONTROLLER = "demo-safety"

@@ -12,16 +12,14 @@ from typing import Any
 
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.errors import UnreachableError
-from strands_robots.fleet.adapter import CLOSED, STOP_S, NetworkAdapter
-from strands_robots.fleet.fleet_verdict import FleetVerdict, NetworkVerdict
+from strands_robots.fleet.adapter import CLOSED, STOP_S, NetworkAdapter, StopRequest
+from strands_robots.fleet.joining import on_own_thread, side_by_side
 from strands_robots.fleet.networks import Networks
-from strands_robots.fleet.side_by_side import on_own_thread, side_by_side
-from strands_robots.fleet.stop_answers import not_reached, roster_verdict
+from strands_robots.fleet.verdicts import FleetVerdict, NetworkVerdict, not_reached, roster_verdict
 from strands_robots.safety.answers import Progress
 from strands_robots.safety.network_key import NetworkKey
-from strands_robots.safety.orders import new_epoch
 from strands_robots.safety.roster import RosterRow
-from strands_robots.safety.scope import EVERY_ROBOT, Scope
+from strands_robots.safety.scope import Scope
 from strands_robots.safety.sightings import Known
 from strands_robots.safety.stop_roster import StopOutcome, robots_known_at
 from strands_robots.safety.stopping import StopVerdict
@@ -55,35 +53,26 @@ def stop_all(networks: Networks, timeout: float = STOP_S, *, known: Sequence[str
 
 def estop_all(
     networks: Networks,
-    reason: str,
+    request: StopRequest,
     *,
-    scope: Scope = EVERY_ROBOT,
-    signing_key: Any = None,
-    estop_id: str = "",
     known: Sequence[str] = (),
     ignored: Sequence[str] = (),
-    named: Collection[str] = (),
-    deadline_s: float | None = None,
     on_progress: OnNetworkProgress = lambda network, progress: None,
 ) -> FleetVerdict:
-    """Stop and lock every robot of every network under one id.
+    """Stop and lock the robots of a request on every network under one id.
 
     It never raises for a verdict. Where emergency stops have a connection of their own it leaves at once, whether or
     not the network is joined.
 
     Args:
         networks: which need not be opened: what it needs of them is joined for it.
-        reason: sent to the robots.
-        scope: the robots that it is for. Where none of them is on any network, every robot is stopped.
-        signing_key: an Ed25519 private key that signs it.
-        estop_id: 32 hex digits, the epoch of the lockout; a fresh one by default.
+        request: the stop. Each network waits for its named robots.
         known: further robots that must answer.
         ignored: notes on arguments that could not be read, for the verdict.
-        named: robots that must answer, on whichever network; each waits for them, and looks for no further ones.
-        deadline_s: seconds until silence is silence, as :meth:`NetworkAdapter.emergency_stop` has it.
         on_progress: called on a thread of the stop; it returns at once.
     """
-    epoch, over, answered = estop_id or new_epoch(), threading.Event(), set[str]()
+    scope, named = request.scope, request.named
+    over, answered = threading.Event(), set[str]()
     keys: list[Callable[[], NetworkKey]] = [
         *(partial(getattr, each, "key") for each in networks.stated),
         *networks.keys.values(),
@@ -108,14 +97,7 @@ def estop_all(
 
     def stopped(network: NetworkAdapter) -> NetworkVerdict:
         outcome = network.emergency_stop(
-            reason,
-            scope=scope,
-            signing_key=signing_key,
-            estop_id=epoch,
-            remembers=remembers,
-            named=named,
-            deadline_s=deadline_s,
-            on_progress=partial(progressed, network),
+            replace(request, remembers=remembers, on_progress=partial(progressed, network))
         )
         # A link that is down where devices could be looked for is one to which no robot is connected.
         why = "" if outcome.report.link else "; ".join(outcome.problems)
@@ -129,7 +111,7 @@ def estop_all(
         over.set()
     reached, unreached = _parted(networks, verdicts)
     meant = {**dict.fromkeys(known if scope.everything else scope.only), **dict.fromkeys(named)}
-    return FleetVerdict(reached, epoch, tuple(meant), ignored, unreached)
+    return FleetVerdict(reached, request.estop_id, tuple(meant), ignored, unreached)
 
 
 def not_left(network: str, key: Callable[[], NetworkKey], why: object) -> NetworkVerdict:
@@ -243,7 +225,7 @@ def _sure(row: RosterRow) -> str:
 def _parted(networks: Networks, verdicts: Sequence[Stopped]) -> tuple[list[NetworkVerdict], list[NetworkVerdict]]:
     """Return the verdicts that count, and those of gone networks without robots."""
     # A caller that is new here remembers no robot of a broker that is gone.
-    elsewhere = {each.name for each in networks.stated if networks.asks_for(each.name) and not each.on_this_machine}
+    elsewhere = {each.name for each in networks.stated if each.name not in networks.unasked and not each.place.local}
     reached = any(left for _, left in verdicts)
     counted, gone = list[NetworkVerdict](), list[NetworkVerdict]()
     populated = any(each.outcome is not None and each.outcome.size for each, _ in verdicts)

@@ -1,4 +1,7 @@
-"""``demo``: an agent puts a cube on a plate, through a stop and a lockout."""
+"""An agent puts a cube on a plate, through a stop and a lockout; ``strands-robots demo`` runs it.
+
+The wheel has this folder as ``strands_robots._demo``.
+"""
 
 from __future__ import annotations
 
@@ -9,39 +12,31 @@ from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated
 
-import typer
-
-from strands_robots.cli.command import command
 from strands_robots.cli.output import CliError, Screen
+from strands_robots.device_connect.backends import loopback_config
+from strands_robots.device_connect.safety_controller import safety_controller
+from strands_robots.safety.ed25519 import load_signing_key
+from strands_robots.simulation import TABLETOP
 
-if TYPE_CHECKING:
-    from strands_robots.cli.demo.output import DemoScreen
-    from strands_robots.cli.demo.steps import DemoReport
+from .output import DemoScreen, draw_motion
+from .processes import TENANT, connected_agent, served_robot
+from .steps import CONTROLLER, DemoReport, DriveSteps, SafetySteps, demo_operator
 
 ROBOT, PEER = "so100", "demo-arm"
 
 
-def register(app: typer.Typer) -> None:
-    """Add ``demo`` to the application."""
-    command(app, "demo")(demo)
+def run(screen: Screen, output: Path, record: Path | None) -> None:
+    """Run every step.
 
+    Args:
+        screen: where it is printed.
+        output: folder for the pictures.
+        record: file of the terminal's recording as SVG, or None.
 
-def demo(
-    screen: Screen,
-    *,
-    output: Annotated[Path, typer.Option("--output", help="Folder for the pictures.")] = Path("demo-output"),
-    record: Annotated[Path | None, typer.Option("--record", help="Write the terminal output as SVG.")] = None,
-) -> None:
-    """An agent in another process looks at a table and has a simulated arm put the red cube on the plate. A stop halts
-    it; an emergency stop locks it until an operator's key frees it. Nothing leaves this machine.
-
-    Exits with 1 when any step did not happen, or the cube is not on the plate.
+    Raises:
+        CliError: a step did not happen.
     """
-    from strands_robots.cli.demo.output import DemoScreen  # noqa: PLC0415 - loaded by the demo only
-    from strands_robots.cli.demo.steps import DemoReport  # noqa: PLC0415 - as above
-
     demo_screen, report = DemoScreen(screen, record is not None), DemoReport()
     started = time.monotonic()
     try:
@@ -61,14 +56,6 @@ def demo(
 
 
 def _run(screen: DemoScreen, report: DemoReport, output: Path) -> None:
-    from strands_robots.cli.demo.output import draw_motion  # noqa: PLC0415 - as above
-    from strands_robots.cli.demo.processes import TENANT, connected_agent, served_robot  # noqa: PLC0415
-    from strands_robots.cli.demo.steps import CONTROLLER, DriveSteps, SafetySteps, demo_operator  # noqa: PLC0415
-    from strands_robots.device_connect.backends import loopback_config  # noqa: PLC0415
-    from strands_robots.device_connect.safety_controller import safety_controller  # noqa: PLC0415
-    from strands_robots.safety.ed25519 import load_signing_key  # noqa: PLC0415
-    from strands_robots.simulation import TABLETOP  # noqa: PLC0415
-
     port = free_port()
     screen.head(f"Another process serves a simulated {ROBOT} at a table; this one is the agent, by a script")
     with ExitStack() as stack:
