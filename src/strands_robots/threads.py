@@ -94,9 +94,7 @@ class ReadyThreads(Generic[T]):
 
 
 class WokenThread:
-    """Thread that sleeps until it is woken or something is due.
-
-    It starts at its first wake.
+    """Thread that sleeps until it is woken, started then, or something is due.
 
     Args:
         name: of the thread.
@@ -111,12 +109,17 @@ class WokenThread:
         self._thread: threading.Thread | None = None
 
     def wake(self) -> None:
-        """Have the step done soon; return at once."""
+        """Have the step done soon; return at once.
+
+        Raises:
+            RuntimeError: no thread can be started; the next wake tries again.
+        """
         if self._thread is None:
             with self._starting:
                 if self._thread is None and not self._closed:
-                    self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
-                    self._thread.start()
+                    thread = threading.Thread(target=self._run, name=self._name, daemon=True)
+                    thread.start()
+                    self._thread = thread
         if not self._woken.is_set():
             self._woken.set()
 

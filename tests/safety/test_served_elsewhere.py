@@ -129,6 +129,34 @@ def test_of_two_that_begin_at_once_the_later_one_waits_for_the_row_of_the_first_
     said(first, "written")
 
 
+def test_a_process_that_began_since_the_first_look_is_seen(
+    store: Sightings, child: Callable[..., subprocess.Popen[str]], hasty: None
+) -> None:
+    assert store.was_here(HERE, "arm-1") is None
+    first = child(STARTING, str(store.directory), MESHED.text)
+    said(first, "began")
+    print(file=first.stdin, flush=True)
+    said(first, "written")
+    for _ in range(2):
+        with pytest.raises(DuplicateDeviceError, match="on the native mesh"):
+            store.serve(HERE, "arm-1")
+
+
+def test_a_start_reads_the_disk_once_where_nobody_began_meanwhile(
+    store: Sightings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looks: list[str] = []
+    read = store.file.served
+    monkeypatch.setattr(store.file, "served", lambda name: looks.append(name) or read(name))
+    for name in ("arm-1", "arm-2", "arm-1"):
+        store.was_here(HERE, name)
+        store.serve(HERE, name)
+        assert store.flush(5.0)
+    assert looks == ["arm-1", "arm-2", "arm-1"]
+    store.serve(HERE, "arm-3")
+    assert looks[-1] == "arm-3"
+
+
 def test_a_start_is_refused_while_a_frozen_process_begins_and_not_once_it_is_killed(
     store: Sightings, child: Callable[..., subprocess.Popen[str]], hasty: None
 ) -> None:

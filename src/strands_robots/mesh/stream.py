@@ -18,7 +18,7 @@ from strands_robots.mesh.scheduler import BoundedExecutor
 from strands_robots.mesh.session import Context
 from strands_robots.mesh.transport import Declaration, Sample, Transport, TransportError, undeclare
 from strands_robots.mesh.wire import WireError
-from strands_robots.serving.rate_limiter import RateLimiter
+from strands_robots.rate_limits import RateLimiter
 
 logger = logging.getLogger(__name__)
 

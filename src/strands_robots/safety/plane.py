@@ -99,9 +99,10 @@ class Registered:
         # until it moves: a hundred of them need no hundred threads.
         if holds_several(robot) or len(plane.robots) >= READY_MAX:
             plane.executor.prepare()
+            self._unwatch = robot.gate.watch(self._stand_by)
         else:
             self._stand_by()
-        self._unwatch = robot.gate.watch(self._stand_by)
+            self._unwatch = lambda: None
 
     @property
     def locked(self) -> bool:

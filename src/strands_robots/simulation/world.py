@@ -89,6 +89,7 @@ class Simulation(PicturesMixin, ArmMixin, TeleopMixin):
         stop_level: StopLevel | Literal["release"] | None = None,
         rest_pose: Mapping[str, Any] | None = None,
     ) -> None:
+        super().__init__()
         self.tool_name_str = text("tool_name", tool_name, longest=128)
         self.tasks = TaskEngine(
             self.tool_name_str,
