@@ -25,7 +25,7 @@ from weakref import WeakSet
 
 from strands_robots.audit import log_safety_event
 from strands_robots.errors import StrandsRobotsError
-from strands_robots.safety.identity import ROBOTS, EnrolledKeys, KeyFile, local_name, of_tenant
+from strands_robots.safety.identity import EnrolledKeys, key_here, local_name, of_tenant
 from strands_robots.safety.network_key import DEVICE_CONNECT, MESH, NetworkKey
 from strands_robots.safety.sighting_file import (
     RECENT_S,
@@ -462,17 +462,10 @@ class Sightings:
             network = answer.network
             known = of_tenant(enrolled, network.tenant).values()
             here = (each for each in known if not each.networks or any(own.meets(network) for own in each.networks))
-            return key in keys or all(each.exemption for each in here) or key == self._key_here(network, answer.name)
+            own = key_here(local_name(network.tenant, answer.name), self.directory)
+            return key in keys or all(each.exemption for each in here) or key == own
 
         return [(answer, key) for answer, key in signed if counts(answer, key)]
-
-    def _key_here(self, network: NetworkKey, name: str) -> bytes | None:
-        """Return the key of a robot of this machine."""
-        try:
-            identity = KeyFile(ROBOTS, local_name(network.tenant, name), self.directory).load()
-        except (StrandsRobotsError, OSError):
-            return None
-        return None if identity is None else identity.public
 
     def _heard_signed(self, proven: Iterable[tuple[NetworkKey, str, bytes]]) -> None:
         """End the exemption of enrolled robots that were heard, and keep their network."""
