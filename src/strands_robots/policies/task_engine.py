@@ -136,12 +136,16 @@ class TaskEngine:
         with waiting.until_begun(permit, leader or label), self.line(label):
             policy = None
             if new.load is not None:
-                self._free_body(label, permit)
+                self.require_free(label)
                 policy = new.load()
                 if not permit.valid:
                     raise MotionRefused(error(_LATE.format(verb)))
             with self.starting:
-                rollout = new.make(self._free_body(label, permit), permit, policy)
+                permit.check()
+                body = self._body(label)
+                self.require_free(label)
+                self._ready()
+                rollout = new.make(body, permit, policy)
                 permit.check()
                 (self.by_leader if leader else self.by_body)[leader or label] = rollout
                 rollout.start()
@@ -158,13 +162,6 @@ class TaskEngine:
             driver = self.occupied(name) or self.leader_of(name)
             if driver:
                 raise ValidationError(f"{name} is driven by {driver}; stop that first.")
-
-    def _free_body(self, name: str, permit: Permit) -> Body:
-        permit.check()
-        body = self._body(name)
-        self.require_free(name)
-        self._ready()
-        return body
 
     @contextmanager
     def sending(self, permit: Permit) -> Iterator[None]:
