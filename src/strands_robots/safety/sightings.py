@@ -33,8 +33,8 @@ from strands_robots.safety.sighting_file import (
     Known,
     Moment,
     Note,
+    RosterRow,
     Served,
-    Sighting,
     SightingFile,
     SightingFileError,
     process_start,
@@ -46,7 +46,7 @@ from strands_robots.stop_log import stop_logger
 
 logger = stop_logger(__name__)
 
-__all__ = ["RECENT_S", "Known", "Moment", "Sighting", "Sightings", "flush_sightings", "sightings", "this_moment"]
+__all__ = ["RECENT_S", "Known", "Moment", "RosterRow", "Sightings", "flush_sightings", "sightings", "this_moment"]
 
 
 T = TypeVar("T")
@@ -328,7 +328,7 @@ class Sightings:
         # The interpreter ends and gives no more threads.
         return self._write_batch() == ""
 
-    def read(self, now: Moment | None = None) -> tuple[list[Sighting], str]:
+    def read(self, now: Moment | None = None) -> tuple[list[RosterRow], str]:
         """Return the robots of the ten minutes before ``now``, and a problem or "".
 
         A robot that was heard since ``now`` is among them. It waits a second at most for the disk; never call it before
