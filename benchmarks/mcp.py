@@ -321,7 +321,10 @@ async def closed(mover: Mover, url: str) -> float:
         call = {"jsonrpc": "2.0", "id": 2, "method": "tools/call", "params": params}
         stream = http.stream("POST", url, json=call)
         await stream.__aenter__()
-        return await mover.last_write_ms(lambda: stream.__aexit__(None, None, None))
+        took = await mover.last_write_ms(lambda: stream.__aexit__(None, None, None))
+        # The server keeps so many sessions of a token: beyond them, one of another trial would end.
+        (await http.delete(url)).raise_for_status()
+        return took
 
 
 async def killed(mover: Mover, start: Callable[..., Awaitable[int]], way: dict[str, Any]) -> float:

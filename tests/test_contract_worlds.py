@@ -10,7 +10,7 @@ from fixtures.toy_robots import ToyRobot, ToyWorld
 from strands_robots.contract import adapt, behind_contract, holds_robots, robots_in, task_runs
 from strands_robots.envelope import Envelope, success
 from strands_robots.serving.robot_verbs import takes_tasks
-from strands_robots.serving.world_stops import OneRobot
+from strands_robots.serving.stops import OneRobot
 from strands_robots.simulation import Simulation
 
 

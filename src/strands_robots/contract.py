@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from types import FunctionType, MethodType
-from typing import TYPE_CHECKING, Any, Literal, ParamSpec, Protocol, TypeVar, runtime_checkable
+from typing import TYPE_CHECKING, Any, Generic, Literal, ParamSpec, Protocol, TypeVar, runtime_checkable
 
 from strands_robots import settings
 from strands_robots.envelope import Envelope, error, success
@@ -90,6 +90,52 @@ Observer = Callable[[RolloutEvent], None]
 """Called from the control thread: it must return at once and may not raise."""
 
 Unsubscribe = Callable[[], None]
+
+
+class OfRobot(Protocol):
+    """An event of one robot."""
+
+    @property
+    def robot(self) -> str:
+        """Name of the robot."""
+
+
+E = TypeVar("E", bound=OfRobot)
+
+
+class Observers(Generic[E]):
+    """Observers of a robot's events; one that raises is logged and stays."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._observers: tuple[Callable[[E], None], ...] = ()
+        self._logged: set[tuple[int, str]] = set()
+
+    def subscribe(self, observer: Callable[[E], None]) -> Unsubscribe:
+        """Call ``observer`` with every event; the returned callable ends that."""
+        with self._lock:
+            self._observers = (*self._observers, observer)
+        once = threading.Lock()
+
+        def unsubscribe() -> None:
+            if once.acquire(blocking=False):
+                with self._lock:
+                    left = list(self._observers)
+                    left.remove(observer)
+                    self._observers = tuple(left)
+
+        return unsubscribe
+
+    def notify(self, event: E) -> None:
+        """Call every observer, in the calling thread."""
+        for observer in self._observers:
+            try:
+                observer(event)
+            except Exception as exc:
+                failure = (id(observer), type(exc).__name__)
+                if failure not in self._logged:
+                    self._logged.add(failure)
+                    logger.exception("An observer of %s raised; it stays subscribed.", event.robot)
 
 
 VERB = "verb"
@@ -283,7 +329,13 @@ def for_request(request: MotionRequest | None, method: Callable[P, T]) -> Callab
     """
     if request is None:
         return method
-    if _takes_request(method):
+    # Off its code: inspect.signature takes 90 us of each command. The methods of a proxy are no functions.
+    function = method.__func__ if isinstance(method, MethodType) else method
+    function = inspect.unwrap(function) if isinstance(function, FunctionType) else function
+    code = function.__code__ if isinstance(function, FunctionType) else None
+    named = () if code is None else code.co_varnames[code.co_argcount : code.co_argcount + code.co_kwonlyargcount]
+    # An argument of a stranger's that has the same name is not ours.
+    if "request" in named and MotionRequest.__name__ in str(function.__annotations__.get("request")):
         ours: Callable[..., T] = method
         return partial(ours, request=request)
 
@@ -292,19 +344,6 @@ def for_request(request: MotionRequest | None, method: Callable[P, T]) -> Callab
             return method(*values, **named)
 
     return within
-
-
-def _takes_request(method: Callable[..., object]) -> bool:
-    # Off its code: inspect.signature takes 90 us of each command. The methods of a proxy are no functions.
-    if not isinstance(method, FunctionType | MethodType):
-        return False
-    function = inspect.unwrap(method.__func__ if isinstance(method, MethodType) else method)
-    if not isinstance(function, FunctionType):
-        return False
-    code = function.__code__
-    named = code.co_varnames[code.co_argcount : code.co_argcount + code.co_kwonlyargcount]
-    # An argument of a stranger's that has the same name is not ours.
-    return "request" in named and MotionRequest.__name__ in str(function.__annotations__.get("request"))
 
 
 def observe(robot: Robot, observer: Observer) -> Unsubscribe:

@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from enum import Enum
 from typing import Any
 
+from strands_robots.errors import StrandsRobotsError
 from strands_robots.utils import shown
 
 Envelope = dict[str, Any]
@@ -106,3 +108,35 @@ def uncarried(value: object, place: str = "", depth: int = DEPTH_MAX) -> str:
 
 def _content(text: str, fields: dict[str, Any]) -> list[dict[str, Any]]:
     return [{"text": text}, {"json": dict(fields)}] if fields else [{"text": text}]
+
+
+class RefusalReason(Enum):
+    """The part of the pipeline that refused a command."""
+
+    ARGUMENTS = "arguments"
+    CALLER = "caller"
+    CONTROL = "control"
+    LOCKOUT = "lockout"
+    APPROVAL = "approval"
+    BUSY = "busy"
+    FAILED = "failed"
+
+    def noted(self, envelope: Envelope) -> Envelope:
+        """Return the envelope with the part that refused, for callers that are programs."""
+        return {**envelope, "refused": self.value}
+
+
+class Refused(StrandsRobotsError):  # noqa: N818 - a refusal, not a fault
+    """A command that did not reach the robot, or failed in it.
+
+    Args:
+        text: what the caller is told.
+        reason: what the audit is told; ``text`` by default.
+        envelope: the whole answer, where it is more than ``text``.
+    """
+
+    def __init__(self, why: RefusalReason, text: str, reason: str = "", envelope: Envelope | None = None) -> None:
+        super().__init__(text)
+        self.why = why
+        self.reason = reason or text
+        self.envelope = why.noted(error(text) if envelope is None else envelope)

@@ -14,7 +14,7 @@ from typing import Any
 
 from strands_robots import settings
 from strands_robots.envelope import is_error, text_of
-from strands_robots.policies.base import SpeedLimit, numbers
+from strands_robots.policies.base import limited, numbers
 from strands_robots.ros.link import DOMAIN_MAX, BroadcastLink, Message
 from strands_robots.ros.link import node_name as checked_node_name
 from strands_robots.ros.rclpy import MAX_QOS_HISTORY_DEPTH, RclpyLink
@@ -259,8 +259,8 @@ class RosTelemetryBase:
             # Whatever was commanded then, the arm may be elsewhere now.
             state: dict[str, Any] = getattr(self._robot, "get_state", dict)()
             start = {**start, **numbers(state.get("joints") or {})}
-        limit = SpeedLimit(dict.fromkeys(action, (-math.inf, math.inf)), 1.0, self._max_speed)
-        cut = limit.limit(action, start, min(max(since, self._period_s), STREAM_S))
+        speeds = dict.fromkeys(action, self._max_speed)
+        cut = limited(action, start, speeds, min(max(since, self._period_s), STREAM_S))
         if cut != action:
             logger.info("A command on %s is cut to %g a second: %s.", self.command_topic, self._max_speed, cut)
         return cut

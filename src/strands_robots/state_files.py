@@ -12,6 +12,8 @@ import os
 import secrets
 import stat
 import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from strands_robots import settings
@@ -139,10 +141,9 @@ def boot() -> str:
     return ""
 
 
-def uptime() -> float:
-    """Return seconds since boot, those asleep included where the system counts them."""
-    clock = getattr(time, "CLOCK_BOOTTIME", None)
-    return time.monotonic() if clock is None else time.clock_gettime(clock)
+_BOOT_CLOCK = getattr(time, "CLOCK_BOOTTIME", None)
+uptime: Callable[[], float] = time.monotonic if _BOOT_CLOCK is None else partial(time.clock_gettime, _BOOT_CLOCK)
+"""Returns seconds since boot, those asleep included where the system counts them; every write of a motion asks it."""
 
 
 def _require_private_status(

@@ -34,7 +34,7 @@ from pathlib import Path
 from typing import Any, Protocol, Self, TextIO
 
 from strands_robots.errors import StrandsRobotsError
-from strands_robots.policies.base import Action, Ranges, SpeedLimit, checked_action, numbers
+from strands_robots.policies.base import Action, Ranges, checked_action, limited, numbers, speeds_across
 from strands_robots.policies.decoding import read_json
 from strands_robots.utils import ValidationError, mapping, missing_extra, number, shown
 
@@ -116,7 +116,7 @@ class LeaderPolicy:
         self._sink_failed = False
         self._now = now
         self._ranges: Ranges = {}
-        self._limit: SpeedLimit | None = None
+        self._speeds: dict[str, float] | None = None
         self._last: dict[str, float] = {}
         self._usable_at = 0.0
 
@@ -127,7 +127,7 @@ class LeaderPolicy:
             key: (max(low, -MAGNITUDE_MAX) if low == -math.inf else low, MAGNITUDE_MAX if high == math.inf else high)
             for key, (low, high) in ranges.items()
         }
-        self._limit = SpeedLimit(ranges, self._max_speed, UNBOUNDED_PER_S)
+        self._speeds = speeds_across(ranges, self._max_speed, UNBOUNDED_PER_S)
         self._last = {}
         self._usable_at = self._now()
 
@@ -150,8 +150,8 @@ class LeaderPolicy:
         self._usable_at = now
         if not self._last:
             self._last = {key: value for key, value in numbers(observation).items() if key in self._ranges}
-        limit = self._limit or SpeedLimit(self._ranges, self._max_speed, UNBOUNDED_PER_S)
-        self._last = {**self._last, **limit.limit(target, self._last, dt)}
+        speeds = self._speeds or speeds_across(self._ranges, self._max_speed, UNBOUNDED_PER_S)
+        self._last = {**self._last, **limited(target, self._last, speeds, dt)}
         self._publish(frame)
         return {key: self._last[key] for key in target}
 

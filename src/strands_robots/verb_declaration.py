@@ -36,7 +36,7 @@ from typing import Any, TypeVar, get_type_hints, overload
 
 from strands_robots.safety.gate import MotionRequest, Permit, gate_of
 from strands_robots.utils import DURATION_MAX_S, START_S, ValidationError, flag, number, plain_text, shown, text
-from strands_robots.verb_parameters import Domain, VerbParameter, is_permit, parameter_of
+from strands_robots.verb_parameters import Domain, Parameter, checked_arguments, is_permit, parameter_of
 
 __all__ = ["DeclaredVerb", "Domain", "Permit", "declared_verbs", "verb"]
 
@@ -74,7 +74,7 @@ class DeclaredVerb:
     made: Callable[..., Any]
 
     @cached_property
-    def parameters(self) -> tuple[VerbParameter, ...]:
+    def parameters(self) -> tuple[Parameter, ...]:
         """Parameters that callers give, by the hints.
 
         Raises:
@@ -158,18 +158,14 @@ class DeclaredVerb:
         if len(values) > len(taken):
             raise ValidationError(f"{self.method} takes at most {len(taken)} arguments in order, not {len(values)}.")
         given = {**{each.name: value for each, value in zip(taken, values, strict=False)}, **named}
-        return self.carry_out(robot, self._checked(given))[0]
-
-    def _checked(self, given: Mapping[str, object]) -> dict[str, Any]:
         known = {each.name: each for each in self.parameters}
-        for name in given.keys() - known.keys():
-            raise ValidationError(
-                f"{self.method} has no argument {shown(name)}; it takes {', '.join(known) or 'none'}."
-            )
-        missing = [name for name, each in known.items() if each.required and name not in given]
-        if missing:
-            raise ValidationError(f"{self.method} needs {', '.join(missing)}.")
-        return {name: known[name].check(name, value) for name, value in given.items()}
+        return self.carry_out(robot, checked_arguments(known, given, self._unfit))[0]
+
+    def _unfit(self, unknown: list[str], missing: list[str]) -> str:
+        if unknown:
+            takes = ", ".join(each.name for each in self.parameters) or "none"
+            return f"{self.method} has no argument {shown(unknown[0])}; it takes {takes}."
+        return f"{self.method} needs {', '.join(missing)}."
 
     @cached_property
     def _given(self) -> tuple[inspect.Parameter, ...]:

@@ -69,25 +69,48 @@ class Domain:
         return {name: value for name, value in stated.items() if value not in (None, "")}
 
 
+REQUIRED: Any = object()
+"""Stands for the default of a parameter that has none."""
+
+
 @dataclass(frozen=True)
-class VerbParameter:
-    """One parameter of a declared verb.
+class Parameter:
+    """One parameter of a verb.
 
     Attributes:
-        type: in Python.
-        meaning: for callers.
-        check: gives the value that is used, or raises :class:`ValidationError` with name, value and domain.
-        schema: in JSON Schema, with ``unit`` besides.
-        default: where it is not required.
+        meaning: a line for callers, with the unit and the domain.
+        type: the Python type that its schema is made from.
+        check: gives the value that is used, or raises :class:`ValidationError` naming parameter, value and domain.
+        schema: JSON Schema of a robot's own verb, with ``unit`` besides; the others have that of their type.
     """
 
     name: str
     type: type
     meaning: str
     check: Check
-    schema: Mapping[str, Any]
-    required: bool
-    default: Any = None
+    default: Any = REQUIRED
+    schema: Mapping[str, Any] | None = None
+
+
+def checked_arguments(
+    parameters: Mapping[str, Parameter], given: Mapping[str, object], unfit: Callable[[list[str], list[str]], str]
+) -> dict[str, Any]:
+    """Return the given arguments in their domains.
+
+    Args:
+        parameters: by name.
+        given: unchecked.
+        unfit: returns the refusal for the names that no parameter has, and those of parameters that are missing.
+
+    Raises:
+        ValidationError: naming what is unknown, missing, or the first one outside its domain.
+    """
+    if not given.keys() <= parameters.keys() or len(given) < len(parameters):
+        unknown = [name for name in given if name not in parameters]
+        missing = [name for name, each in parameters.items() if each.default is REQUIRED and name not in given]
+        if unknown or missing:
+            raise ValidationError(unfit(unknown, missing))
+    return {name: each.check(name, given[name]) for name, each in parameters.items() if name in given}
 
 
 @dataclass(frozen=True)
@@ -102,7 +125,7 @@ def is_permit(hint: Any) -> bool:
     return hint is Permit or (get_origin(hint) is Annotated and get_args(hint)[0] is Permit)
 
 
-def parameter_of(where: str, parameter: inspect.Parameter, hint: Any, meaning: str) -> VerbParameter:
+def parameter_of(where: str, parameter: inspect.Parameter, hint: Any, meaning: str) -> Parameter:
     """Return a parameter by its hint.
 
     Args:
@@ -120,7 +143,7 @@ def parameter_of(where: str, parameter: inspect.Parameter, hint: Any, meaning: s
     told = [each for each in get_args(hint)[1:] if isinstance(each, str)] if get_origin(hint) is Annotated else []
     kind = _kind(where, hint, None, DEPTH_MAX)
     required = parameter.default is inspect.Parameter.empty
-    schema, default = dict(kind.schema), None
+    schema, default = dict(kind.schema), REQUIRED
     if not required:
         default = parameter.default
         if default is not None:
@@ -133,7 +156,7 @@ def parameter_of(where: str, parameter: inspect.Parameter, hint: Any, meaning: s
     words = plain_text(meaning or " ".join(told), MEANING_MAX)
     described = {**schema, "description": words} if words else schema
     check = kind.check if required or parameter.default is not None else _or_none(kind.check)
-    return VerbParameter(parameter.name, kind.type, words, check, described, required, default)
+    return Parameter(parameter.name, kind.type, words, check, default, described)
 
 
 def _kind(where: str, hint: Any, domain: Domain | None, depth: int) -> _Kind:

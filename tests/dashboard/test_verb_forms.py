@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 from fixtures.page_feed import forms_of
 
-from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS
-from strands_robots.serving.verb_schema import described
+from strands_robots.serving.arm_verbs import ARM_MOTION_VERBS
+from strands_robots.serving.verbs import described
 
 
 @pytest.mark.parametrize("default", [float("nan"), float("inf"), -float("inf"), [1], {}])

@@ -153,19 +153,19 @@ def test_devices_of_one_class_share_what_describes_them(world: Growing) -> None:
 
 async def test_lockout_and_its_end_are_announced_once_each(runtime: Any, driver: SimulationDeviceDriver) -> None:
     latch = LockoutLatch("sim-1")
-    driver._unregistered = latch
+    driver.stops.unregistered = latch
     driver.robot.gate.attach(latch)
     driver.set_device(runtime)
-    driver.activity = driver.glance()
+    driver.reports.activity = driver.glance()
     announce(runtime, driver)
     await ended()
     runtime.messaging.published.clear()
     for change, locked in ((lambda: latch.engage("e" * 32, "desk", "smoke"), True), (latch.clear, False)):
         change()
-        assert not driver.unchanged()
+        assert not driver.reports.unchanged()
         for _ in range(3):
             announce(runtime, driver)
             await ended()
         assert [each["status"]["locked"] for each in runtime.messaging.published] == [locked]
-        assert driver.unchanged()
+        assert driver.reports.unchanged()
         runtime.messaging.published.clear()

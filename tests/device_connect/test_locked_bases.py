@@ -12,7 +12,7 @@ from fixtures.planes import own_plane
 from fixtures.ros_memory import MemoryLink
 
 from strands_robots.device_connect.bringup import driver_for
-from strands_robots.device_connect.mobile_base_driver import MobileBaseDeviceDriver
+from strands_robots.device_connect.robot_driver import MobileBaseDeviceDriver
 from strands_robots.drivers.ros import rtps_robot, velocity
 from strands_robots.drivers.ros.ackermann_robot import AckermannRosRobot
 from strands_robots.drivers.ros.mobile_base import MobileBaseRobot

@@ -11,7 +11,7 @@ from fixtures.driver_bench import DriverBench
 from fixtures.ros_memory import MemoryLink
 
 from strands_robots.device_connect.bringup import driver_for
-from strands_robots.device_connect.mobile_base_driver import MobileBaseDeviceDriver
+from strands_robots.device_connect.robot_driver import MobileBaseDeviceDriver
 from strands_robots.drivers.ros.mobile_base import MobileBaseRobot
 from strands_robots.ros.gate import CommandGate
 from strands_robots.safety.authorization import Approval, Authorization

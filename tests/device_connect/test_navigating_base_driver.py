@@ -11,7 +11,7 @@ from fixtures.ros_memory import MemoryLink
 from fixtures.waiting import until
 
 from strands_robots.device_connect.bringup import driver_for
-from strands_robots.device_connect.mobile_base_driver import MobileBaseDeviceDriver, NavigatingBaseDeviceDriver
+from strands_robots.device_connect.robot_driver import MobileBaseDeviceDriver, NavigatingBaseDeviceDriver
 from strands_robots.drivers.ros.ros_bridge import RosBridgedRobot
 from strands_robots.ros.gate import CommandGate
 from strands_robots.ros.link import Goal

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from fixtures.driver_bench import DriverBench, drive
 from fixtures.toy_robots import ToyRobot
+from fixtures.waiting import eventually
 
 from strands_robots.device_connect import base_driver
 from strands_robots.mesh.resume_authority import keygen
@@ -205,15 +206,14 @@ def test_a_robot_that_did_not_stop_is_named_at_critical(robot: ToyRobot, caplog:
     robot.start_task("wave", duration=300)
     robot.stubborn = True
     with caplog.at_level(logging.CRITICAL):
-        verdict = driver.handle_estop("safety-1", {"reason": "smoke"})
-    assert verdict is not None
-    assert verdict.stopped is False
+        driver.stops.receive("safety-1", {"reason": "smoke"})
+        eventually(lambda: "DID NOT STOP IT" in caplog.text)
     assert "toy" in caplog.text
     assert "safety-1" in caplog.text
 
 
 @pytest.mark.parametrize("payload", [None, [], "x", {"reason": object()}])
 def test_an_emergency_stop_counts_whatever_its_payload_is(robot: ToyRobot, payload: object) -> None:
-    verdict = drive(robot).handle_estop("safety-1", payload)
-    assert verdict is not None
-    assert verdict.stopped is True
+    halting = drive(robot).stops.begin("safety-1", payload)
+    assert halting is not None
+    assert halting.result().stopped is True

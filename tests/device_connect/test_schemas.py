@@ -11,7 +11,7 @@ from fixtures.toy_robots import ToyRobot, ToyWorld
 from strands_robots.device_connect._compat import rpc
 from strands_robots.device_connect.robot_driver import RobotDeviceDriver
 from strands_robots.device_connect.simulation_driver import SimulationDeviceDriver
-from strands_robots.serving.control_verbs import CONTROL_VERBS
+from strands_robots.serving.control_leases import CONTROL_VERBS
 
 DRIVERS = [RobotDeviceDriver(ToyRobot()), SimulationDeviceDriver(ToyWorld())]
 TYPES = {"string", "integer", "number", "boolean", "object", "array"}

@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 
 from strands_robots import errors
+from strands_robots.envelope import RefusalReason
 from strands_robots.errors import RefusalError, StrandsRobotsError
 from strands_robots.fleet.refusals import BY_REASON, refusal_of_text, said
 from strands_robots.mesh import commands
 from strands_robots.safety.authorization import Approval
-from strands_robots.serving.refused import RefusalReason
 
 
 @pytest.mark.parametrize(

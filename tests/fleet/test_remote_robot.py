@@ -22,7 +22,7 @@ from strands_robots.errors import RefusalError
 from strands_robots.fleet import reports
 from strands_robots.fleet.adapter import FoundRobot, RobotEvent
 from strands_robots.fleet.remote_robot import RemoteRobot, python_name
-from strands_robots.serving.own_verbs import MEMBERS, STOPS
+from strands_robots.serving.offered_verbs import MEMBERS, STOPS
 from strands_robots.utils import WAIT_S, ValidationError
 
 

@@ -11,13 +11,12 @@ from fixtures.devices import RecordingDevice, TorqueDevice
 from fixtures.waiting import eventually
 
 from strands_robots.audit import flush_audit, read_audit_log
+from strands_robots.envelope import RefusalReason, Refused
 from strands_robots.hardware import HardwareRobot
 from strands_robots.safety.authorization import Approval
 from strands_robots.safety.lockout import LockoutLatch
-from strands_robots.serving.leave import Command
 from strands_robots.serving.peer_verbs import PEER_VERBS
-from strands_robots.serving.pipeline import Pipeline, Result
-from strands_robots.serving.refused import RefusalReason, Refused
+from strands_robots.serving.pipeline import Command, Pipeline, Result
 from strands_robots.serving.robot_verbs import ARM_VERBS
 from strands_robots.serving.verbs import Arguments
 

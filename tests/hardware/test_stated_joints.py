@@ -22,7 +22,7 @@ from strands_robots.kinematics.motion import Motion
 from strands_robots.policies.rollout import Rollout
 from strands_robots.safety.gate import Permit
 from strands_robots.safety.orders import StopOrder, new_epoch
-from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS
+from strands_robots.serving.arm_verbs import ARM_MOTION_VERBS
 
 HZ = 100.0
 

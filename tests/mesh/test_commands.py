@@ -16,8 +16,9 @@ from strands_robots import policies
 from strands_robots.mesh.security import ValidationError, validate_command
 from strands_robots.mesh.transport.memory import MemoryTransport
 from strands_robots.safety.authorization import Grants
+from strands_robots.serving.peer_verbs import run_to_end
 from strands_robots.serving.policy_arguments import registered_providers
-from strands_robots.serving.robot_verbs import run_to_end, served
+from strands_robots.serving.robot_verbs import served
 from strands_robots.state_files import state_dir
 
 

@@ -15,7 +15,7 @@ from strands_robots.mesh import input_receiver
 from strands_robots.mesh.core import Mesh
 from strands_robots.mesh.input import InputPublisher
 from strands_robots.mesh.input_receiver import HOLD_S, LOST_S
-from strands_robots.serving.control import leases_of
+from strands_robots.serving.control_leases import leases_of
 from strands_robots.simulation import Simulation
 
 

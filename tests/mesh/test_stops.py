@@ -15,7 +15,7 @@ from strands_robots.envelope import Envelope, success
 from strands_robots.mesh import input_receiver, rpc
 from strands_robots.mesh.input_receiver import InputReceiver
 from strands_robots.safety.stopping import StopVerdict
-from strands_robots.serving.stop_requests import CALLER_MAX
+from strands_robots.serving.stops import CALLER_MAX
 from strands_robots.serving.workers import shares_of
 
 START = {"action": "start", "instruction": "wave", "policy_provider": "mock", "duration": 30.0}

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from strands_robots.policies.base import SpeedLimit, checked_action, checked_speeds, numbers, plain_numbers
+from strands_robots.policies.base import checked_action, checked_speeds, limited, numbers, plain_numbers, speeds_across
 from strands_robots.utils import ValidationError
 
 RANGES = {"a": (-1.0, 1.0), "b": (-math.inf, math.inf)}
@@ -65,8 +65,8 @@ def test_plain_numbers_of_a_value_that_is_no_mapping_are_empty(value: object) ->
 
 @given(st.floats(-5, 5), st.floats(-5, 5), st.floats(0.001, 0.1))
 def test_speed_limit_bounds_every_step(before: float, wanted: float, dt: float) -> None:
-    limit = SpeedLimit(RANGES, full_ranges_per_s=2.0, unbounded_per_s=10.0)
-    after = limit.limit({"a": wanted, "b": wanted}, {"a": before, "b": before}, dt)
+    speeds = speeds_across(RANGES, full_ranges_per_s=2.0, unbounded_per_s=10.0)
+    after = limited({"a": wanted, "b": wanted}, {"a": before, "b": before}, speeds, dt)
     assert abs(after["a"] - before) <= 4 * dt + 1e-9
     assert abs(after["b"] - before) <= 10 * dt + 1e-9
     assert min(before, wanted) - 1e-9 <= after["a"] <= max(before, wanted) + 1e-9

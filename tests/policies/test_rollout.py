@@ -189,7 +189,7 @@ def test_raising_observer_affects_neither_the_loop_nor_the_others(caplog: pytest
     one, _ = run(ScriptedPolicy([{"a": 0.1}] * 5), observers=observers)
     assert one.state == "completed"
     assert len(seen) == 7
-    assert len([record for record in caplog.records if record.name == "strands_robots.policies.rollout"]) == 1
+    assert len([record for record in caplog.records if record.name == "strands_robots.contract"]) == 1
 
 
 def test_unsubscribed_observer_gets_no_events() -> None:

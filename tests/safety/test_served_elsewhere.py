@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -129,6 +130,34 @@ def test_of_two_that_begin_at_once_the_later_one_waits_for_the_row_of_the_first_
     said(first, "written")
 
 
+def test_a_process_that_began_since_the_first_look_is_seen(
+    store: Sightings, child: Callable[..., subprocess.Popen[str]], hasty: None
+) -> None:
+    assert store.was_here(HERE, "arm-1") is None
+    first = child(STARTING, str(store.directory), MESHED.text)
+    said(first, "began")
+    print(file=first.stdin, flush=True)
+    said(first, "written")
+    for _ in range(2):
+        with pytest.raises(DuplicateDeviceError, match="on the native mesh"):
+            store.serve(HERE, "arm-1")
+
+
+def test_a_start_reads_the_disk_once_where_nobody_began_meanwhile(
+    store: Sightings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looks: list[str] = []
+    read = store.file.served
+    monkeypatch.setattr(store.file, "served", lambda name: looks.append(name) or read(name))
+    for name in ("arm-1", "arm-2", "arm-1"):
+        store.was_here(HERE, name)
+        store.serve(HERE, name)
+        assert store.flush(5.0)
+    assert looks == ["arm-1", "arm-2", "arm-1"]
+    store.serve(HERE, "arm-3")
+    assert looks[-1] == "arm-3"
+
+
 def test_a_start_is_refused_while_a_frozen_process_begins_and_not_once_it_is_killed(
     store: Sightings, child: Callable[..., subprocess.Popen[str]], hasty: None
 ) -> None:
@@ -149,15 +178,22 @@ def test_a_start_is_refused_while_a_frozen_process_begins_and_not_once_it_is_kil
 
 
 def test_a_start_keeps_no_descriptor_once_it_is_written(store: Sightings) -> None:
-    store.serve(HERE, "arm-1")
-    assert store.flush(5.0)
-    before = len(list(Path("/proc/self/fd").iterdir()))
-    for _ in range(3):
+    for _ in range(2):
+        store.was_here(HERE, "arm-1")
         store.serve(HERE, "arm-1")
         store.serve(MESHED, "arm-1")
         assert store.flush(5.0)
+        assert store.directory / "starting.lock" not in _open_files()
         store.leave(HERE, "arm-1")
-    assert len(list(Path("/proc/self/fd").iterdir())) <= before
+        store.leave(MESHED, "arm-1")
+
+
+def _open_files() -> list[Path]:
+    files = []
+    for each in Path("/proc/self/fd").iterdir():
+        with contextlib.suppress(OSError):  # closed meanwhile
+            files.append(each.readlink())
+    return files
 
 
 def test_a_file_that_cannot_be_locked_refuses_no_start(store: Sightings, caplog: pytest.LogCaptureFixture) -> None:

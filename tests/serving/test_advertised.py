@@ -19,8 +19,8 @@ from strands_robots.serving.advertised import (
     find_verb,
     typed,
 )
-from strands_robots.serving.own_verbs import own_verbs
-from strands_robots.serving.verb_schema import described
+from strands_robots.serving.offered_verbs import own_verbs
+from strands_robots.serving.verbs import described
 from strands_robots.utils import ValidationError, near
 
 BREW: dict[str, Any] = {

@@ -16,15 +16,13 @@ from fixtures.toy_robots import ToyRobot
 from fixtures.waiting import eventually
 
 from strands_robots.contract import adapt
-from strands_robots.envelope import error, success
+from strands_robots.envelope import RefusalReason, Refused, error, success
 from strands_robots.hardware import HardwareRobot
 from strands_robots.safety.authorization import Approval, Grants, Leave, digest
 from strands_robots.safety.gate import MotionRequest
-from strands_robots.serving import starting_motions
-from strands_robots.serving.leave import Command
+from strands_robots.serving import control
 from strands_robots.serving.peer_verbs import PEER_VERBS
-from strands_robots.serving.pipeline import Pipeline, Result
-from strands_robots.serving.refused import RefusalReason, Refused
+from strands_robots.serving.pipeline import Command, Pipeline, Result
 from strands_robots.serving.robot_verbs import ARM_VERBS
 from strands_robots.serving.verbs import Arguments, Verb
 
@@ -345,7 +343,7 @@ def test_a_grant_is_spent_by_what_began_or_may_have(
 def test_another_callers_motion_is_refused_at_once_while_a_call_that_lasts_moves(
     robot: ToyRobot, grants: Grants, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(starting_motions, "START_WAIT_S", 600.0)
+    monkeypatch.setattr(control, "START_WAIT_S", 600.0)
     moves, end = threading.Event(), threading.Event()
 
     def last(toy: Any, arguments: Arguments, request: MotionRequest | None) -> Any:

@@ -11,7 +11,7 @@ import pytest
 from fixtures.toy_robots import ToyRobot
 
 from strands_robots.contract import adapt
-from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS, WORLD_MOTION_VERBS
+from strands_robots.serving.arm_verbs import ARM_MOTION_VERBS, WORLD_MOTION_VERBS
 from strands_robots.serving.verbs import Kind
 from strands_robots.simulation import Simulation
 from strands_robots.utils import ValidationError

@@ -11,16 +11,13 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from fixtures.toy_robots import ToyRobot, ToyWorld
 from fixtures.waiting import eventually
 
+from strands_robots.envelope import RefusalReason
 from strands_robots.safety import ed25519
-from strands_robots.serving.control import ControlLease, NotHolderError, leases_of
-from strands_robots.serving.control_changes import ControlChange
-from strands_robots.serving.control_verbs import CONTROL_VERBS
-from strands_robots.serving.lease_watch import LeaseWatch
-from strands_robots.serving.leave import Command
-from strands_robots.serving.pipeline import Pipeline, Result
-from strands_robots.serving.refused import RefusalReason
+from strands_robots.safety.lease_signatures import PURPOSE, VERSION, sign_take
+from strands_robots.serving.control import ControlChange, ControlLease, LeaseWatch, NotHolderError
+from strands_robots.serving.control_leases import CONTROL_VERBS, leases_of
+from strands_robots.serving.pipeline import Command, Pipeline, Result
 from strands_robots.serving.robot_verbs import ARM_VERBS, WORLD_VERBS
-from strands_robots.serving.take_assertion import PURPOSE, VERSION, sign_take
 from strands_robots.utils import canonical_json
 
 KEY = Ed25519PrivateKey.generate()

@@ -12,9 +12,8 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from strands_robots.safety import ed25519
-from strands_robots.serving.control import ControlLease
-from strands_robots.serving.control_epochs import EPOCHS_EACH, FirstEpoch, reserve_epochs
-from strands_robots.serving.take_assertion import sign_take
+from strands_robots.safety.lease_signatures import EPOCHS_EACH, reserve_epochs, sign_take
+from strands_robots.serving.control import ControlLease, FirstEpoch
 from strands_robots.state_files import StateFileError
 
 KEY = Ed25519PrivateKey.generate()

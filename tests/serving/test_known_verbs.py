@@ -1,10 +1,9 @@
 from __future__ import annotations
 
-from strands_robots.serving import known_verbs
-from strands_robots.serving.base_verbs import NAVIGATING_BASE_VERBS
+from strands_robots.serving import advertised
 from strands_robots.serving.peer_verbs import PEER_VERBS
 from strands_robots.serving.reachy_verbs import REACHY_VERBS
-from strands_robots.serving.robot_verbs import ARM_VERBS, WORLD_VERBS
+from strands_robots.serving.robot_verbs import ARM_VERBS, NAVIGATING_BASE_VERBS, WORLD_VERBS
 from strands_robots.serving.verbs import Kind
 
 # Of two entries of a name, that of Device Connect comes last: there a verb may be answered sooner.
@@ -17,16 +16,16 @@ def named(*kinds: Kind, lasts: bool = False) -> set[str]:
 
 
 def test_names_are_those_of_the_tables() -> None:
-    assert named(Kind.READ) == known_verbs.READS
-    assert named(Kind.STOP) == known_verbs.STOPS
-    assert named(Kind.RESUME) == known_verbs.RESUMES
-    assert named(Kind.READ, Kind.MOTION, lasts=True) == known_verbs.WAITING
-    assert named(Kind.MOTION) == known_verbs.STARTING
-    assert VERBS.keys() == known_verbs.VERBS
+    assert named(Kind.READ) == advertised.READS
+    assert named(Kind.STOP) == advertised.STOPS
+    assert named(Kind.RESUME) == advertised.RESUMES
+    assert named(Kind.READ, Kind.MOTION, lasts=True) == advertised.WAITING
+    assert named(Kind.MOTION) == advertised.STARTING
+    assert VERBS.keys() == advertised.VERBS
 
 
 def test_texts_are_those_of_the_tables() -> None:
     parameters = [each for table in TABLES for verb in table.values() for each in verb.parameters]
     texts = {each.name for each in parameters if each.type is str}
-    assert texts == known_verbs.TEXTS
+    assert texts == advertised.TEXTS
     assert not texts & {each.name for each in parameters if each.type is not str}

@@ -12,10 +12,9 @@ import pytest
 from fixtures.toy_robots import ToyRobot, ToyWorld
 from fixtures.waiting import eventually
 
-from strands_robots.serving import lease_watch
-from strands_robots.serving.control import ControlLease, NotHolderError, leases_of
-from strands_robots.serving.control_changes import ControlChange
-from strands_robots.serving.lease_watch import LeaseWatch
+from strands_robots.serving import control
+from strands_robots.serving.control import ControlChange, ControlLease, LeaseWatch, NotHolderError
+from strands_robots.serving.control_leases import leases_of
 from strands_robots.serving.workers import UNBOUNDED, BoundedCall
 
 SECRET = "a secret of agent-a"
@@ -183,7 +182,7 @@ def test_watch_that_could_not_start_its_thread_starts_it_later(monkeypatch: pyte
             raise RuntimeError("can't start new thread")
 
     with monkeypatch.context() as patch:
-        patch.setattr(lease_watch.threading, "Thread", NoThread)
+        patch.setattr(control.threading, "Thread", NoThread)
         with pytest.raises(RuntimeError):
             lease.acquire("agent-a", "agent", 0.05)
     assert lease.facts()["held"] is False

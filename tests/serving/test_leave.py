@@ -20,15 +20,13 @@ from strands_robots.hardware import HardwareRobot
 from strands_robots.ros.gate import CommandGate
 from strands_robots.safety.authorization import Leave
 from strands_robots.safety.gate import MotionGate
-from strands_robots.serving.base_verbs import NAVIGATING_BASE_VERBS
-from strands_robots.serving.leave import Command
-from strands_robots.serving.own_verbs import own_verbs
+from strands_robots.serving.offered_verbs import own_verbs
 from strands_robots.serving.peer_verbs import PEER_VERBS
-from strands_robots.serving.pipeline import Pipeline, Result
+from strands_robots.serving.pipeline import Command, Pipeline, Result
 from strands_robots.serving.reachy_verbs import REACHY_VERBS
-from strands_robots.serving.robot_verbs import ARM_VERBS, WORLD_VERBS
+from strands_robots.serving.robot_verbs import ARM_VERBS, NAVIGATING_BASE_VERBS, WORLD_VERBS
+from strands_robots.serving.stops import OneRobot
 from strands_robots.serving.verbs import Verb
-from strands_robots.serving.world_stops import OneRobot
 
 
 class HaltAfterLeave(Pipeline):

@@ -10,12 +10,11 @@ from fixtures.devices import RecordingDevice
 from fixtures.toy_robots import ToyRobot
 
 from strands_robots.contract import RolloutEvent
+from strands_robots.envelope import RefusalReason
 from strands_robots.hardware import HardwareRobot
 from strands_robots.safety.authorization import Approval
-from strands_robots.serving.leave import Command
 from strands_robots.serving.peer_verbs import PEER_VERBS
-from strands_robots.serving.pipeline import Pipeline, Result
-from strands_robots.serving.refused import RefusalReason
+from strands_robots.serving.pipeline import Command, Pipeline, Result
 from strands_robots.serving.robot_verbs import ARM_VERBS
 from strands_robots.simulation import Simulation
 

@@ -17,18 +17,17 @@ from fixtures.ros_memory import MemoryLink
 from fixtures.toy_robots import ToyRobot, ToyWorld
 
 from strands_robots.contract import adapt
-from strands_robots.device_connect.mobile_base_driver import MobileBaseDeviceDriver
+from strands_robots.device_connect.robot_driver import MobileBaseDeviceDriver
 from strands_robots.drivers.reachy import ReachyDriver
 from strands_robots.drivers.ros.mobile_base import MobileBaseRobot
 from strands_robots.hardware import HardwareRobot
-from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS
-from strands_robots.serving.control_verbs import CONTROL_VERBS
+from strands_robots.serving.arm_verbs import ARM_MOTION_VERBS, PICTURE_VERBS
+from strands_robots.serving.control_leases import CONTROL_VERBS
 from strands_robots.serving.offered_verbs import offered
 from strands_robots.serving.peer_verbs import KINDS, PEER_VERBS, kind_of
-from strands_robots.serving.picture_verbs import PICTURE_VERBS
 from strands_robots.serving.reachy_verbs import REACHY_VERBS
 from strands_robots.serving.robot_verbs import ARM_VERBS, WORLD_VERBS
-from strands_robots.serving.world_stops import OneRobot
+from strands_robots.serving.stops import OneRobot
 from strands_robots.simulation import Simulation
 
 ALWAYS = {"stop", "resume", "getStatus", "getFeatures", *CONTROL_VERBS}

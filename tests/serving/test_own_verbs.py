@@ -13,9 +13,8 @@ from fixtures.barista import Barista, Careless, Stubborn
 from strands_robots import Permit, verb
 from strands_robots.contract import adapt
 from strands_robots.envelope import success, text_of
-from strands_robots.serving.leave import Command
-from strands_robots.serving.own_verbs import answer_of, own_verbs
-from strands_robots.serving.pipeline import Pipeline, Result
+from strands_robots.serving.offered_verbs import answer_of, own_verbs
+from strands_robots.serving.pipeline import Command, Pipeline, Result
 from strands_robots.serving.verbs import Kind
 from strands_robots.utils import ValidationError
 

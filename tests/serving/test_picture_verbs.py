@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from strands_robots.recording import cameras
-from strands_robots.serving.picture_verbs import PICTURE_VERBS
+from strands_robots.serving.arm_verbs import PICTURE_VERBS
 from strands_robots.simulation import Simulation
 from strands_robots.utils import ValidationError
 
@@ -80,5 +80,5 @@ def test_pictures_that_cannot_be_taken_are_refused_by_name(world: Simulation, mo
     assert asked("getPicture", object())["reason"] == "this robot has no camera."
     with pytest.raises(ValidationError, match="width must be an integer from 16 to 1920"):
         asked("getPicture", world, width=4000)
-    monkeypatch.setattr("strands_robots.serving.picture_verbs.PICTURE_MAX_BYTES", 100)
+    monkeypatch.setattr("strands_robots.serving.arm_verbs.PICTURE_MAX_BYTES", 100)
     assert "ask for a smaller one" in asked("getPicture", world)["reason"]

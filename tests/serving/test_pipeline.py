@@ -10,11 +10,9 @@ from typing import Any
 import pytest
 from fixtures.toy_robots import ToyRobot
 
-from strands_robots.envelope import error
+from strands_robots.envelope import RefusalReason, Refused, error
 from strands_robots.safety.authorization import Approval, Grants
-from strands_robots.serving.leave import Command
-from strands_robots.serving.pipeline import Pipeline, Result
-from strands_robots.serving.refused import RefusalReason, Refused
+from strands_robots.serving.pipeline import Command, Pipeline, Result
 from strands_robots.serving.robot_verbs import ARM_VERBS
 from strands_robots.serving.verbs import Arguments
 from strands_robots.serving.workers import shares_of
@@ -121,7 +119,7 @@ def test_a_closed_pipeline_refuses_and_names_what_still_runs(robot: ToyRobot) ->
     line = pipeline(robot)
     results: list[Result] = []
     command = Command(ARM_VERBS["execute"], {"instruction": "wave"}, "agent", line.pending.arrive())
-    line.share(command.verb).submit(lambda: line.serve(command, results.append))
+    line.shares.motion.submit(lambda: line.serve(command, results.append))
     assert started.wait(20.0)
     assert line.close() == ["execute"]
     refused = served(line, instruction="wave").refusal

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from strands_robots.serving.rate_limiter import RateLimiter
+from strands_robots.rate_limits import RateLimiter
 
 
 class Clock:

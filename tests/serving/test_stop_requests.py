@@ -11,7 +11,7 @@ from fixtures.waiting import eventually
 
 from strands_robots.safety.stop_executor import StopExecutor
 from strands_robots.safety.stopping import StopVerdict
-from strands_robots.serving.stop_requests import CALLER_MAX, TOTAL_MAX, Request, StopRequests
+from strands_robots.serving.stops import CALLER_MAX, TOTAL_MAX, Request, StopRequests
 
 
 @dataclass(eq=False)

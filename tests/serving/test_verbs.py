@@ -8,15 +8,17 @@ from typing import Any
 
 import pytest
 
-from strands_robots.device_connect.mobile_base_driver import MobileBaseDeviceDriver, NavigatingBaseDeviceDriver
 from strands_robots.device_connect.reachy_mini_driver import ReachyMiniDriver
-from strands_robots.device_connect.robot_driver import RobotDeviceDriver
+from strands_robots.device_connect.robot_driver import (
+    MobileBaseDeviceDriver,
+    NavigatingBaseDeviceDriver,
+    RobotDeviceDriver,
+)
 from strands_robots.device_connect.simulation_driver import SimulationDeviceDriver
 from strands_robots.mesh.security import validate_command
-from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS
-from strands_robots.serving.control_verbs import CONTROL_VERBS
+from strands_robots.serving.arm_verbs import ARM_MOTION_VERBS, PICTURE_VERBS
+from strands_robots.serving.control_leases import CONTROL_VERBS
 from strands_robots.serving.peer_verbs import KINDS, PEER_VERBS
-from strands_robots.serving.picture_verbs import PICTURE_VERBS
 from strands_robots.serving.robot_verbs import ARM_VERBS
 from strands_robots.serving.verbs import REQUIRED, Kind, Parameter, Verb
 from strands_robots.tools import robot_mesh

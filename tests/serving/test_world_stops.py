@@ -10,7 +10,7 @@ from fixtures.waiting import eventually
 
 from strands_robots.safety.stop_executor import stop_executor
 from strands_robots.safety.stopping import StopVerdict
-from strands_robots.serving.world_stops import WorldStop
+from strands_robots.serving.stops import WorldStop
 
 
 def test_each_stop_halts_a_world_whose_listing_hangs(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,12 +11,11 @@ from fixtures.waiting import eventually
 
 from strands_robots import Permit, Simulation, verb
 from strands_robots.safety.stop_executor import stop_executor
-from strands_robots.serving.control import leases_of
-from strands_robots.serving.leave import Command
-from strands_robots.serving.own_verbs import own_verbs
-from strands_robots.serving.pipeline import Pipeline, Result
+from strands_robots.serving.control_leases import leases_of
+from strands_robots.serving.offered_verbs import own_verbs
+from strands_robots.serving.pipeline import Command, Pipeline, Result
 from strands_robots.serving.robot_verbs import WORLD_VERBS
-from strands_robots.serving.world_stops import WorldStop, robot_stop, stop_within
+from strands_robots.serving.stops import WorldStop, robot_stop, stop_within
 
 
 class Nodding(Simulation):

@@ -17,7 +17,7 @@ from strands_robots.policies.settling import RANGES_PER_S, SETTLE_HZ
 from strands_robots.robot import Robot
 from strands_robots.safety.orders import StopOrder, new_epoch
 from strands_robots.serving.robot_verbs import world_stop_answer
-from strands_robots.serving.world_stops import WorldStop
+from strands_robots.serving.stops import WorldStop
 from strands_robots.simulation import Simulation
 from strands_robots.simulation.body import RobotBody, StopTorque
 from strands_robots.utils import ValidationError

@@ -16,14 +16,13 @@ from strands_robots import settings
 from strands_robots.cli.app import Timeout, assignments
 from strands_robots.cli.network import Network, answering, say_missing
 from strands_robots.cli.output import LATE_S, CliError, Exit, Screen, label, plain, readable, table
-from strands_robots.envelope import is_error, text_of
+from strands_robots.envelope import RefusalReason, is_error, text_of
 from strands_robots.fleet.adapter import FIND_S, SOURCE
 from strands_robots.fleet.device_connect.config import as_flag, described
 from strands_robots.fleet.networks import STILL
 from strands_robots.fleet.profiles import profile_names, profiles_folder, read_profile
-from strands_robots.serving.known_verbs import QUICK, STOPS, TEXTS, VERBS, WAITING
-from strands_robots.serving.refused import RefusalReason
-from strands_robots.utils import WAIT_S, MissingExtraError, ValidationError, identifier, number
+from strands_robots.serving.advertised import QUICK, STOPS, TEXTS, VERBS, WAITING
+from strands_robots.utils import WAIT_S, MissingExtraError, ValidationError, duration, identifier, number
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -222,7 +221,7 @@ def call(
     """
     given = arguments or []
     params = assignments(given)
-    stated = None if timeout is None else number("--timeout", timeout, above=0, high=3600)
+    stated = None if timeout is None else duration("--timeout", timeout)
     with network.joined(source=source, in_turn=function in STILL - STOPS) as there:
         try:
             with answering(there, device, function or ""):

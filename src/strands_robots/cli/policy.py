@@ -15,7 +15,7 @@ from strands_robots.cli.output import CliError, Screen, label, table
 from strands_robots.policies.base import PolicyError
 from strands_robots.policies.check import PolicyCheck, check_policy, statements_of
 from strands_robots.policies.profiles import Profile, load_profiles
-from strands_robots.utils import ValidationError, missing_extra, number, shown, whole
+from strands_robots.utils import ValidationError, duration, missing_extra, number, shown, whole
 
 if TYPE_CHECKING:
     from strands_robots.evaluation.episode import Episode
@@ -68,7 +68,7 @@ def bench(
 ) -> None:
     """Run a policy's loop without a robot, and compare its figures with its budget."""
     profile = _profile(name, policies)
-    span = number("--for", seconds, above=0, high=3600)
+    span = duration("--for", seconds)
     rate = number("--hz", hz, above=0, high=2000) if hz else profile.rate or 50.0
     if policies is not None:
         settings.put("STRANDS_POLICIES", str(policies))

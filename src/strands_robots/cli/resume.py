@@ -17,11 +17,11 @@ from strands_robots.envelope import is_error, text_of
 from strands_robots.fleet.adapter import LockoutReport
 from strands_robots.fleet.lockouts import ask_lockouts, by_robot, resume_all, unheard_in
 from strands_robots.safety.authorization import GRANT_S, Grants
+from strands_robots.safety.lease_signatures import sign_take
 from strands_robots.safety.lockout import Lockout, utc
 from strands_robots.safety.persistence import LockoutStore, StoredLockout
 from strands_robots.safety.resume import NOT_LOCKED, clear_here
 from strands_robots.safety.stop_notes import Unheard, unheard_since
-from strands_robots.serving.take_assertion import sign_take
 from strands_robots.state_files import state_dir
 from strands_robots.utils import identifier, number, operator
 

@@ -34,7 +34,8 @@ from strands_robots.fleet.stops import not_left
 from strands_robots.fleet.verdicts import NetworkVerdict
 from strands_robots.safety.identity import KeyFileError
 from strands_robots.serving.advertised import AdvertisedParameter, AdvertisedVerb, RobotDescription
-from strands_robots.serving.control_verbs import CONTROL_VERBS
+from strands_robots.serving.control_leases import CONTROL_VERBS
+from strands_robots.threads import LoopThread
 from strands_robots.utils import plain_text
 
 logger = logging.getLogger(__name__)
@@ -189,7 +190,7 @@ class FleetFeed:
         except BaseException:
             self._stack.close()
             raise
-        asyncio.run_coroutine_threadsafe(self._run(), thread.loop)
+        thread.submit(self._run())
 
     async def call(self, robot: str, verb: str, params: Mapping[str, Any], seconds: float) -> Envelope:
         """Call a verb; every failure is an answer of status error."""
@@ -358,29 +359,6 @@ class FleetFeed:
             each.pop(name, None)
         for what in ("verbs", "lockout"):
             self._tasks.pop((what, name), None)
-
-
-class LoopThread:
-    """An event loop on a thread of its own, ended by :meth:`close`."""
-
-    def __init__(self, name: str) -> None:
-        self.loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self.loop.run_forever, name=name, daemon=True)
-        self._thread.start()
-
-    def close(self) -> None:
-        """Cancel what runs there, and end the thread."""
-
-        async def cancel() -> None:
-            tasks = [task for task in asyncio.all_tasks() if task is not asyncio.current_task()]
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
-
-        asyncio.run_coroutine_threadsafe(cancel(), self.loop).result(5.0)
-        self.loop.call_soon_threadsafe(self.loop.stop)
-        self._thread.join(5.0)
-        self.loop.close()
 
 
 def page_name(network: str) -> str:

@@ -25,7 +25,7 @@ from strands_robots.envelope import Envelope, error, is_error, jsonable, text_of
 from strands_robots.recording.cameras import OVERVIEW
 from strands_robots.safety.stop_notes import Unheard, unheard_now
 from strands_robots.safety.stopping import grade
-from strands_robots.serving.known_verbs import STOPS
+from strands_robots.serving.advertised import STOPS
 from strands_robots.utils import ValidationError, plain_text, shown, text
 
 logger = logging.getLogger(__name__)

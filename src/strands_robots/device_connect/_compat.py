@@ -173,6 +173,7 @@ class Runtime(DeviceRuntime):  # type: ignore[misc]  # the framework has no type
         self._running: asyncio.Task[Any] | None = None
         self._lost_at: float | None = None
         self._dropping = False
+        self._served: frozenset[str] = frozenset()
         self.lives: Callable[[], bool] = lambda: True
         """Says whether the robot behind the device can be read; the heartbeat leaves it out while it cannot."""
 
@@ -302,11 +303,12 @@ class Runtime(DeviceRuntime):  # type: ignore[misc]  # the framework has no type
             )
 
     async def _cmd_subscription(self) -> None:
-        if _traced():
+        if observed():
             await super()._cmd_subscription()
             return
         functions = self._driver._get_functions()
         functions.update({name: _quick(function) for name, function in functions.items()})
+        self._served = frozenset(functions)
         await self.messaging.serve(f"device-connect.{self.tenant}.{self.device_id}.cmd", self._serve)
 
     async def _serve(self, command: jsonrpc.RpcRequest, answer: Answer | None) -> None:
@@ -317,7 +319,7 @@ class Runtime(DeviceRuntime):  # type: ignore[misc]  # the framework has no type
             params["source_device"] = source
         if method == "requestRegistration":
             reply = jsonrpc.result(command.id, self._build_registration_params())
-        elif method not in self._driver._get_functions():
+        elif method not in self._served:
             reply = jsonrpc.error(command.id, jsonrpc.METHOD_NOT_FOUND, f"Unknown method: {method}")
         else:
             try:
@@ -452,8 +454,12 @@ class _NoTelemetry:
 _telemetry = framework.DeviceConnectTelemetry
 
 
-def _traced() -> bool:
-    """Return True when spans or metrics are recorded in this process."""
+def observed(driver: Any = None) -> bool:
+    """Return True when spans, metrics or log lines of a driver are recorded."""
+    if driver is not None and (
+        callable(getattr(driver, "log_integration", None)) or decorators.logger.isEnabledFor(logging.INFO)
+    ):
+        return True
     try:
         from opentelemetry import metrics, trace  # noqa: PLC0415 - an optional part of the framework
     except ImportError:
@@ -463,12 +469,6 @@ def _traced() -> bool:
     return any(
         not type(each).__module__.startswith(("opentelemetry.trace", "opentelemetry.metrics")) for each in providers
     )
-
-
-def observed(driver: Any) -> bool:
-    """Return True while the framework's log lines, spans or metrics are recorded."""
-    integration = callable(getattr(driver, "log_integration", None))
-    return integration or decorators.logger.isEnabledFor(logging.INFO) or _traced()
 
 
 def _quick(function: Callable[..., Awaitable[Any]]) -> Callable[..., Awaitable[Any]]:

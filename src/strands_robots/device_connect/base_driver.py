@@ -9,75 +9,52 @@ from __future__ import annotations
 import asyncio
 import inspect
 import json
-from collections.abc import Awaitable, Callable, Coroutine, Mapping
-from concurrent.futures import Future
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, ClassVar, TypeVar
 from weakref import WeakKeyDictionary
 
-from device_connect_edge.device import DeviceRuntime
 from device_connect_edge.drivers.decorators import get_rpc_source_device
-from device_connect_edge.types import DeviceStatus, EventDef, FunctionDef
+from device_connect_edge.types import DeviceIdentity, DeviceStatus, EventDef, FunctionDef
 
 from strands_robots import settings
 from strands_robots.contract import Haltable, Robot, RolloutEvent, Unsubscribe, observe
 from strands_robots.device_connect._compat import CollectedOnce, Runtime, describe_anew, emit, observed, on, rpc
+from strands_robots.device_connect.device_stops import DeviceStops, stops_of
 from strands_robots.device_connect.presence import lock_stated
-from strands_robots.device_connect.safety_registration import (
-    LEAVE_TIMEOUT_S,
-    REGISTER_S,
-    REGISTRATIONS,
-    SafetyRegistration,
-    register_safety,
-    register_served,
-    stops_of,
+from strands_robots.device_connect.safety_registration import SafetyRegistration
+from strands_robots.device_connect.telemetry import (
+    READ_DEADLINE_S,
+    Activity,
+    RolloutPump,
+    StateReports,
+    sweep,
 )
-from strands_robots.device_connect.telemetry import RolloutPump, report_changes, sweep
-from strands_robots.envelope import Envelope, error, jsonable, success
+from strands_robots.envelope import Envelope, RefusalReason, Refused, error, jsonable, success
 from strands_robots.safety.authorization import ANONYMOUS, Approval, Authorization, caller_name
 from strands_robots.safety.gate import MotionRequest
-from strands_robots.safety.lockout import LockoutLatch
-from strands_robots.safety.orders import REASON_MAX, epoch_of
 from strands_robots.safety.stop_executor import stop_executor
 from strands_robots.safety.stop_link import ESTOP
 from strands_robots.safety.stopping import StopVerdict
-from strands_robots.serving.control_changes import ControlChange
-from strands_robots.serving.leave import Command
-from strands_robots.serving.offered_verbs import Offers
-from strands_robots.serving.own_verbs import own_verbs
-from strands_robots.serving.pipeline import Pipeline, Result, busy
-from strands_robots.serving.refused import RefusalReason, Refused
+from strands_robots.serving.control import ControlChange
+from strands_robots.serving.offered_verbs import Offers, own_verbs
+from strands_robots.serving.pipeline import Command, Pipeline, Result, busy
+from strands_robots.serving.policy_arguments import profile_list
 from strands_robots.serving.stop_arguments import noted
-from strands_robots.serving.verb_schema import described, labels_of, text_of
-from strands_robots.serving.verbs import REQUIRED, Arguments, Kind, Verb
+from strands_robots.serving.stops import stop_within
+from strands_robots.serving.verbs import Arguments, Kind, Verb, described, labels_of, text_of
 from strands_robots.serving.workers import ShareFullError, called, loop_future
-from strands_robots.serving.world_stops import stop_within
 from strands_robots.stop_log import stop_logger
 from strands_robots.utils import START_S, WAIT_S, ValidationError, shown, text
+from strands_robots.verb_parameters import REQUIRED
 
 logger = stop_logger(__name__)
 
 T = TypeVar("T")
 
-READ_DEADLINE_S = 5.0
-"""Seconds in which a robot has to have answered a read."""
-
-FIRST_LOOK_S = 0.02
-"""Seconds from the start of a device to its first state."""
-
 _FUNCTIONS: WeakKeyDictionary[type, tuple[FunctionDef, ...]] = WeakKeyDictionary()
 _EVENTS: WeakKeyDictionary[type, tuple[EventDef, ...]] = WeakKeyDictionary()
 _DESCRIBED: WeakKeyDictionary[type, dict[tuple[str, frozenset[str]], str]] = WeakKeyDictionary()
-
-
-@dataclass(frozen=True, slots=True)
-class Activity:
-    """Present activity of a robot, as status, presence and events report it."""
-
-    busy: bool = False
-    facts: Mapping[str, Any] = field(default_factory=dict)
-    fault: str = ""
 
 
 def rpc_method(verb: Verb) -> Callable[..., Any]:
@@ -139,6 +116,9 @@ class RobotDriver(CollectedOnce):
     cell: str | None = None
     """The cell that the robot is in, "" for none; None asks the robot, then ``STRANDS_CELL``."""
 
+    noun: ClassVar[str] = "Robot"
+    """Begins the description of the device."""
+
     verbs: ClassVar[Mapping[str, Verb]] = {}
     """The verbs of the device, by name; each becomes an RPC method. An instance serves its robot's own besides."""
 
@@ -173,22 +153,18 @@ class RobotDriver(CollectedOnce):
         self.hardware = hardware
         self.authorization = authorization or Authorization(hardware=hardware, robot=robot.tool_name_str)
         self.registration: SafetyRegistration | None = None
-        self._registered_here: SafetyRegistration | None = None
-        self._unregistered: LockoutLatch | None = None
+        self.stops, self.reports = DeviceStops(self), StateReports(self)
         self.pipeline = Pipeline.of(
             robot,
             lambda: self.peer_id,
             hardware=hardware,
             authorize=self.authorize,
             approval=approval or Approval(),
-            own={"resume": self._resume, "getStatus": self._status},
+            own={"resume": self.stops.resume, "getStatus": self._status},
         )
         self.runtime: Any = None
-        self.activity = Activity()
-        self._looked_once = False
-        self._changed: list[asyncio.Event] = []
-        self._looking = 0
-        self._rolling: set[str] = set()
+        self.policy_provider = ""
+        """Of the last motion that was asked for, for a robot that tells no events."""
         self._watchers: list[asyncio.Task[None]] = []
         self._unsubscribe: Unsubscribe | None = None
         self._end_control: Callable[[], None] = lambda: None
@@ -215,12 +191,12 @@ class RobotDriver(CollectedOnce):
             problem = verb and verb.unfit(params.keys() - {"source_device"})
             return error(problem) if problem else await super().invoke(function_name, **params)
         caller = params.pop("source_device", None)
-        moves, named = verb.kind is Kind.MOTION, params.get("robot_name")
-        request = self.pipeline.pending.arrive(named if isinstance(named, str) else "") if moves else None
+        moves = verb.kind is Kind.MOTION
+        request = self.pipeline.pending.arrive(params.get("robot_name")) if moves else None
         command = Command(verb, params, caller, request)
         answered, hand_over = loop_future()
         try:
-            self.pipeline.share(verb).submit(partial(self.pipeline.serve, command, hand_over))
+            self.pipeline.shares.by_name[verb.share].submit(partial(self.pipeline.serve, command, hand_over))
             # Not wait_for: in Python 3.11 it forgets a cancellation that comes together with the answer.
             within_s = (START_S if moves else READ_DEADLINE_S) + (verb.lasts_s or WAIT_S if verb.lasts else 0.0)
             async with asyncio.timeout(within_s):
@@ -234,48 +210,29 @@ class RobotDriver(CollectedOnce):
             return error(f"The robot did not answer {verb.name} in time; what it may still start is void.")
         if moves and result.refusal is None:
             logger.info("%s: %s by caller %s (self-declared).", self.peer_id, verb.name, shown(caller))
-            self.wake()
+            self.reports.wake()
         return enveloped(verb.name, result.result)
 
     def authorize(self, command: Command, arguments: Arguments) -> tuple[str, ...]:
         """Refuse a caller or a policy that is not allowed; return the caller's name."""
         if command.verb.kind is not Kind.MOTION:
             return ()
-        refusal = self.authorization.motion(command.caller, command.verb.name)
-        if refusal is None and "policy_provider" in arguments:
-            refusal = self.authorization.provider(arguments["policy_provider"])
+        provider = arguments.get("policy_provider", "")
+        self.policy_provider = provider or self.policy_provider
+        refusal = self.authorization.motion(command.caller, command.verb.name, provider)
         if refusal is not None:
             raise Refused(RefusalReason.CALLER, refusal)
         return (caller_name(command.caller) or ANONYMOUS,)
-
-    def _resume(self, arguments: Arguments, request: MotionRequest | None) -> Envelope:
-        if self.registration is None and self._unregistered is not None:
-            self._registered_here = register_safety(self.peer_id, self, None, named=False)
-        registration = self.registration
-        return error("resume rejected") if registration is None else registration.resume(arguments["assertion"])
 
     def _status(self, arguments: Arguments, request: MotionRequest | None) -> object:
         """The robot's status with its lockouts, the dead-man check-in and who holds it."""
         answer = self.verbs["getStatus"].call(self.robot, arguments)()
         if not isinstance(answer, dict):
             return answer
-        here, nonce = self.registration, arguments.get("nonce", "")
-        lockouts = lock_facts(self._latched) if here is None else here.facts(nonce)
+        lockouts = self.stops.facts(arguments.get("nonce", ""))
         control = {} if self.pipeline.leases is None else {"control": self.pipeline.leases.facts()}
         running = self.robot.gate.under_way.name
         return {**answer, **lockouts, **control, **({"verb": running} if running else {})}
-
-    @property
-    def _latched(self) -> LockoutLatch | None:
-        """The latch of a robot that no plane has."""
-        return self._unregistered if self._unregistered in self.robot.gate.latches else None
-
-    @property
-    def locked_out(self) -> bool | None:
-        """True while an emergency stop locks it; None where that is not known."""
-        if self.registration is not None:
-            return self.registration.entry.locked
-        return None if self._latched is None else self._latched.state.locked
 
     # Stops.
 
@@ -308,15 +265,6 @@ class RobotDriver(CollectedOnce):
         verdict = await asyncio.wrap_future(halting)
         return enveloped("stop", self.stop_envelope(verdict))
 
-    def handle_estop(self, device_id: object, payload: object) -> StopVerdict | None:
-        """Act on an emergency stop; return the verdict, None when it does not count."""
-        halting = self._begin_estop(device_id, payload)
-        if halting is None:
-            return None
-        verdict = halting.result()
-        self._log_estop(device_id, verdict)
-        return verdict
-
     @emit(labels={"safety": "critical"})
     async def emergencyStop(self, reason: str = "") -> None:
         """This device locks and halts, and calls for an emergency stop of all others.
@@ -342,53 +290,11 @@ class RobotDriver(CollectedOnce):
         return [each for each in found if not (self._stops_are_shared and each["handler"] == self.onEmergencyStop)]
 
     async def on_estop(self, device_id: object, payload: object, raw: bytes | int | None = None) -> None:
-        """Act on an emergency stop of the runtime, in the safety plane if registered.
+        """Act on an emergency stop that the runtime received.
 
         ``raw`` is its message, or the number of bytes of one that is too long to be read.
         """
-        if self.registration is not None:
-            self.registration.runtime_estop(device_id, payload, raw)
-            return
-        halting = self._begin_estop(device_id, payload)
-        if halting is not None:
-            halting.add_done_callback(lambda halted: self._log_estop(device_id, halted.result()))
-
-    def _raise_estop(self, payload: Mapping[str, Any]) -> None:
-        """Lock and halt before the network is told, which must be told whatever happens."""
-        try:
-            if self.registration is not None:
-                self.registration.raise_estop(payload)
-            else:
-                stop_executor().submit(self.robot, self.peer_id, "its own emergency stop")
-        except Exception:
-            logger.critical("%s: its own emergency stop failed.", self.peer_id, exc_info=True)
-
-    def _begin_estop(self, device_id: object, payload: object) -> Future[StopVerdict] | None:
-        if device_id == self.peer_id:
-            return None
-        refusal = self.authorization.estop(device_id)
-        if refusal is not None:
-            logger.warning("%s: emergency stop ignored: %s.", self.peer_id, refusal)
-            return None
-        params = payload if isinstance(payload, Mapping) else {}
-        why = params.get("reason", "")
-        # No plane has this robot; the one that it is registered with takes the lockout over.
-        latch = self._unregistered
-        if latch is None or latch not in self.robot.gate.latches:
-            latch = self._unregistered = LockoutLatch(self.peer_id)
-            self.robot.gate.attach(latch)
-        epoch = epoch_of(str(device_id), params, json.dumps(params, default=repr, skipkeys=True).encode())
-        latch.engage(epoch, str(device_id), why[:REASON_MAX] if isinstance(why, str) else "")
-        return stop_executor().submit(self.robot, self.peer_id, f"emergency stop of {device_id}: {shown(why)}")
-
-    def _log_estop(self, device_id: object, verdict: StopVerdict) -> None:
-        answer = verdict.envelope()
-        if verdict.stopped:
-            text = answer["content"][0]["text"]
-            logger.warning("%s: halted by emergency stop of %s: %s", self.peer_id, device_id, text)
-        else:
-            reason = answer.get("reason")
-            logger.critical("%s: EMERGENCY STOP of %s DID NOT STOP IT: %s", self.peer_id, device_id, reason)
+        self.stops.receive(device_id, payload, raw)
 
     # Control.
 
@@ -416,13 +322,13 @@ class RobotDriver(CollectedOnce):
     def _on_control(self, change: ControlChange) -> None:
         facts: dict[str, Any] = {"robot": change.robot, "holder": change.holder, "epoch": change.epoch}
         if change.event == "taken":
-            self._emit_from_thread("controlTaken", {**facts, "reason": change.reason})
+            event, facts = "controlTaken", {**facts, "reason": change.reason}
         elif change.event == "expired":
-            self._emit_from_thread("controlExpired", facts)
-
-    def _emit_from_thread(self, event: str, payload: dict[str, Any]) -> None:
+            event = "controlExpired"
+        else:
+            return
         try:
-            self.runtime.emit_from_thread(event, payload)
+            self.runtime.emit_from_thread(event, facts)
         except RuntimeError as exc:
             logger.warning("%s: %s was not told: %s", self.peer_id, event, exc)
 
@@ -439,6 +345,17 @@ class RobotDriver(CollectedOnce):
     async def tell_rollout(self, event: RolloutEvent) -> None:
         """Emit the events that belong to ``event``."""
         raise NotImplementedError
+
+    @property
+    def identity(self) -> DeviceIdentity:
+        """Identity of this device; ``model`` is the robot's own name."""
+        model = self.robot.tool_name_str
+        return DeviceIdentity(
+            device_type=self.device_type,
+            manufacturer="strands-robots",
+            model=model,
+            description=f"{self.noun} {model}{profile_list()}",
+        )
 
     @property
     def functions(self) -> list[FunctionDef]:
@@ -479,18 +396,31 @@ class RobotDriver(CollectedOnce):
     @property
     def status(self) -> DeviceStatus:
         """Live availability: busy (score 1.0) while something runs, else idle (0.0)."""
-        activity = self.activity if self._looked_once else self._look_now()
-        return DeviceStatus(**_status_fields(activity))
+        return DeviceStatus(**self.status_of(self.reports.present))
+
+    def status_of(self, activity: Activity) -> dict[str, Any]:
+        """Return the fields of the status for an activity."""
+        return {
+            "availability": "busy" if activity.busy else "idle",
+            "busy_score": 1.0 if activity.busy else 0.0,
+            "error_state": activity.fault or None,
+        }
 
     @property
     def lives(self) -> bool:
         """False while the robot cannot be read."""
-        return not self.activity.fault
+        return not self.reports.activity.fault
+
+    @property
+    def locked_out(self) -> bool | None:
+        """True while an emergency stop locks it; None where that is not known."""
+        return self.stops.locked
 
     def heartbeat(self) -> dict[str, Any]:
         """Return what every heartbeat carries besides the id and the time."""
         describe_anew(self.runtime, self)
-        return {**_status_fields(self.activity), **lock_stated(self), "state": jsonable(self.activity.facts)}
+        activity = self.reports.activity
+        return {**self.status_of(activity), **lock_stated(self), "state": jsonable(activity.facts)}
 
     def set_device(self, device: Any) -> None:
         """Learn the runtime, which has this robot's id on the network."""
@@ -509,7 +439,7 @@ class RobotDriver(CollectedOnce):
         async def emit_at_home(name: str, payload: dict[str, Any]) -> None:
             clean = jsonable(payload)
             if name == ESTOP:
-                self._raise_estop(clean)
+                self.stops.call_for(clean)
             if asyncio.get_running_loop() is home:
                 await callback(name, clean)
             else:
@@ -521,7 +451,7 @@ class RobotDriver(CollectedOnce):
         """Start telling the state; the robot manages its own hardware connection."""
         if self.runtime is None or self._watchers:
             return
-        await self._register()
+        await self.stops.register()
         # Before it is announced: a change from now on is told.
         describe_anew(self.runtime, self)
         opened = self.authorization.opened()
@@ -529,87 +459,24 @@ class RobotDriver(CollectedOnce):
             logger.warning("%s is real hardware, and callers that are not named may move it: %s.", self.peer_id, opened)
         if self._stops_are_shared:
             await stops_of(self.runtime.link).join(self)
-        if not self._looked_once:
-            await self.read_activity()
-        pump = RolloutPump(self._on_rollout, settings.number("STRANDS_DC_STREAM_HZ"))
+        await self.reports.read()
+        pump = RolloutPump(self.reports.on_rollout, settings.number("STRANDS_DC_STREAM_HZ"))
         subscribe = partial(observe, self.robot, pump.observe)
         self._unsubscribe = await called(self.pipeline.shares.read, subscribe, READ_DEADLINE_S)
         self._watchers = [asyncio.create_task(work) for work in (pump.run(), *self.watches())]
-        sweep(settings.number("STRANDS_DC_STATE_HZ")).add(self)
+        sweep(settings.number("STRANDS_DC_STATE_HZ")).add(self.reports)
         if self.pipeline.leases is not None:
             self._end_control = self.pipeline.leases.observe(self._on_control)
-
-    async def _register(self) -> None:
-        """Register with the safety plane, unless what serves this driver has done so."""
-        await self._unregister()
-        if self.registration is None and isinstance(self.runtime, DeviceRuntime):
-            made = partial(register_served, self, self.runtime)
-            self._registered_here = await called(REGISTRATIONS, made, REGISTER_S)
-
-    async def _unregister(self) -> None:
-        made, self._registered_here = self._registered_here, None
-        if made is not None:
-            await called(REGISTRATIONS, made.leave, LEAVE_TIMEOUT_S)
 
     def watches(self) -> list[Any]:
         """Return the coroutines that run while the device is connected."""
         busy_hz = settings.number("STRANDS_DC_STATE_BUSY_HZ")
-        return [self.reporting(self._look, self.tell, self.same, busy_hz, settings.number("STRANDS_DC_STATE_HZ"))]
-
-    def reporting(
-        self,
-        look: Callable[[], Awaitable[T | None]],
-        tell: Callable[[T], Awaitable[None]],
-        same: Callable[[T, T], bool],
-        busy_hz: float,
-        moving_hz: float,
-    ) -> Coroutine[Any, Any, None]:
-        """Return a watch that tells a state whenever it changed.
-
-        Args:
-            look: reads the state; None when it cannot be read.
-            tell: emits it.
-            same: returns True for two states of which the second one need not be told.
-            busy_hz: looks a second while something runs.
-            moving_hz: the same while nothing runs and the state changes nevertheless.
-        """
-        idle_hz, changed = settings.number("STRANDS_DC_STATE_HZ"), asyncio.Event()
-        self._changed.append(changed)
-
-        def rate(moved: bool) -> float:
-            # A robot may tell that a rollout began before its own status says so.
-            if self.activity.busy or self._rolling:
-                return busy_hz
-            # A quiet robot is looked at by the sweep.
-            return moving_hz if moved else idle_hz if self.activity.fault else 0.0
-
-        async def after_the_start() -> None:
-            # The first look costs the start of the device nothing.
-            await asyncio.sleep(FIRST_LOOK_S)
-            await report_changes(look, tell, rate=rate, changed=changed, most_hz=busy_hz, same=same)
-
-        return after_the_start()
-
-    @property
-    def quiet(self) -> bool:
-        """True while the robot does nothing and is not being looked at."""
-        return not (self.activity.busy or self._rolling or self.activity.fault or self._looking)
-
-    def unchanged(self) -> bool:
-        """Look at the robot, on a worker; False when its state or lock is another."""
-        if not lock_stated(self).items() <= self.runtime.status.items():
-            return False
-        same = self.same(self.glance(), self.activity) and not self.robot.gate.under_way
-        return same and not self.offers.look()
+        idle_hz = settings.number("STRANDS_DC_STATE_HZ")
+        return [self.reports.watch(self.reports.look, self.tell, self.same, busy_hz, idle_hz)]
 
     def same(self, one: Activity, other: Activity) -> bool:
         """Return True for two states of which the second one need not be told."""
         return one == other
-
-    def wake(self) -> None:
-        """Look at the robot at once; on the loop."""
-        for changed in self._changed:
-            changed.set()
 
     async def disconnect(self) -> None:
         """Stop telling the state; the robot manages its own shutdown."""
@@ -617,12 +484,11 @@ class RobotDriver(CollectedOnce):
         if self._stops_are_shared:
             await stops_of(self.runtime.link).leave(self)
         if watchers:
-            sweep(settings.number("STRANDS_DC_STATE_HZ")).remove(self)
-        self._changed = []
+            sweep(settings.number("STRANDS_DC_STATE_HZ")).remove(self.reports)
         for watcher in watchers:
             watcher.cancel()
         await asyncio.gather(*watchers, return_exceptions=True)
-        self._looked_once = False
+        self.reports.end()
         self._end_control()
         unsubscribe, self._unsubscribe = self._unsubscribe, None
         if unsubscribe is not None:
@@ -630,68 +496,4 @@ class RobotDriver(CollectedOnce):
                 await called(self.pipeline.shares.read, unsubscribe, READ_DEADLINE_S)
             except Exception as exc:  # noqa: BLE001 - whatever a robot raises, its device leaves
                 logger.warning("%s: its events could not be unsubscribed: %s", self.peer_id, exc)
-        await self._unregister()
-
-    async def read_activity(self) -> None:
-        """Ask the robot for its activity, which the status tells from now on."""
-        self.activity = await self._looked()
-        self._looked_once = True
-
-    async def refresh(self) -> Activity:
-        """Ask the robot again; the answer is what status and presence say from now on."""
-        activity = self.activity = await self._looked()
-        # The runtime announces this very mapping in its presence.
-        self.runtime.status.update(_status_fields(activity))
-        describe_anew(self.runtime, self)
-        return activity
-
-    async def _on_rollout(self, event: RolloutEvent) -> None:
-        if event.kind == "started":
-            self._rolling.add(event.robot)
-        elif event.kind == "finished":
-            self._rolling.discard(event.robot)
-        await self.tell_rollout(event)
-        if event.kind != "step":
-            self.wake()
-
-    async def _look(self) -> Activity | None:
-        activity = await self.refresh()
-        return None if activity.fault else activity
-
-    async def _looked(self) -> Activity:
-        self._looking += 1
-        try:
-            activity = await called(self.pipeline.shares.read, self._glance, READ_DEADLINE_S)
-            return replace(activity, busy=True) if self.robot.gate.under_way else activity
-        except Exception as exc:  # noqa: BLE001 - whatever a robot's read raises is its state to tell
-            fault = f"{type(exc).__name__}: {exc}"
-            if fault != self.activity.fault:
-                logger.warning("%s: its state cannot be read: %s", self.peer_id, fault)
-            return Activity(self.activity.busy, self.activity.facts, fault)
-        finally:
-            self._looking -= 1
-
-    def _glance(self) -> Activity:
-        self.offers.look()
-        return self.glance()
-
-    def _look_now(self) -> Activity:
-        try:
-            return self.pipeline.shares.read.call(self.glance).result(1.0)
-        except Exception as exc:  # noqa: BLE001 - a robot that cannot answer is shown with its fault
-            return Activity(fault=f"{type(exc).__name__}: {exc}")
-
-
-def lock_facts(latch: LockoutLatch | None) -> dict[str, Any]:
-    """Return the lockouts of a robot that no plane has; nothing without any."""
-    if latch is None:
-        return {}
-    return {"locked": latch.state.locked, "lockout": [each.fields() for each in latch.state.all]}
-
-
-def _status_fields(activity: Activity) -> dict[str, Any]:
-    return {
-        "availability": "busy" if activity.busy else "idle",
-        "busy_score": 1.0 if activity.busy else 0.0,
-        "error_state": activity.fault or None,
-    }
+        await self.stops.leave()

@@ -30,7 +30,11 @@ from strands_robots.device_connect.backends.config import insecure_opt_in, link_
 from strands_robots.device_connect.base_driver import RobotDriver
 from strands_robots.device_connect.presence import encoded_capabilities
 from strands_robots.device_connect.process import LOOP_JOIN_TIMEOUT_S, DeviceLoop, enter_loop
-from strands_robots.device_connect.robot_driver import RobotDeviceDriver
+from strands_robots.device_connect.robot_driver import (
+    MobileBaseDeviceDriver,
+    NavigatingBaseDeviceDriver,
+    RobotDeviceDriver,
+)
 from strands_robots.device_connect.safety_registration import (
     LEAVE_TIMEOUT_S,
     REGISTRATIONS,
@@ -164,7 +168,7 @@ async def init_device_connect(  # noqa: PLR0917 - the documented signature
         await asyncio.wait({registration})
         if isinstance(driver, RobotDriver):
             # The runtime reads the status when it is made, on the loop, where a robot that blocks holds all others.
-            await driver.read_activity()
+            await driver.reports.read()
         runtime = Runtime(
             driver=driver,
             device_id=name,
@@ -328,14 +332,8 @@ def _driver_by_class(robot: Any) -> DeviceDriver | None:
 
         return ReachyMiniDriver(robot=robot)
     if getattr(robot, "nav_action", None) is not None and callable(getattr(robot, "start_navigation", None)):
-        from strands_robots.device_connect.mobile_base_driver import (  # noqa: PLC0415 - as above
-            NavigatingBaseDeviceDriver,
-        )
-
         return NavigatingBaseDeviceDriver(robot)
     if callable(getattr(robot, "start_drive", None)):
-        from strands_robots.device_connect.mobile_base_driver import MobileBaseDeviceDriver  # noqa: PLC0415 - as above
-
         return MobileBaseDeviceDriver(robot)
     simulation = getattr(sys.modules.get("strands_robots.simulation"), "Simulation", None)
     if isinstance(simulation, type) and isinstance(robot, simulation):

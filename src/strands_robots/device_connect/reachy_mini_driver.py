@@ -12,7 +12,8 @@ from device_connect_edge.types import DeviceIdentity, DeviceStatus
 
 from strands_robots.contract import RolloutEvent
 from strands_robots.device_connect._compat import Labels, emit
-from strands_robots.device_connect.base_driver import Activity, RobotDriver
+from strands_robots.device_connect.base_driver import RobotDriver
+from strands_robots.device_connect.telemetry import Activity
 from strands_robots.drivers.reachy import ReachyDriver
 from strands_robots.drivers.reachy.links import DEFAULT_PREFIX
 from strands_robots.safety.authorization import Approval, Authorization
@@ -85,17 +86,10 @@ class ReachyMiniDriver(RobotDriver):
             return super().status
         return DeviceStatus(availability=UNAVAILABLE, busy_score=0.0, error_state=away)
 
-    def heartbeat(self) -> dict[str, Any]:
-        """Fields of every heartbeat besides the id and the time."""
-        told = super().heartbeat()
-        return {**told, "availability": UNAVAILABLE} if self.activity.fault else told
-
-    async def refresh(self) -> Activity:
-        """Ask the robot again; the answer is what status and presence say from now on."""
-        activity = await super().refresh()
-        if activity.fault:
-            self.runtime.status["availability"] = UNAVAILABLE
-        return activity
+    def status_of(self, activity: Activity) -> dict[str, Any]:
+        """Return the fields of the status; a robot that is away is unavailable."""
+        fields = super().status_of(activity)
+        return {**fields, "availability": UNAVAILABLE} if activity.fault else fields
 
     async def connect(self) -> None:
         """Begin to connect; a daemon that is away is connected to when it appears."""
@@ -160,4 +154,4 @@ class ReachyMiniDriver(RobotDriver):
             await self.motionComplete(
                 name=event.instruction, state=event.state, detail=event.error, duration=round(event.elapsed_s, 3)
             )
-            self.wake()
+            self.reports.wake()

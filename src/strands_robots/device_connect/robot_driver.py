@@ -6,19 +6,16 @@ import time
 from collections.abc import Mapping
 from typing import Any, ClassVar, Optional
 
-from device_connect_edge.types import DeviceIdentity
-
 from strands_robots.bus_access import read_joints
 from strands_robots.contract import RUNNING, RolloutEvent, adapt, body_of
 from strands_robots.device_connect._compat import Labels, emit
-from strands_robots.device_connect.base_driver import Activity, RobotDriver, stated_type
+from strands_robots.device_connect.base_driver import RobotDriver, stated_type
+from strands_robots.device_connect.telemetry import Activity, rollout_fields
 from strands_robots.envelope import fields_of
 from strands_robots.policies.base import plain_numbers
 from strands_robots.safety.authorization import Approval, Authorization
-from strands_robots.serving.leave import Command
-from strands_robots.serving.policy_arguments import profile_list
-from strands_robots.serving.robot_verbs import ARM_VERBS
-from strands_robots.serving.verbs import Arguments, Verb
+from strands_robots.serving.robot_verbs import ARM_VERBS, BASE_VERBS, NAVIGATING_BASE_VERBS
+from strands_robots.serving.verbs import Verb
 
 
 class RobotDeviceDriver(RobotDriver):
@@ -43,28 +40,10 @@ class RobotDeviceDriver(RobotDriver):
         task_robot = adapt(robot, read_joints)
         super().__init__(task_robot, hardware=hardware, authorization=authorization, approval=approval)
         self.task_robot = task_robot
-        self._model = task_robot.tool_name_str
         wrapped = body_of(task_robot)
         self.device_type = stated_type(wrapped, self.device_type)
         self._tells = callable(getattr(wrapped, "subscribe", None))
-        self._provider = ""
         self._began: float | None = None
-
-    @property
-    def identity(self) -> DeviceIdentity:
-        """Identity of this device; ``model`` is the robot's own name."""
-        return DeviceIdentity(
-            device_type=self.device_type,
-            manufacturer="strands-robots",
-            model=self._model,
-            description=f"Robot {self._model}{profile_list()}",
-        )
-
-    def authorize(self, command: Command, arguments: Arguments) -> tuple[str, ...]:
-        """Refuse as every device does; note the policy for a robot without events."""
-        callers = super().authorize(command, arguments)
-        self._provider = arguments.get("policy_provider", self._provider)
-        return callers
 
     @emit()
     async def taskStarted(self, instruction: str, policy_provider: str, follows_instruction: bool = True) -> None:
@@ -141,7 +120,7 @@ class RobotDeviceDriver(RobotDriver):
         runs = activity.facts["task_status"] in RUNNING and instruction not in self.own_verbs
         if runs and self._began is None:
             self._began = time.monotonic()
-            await self.taskStarted(instruction=instruction, policy_provider=self._provider)
+            await self.taskStarted(instruction=instruction, policy_provider=self.policy_provider)
         elif not runs and self._began is not None:
             duration, self._began = time.monotonic() - self._began, None
             state = activity.facts["task_status"]
@@ -151,22 +130,23 @@ class RobotDeviceDriver(RobotDriver):
 
     async def tell_rollout(self, event: RolloutEvent) -> None:
         """Emit ``taskStarted``, ``streamStep`` or ``taskComplete``."""
+        fields = rollout_fields(event)
         if event.kind == "started":
-            await self.taskStarted(
-                instruction=event.instruction,
-                policy_provider=event.policy,
-                follows_instruction=event.follows_instruction,
-            )
+            await self.taskStarted(**fields)
         elif event.kind == "step":
-            await self.streamStep(
-                step=event.step, observation=plain_numbers(event.observation), action=plain_numbers(event.action)
-            )
+            await self.streamStep(**fields)
         else:
-            await self.taskComplete(
-                instruction=event.instruction,
-                steps=event.step,
-                duration=event.elapsed_s,
-                state=event.state,
-                error=event.error,
-                loop=dict(event.loop),
-            )
+            await self.taskComplete(duration=event.elapsed_s, **fields)
+
+
+class MobileBaseDeviceDriver(RobotDeviceDriver):
+    """A mobile base. Start it with drive, end it with stop."""
+
+    labels: ClassVar[Labels] = {"category": "mobile_base"}
+    verbs: ClassVar[Mapping[str, Verb]] = BASE_VERBS
+
+
+class NavigatingBaseDeviceDriver(MobileBaseDeviceDriver):
+    """A mobile base that was made with a ``nav_action``. Start it with drive or navigateTo, end it with stop."""
+
+    verbs: ClassVar[Mapping[str, Verb]] = NAVIGATING_BASE_VERBS

@@ -6,22 +6,20 @@ from collections.abc import Mapping
 from operator import eq
 from typing import Any, ClassVar, Optional
 
-from device_connect_edge.types import DeviceIdentity
-
 from strands_robots import settings
 from strands_robots.contract import Haltable, RolloutEvent
 from strands_robots.device_connect._compat import Labels, emit
-from strands_robots.device_connect.base_driver import Activity, RobotDriver, stated_type
+from strands_robots.device_connect.base_driver import RobotDriver, stated_type
+from strands_robots.device_connect.telemetry import Activity, rollout_fields
 from strands_robots.envelope import Envelope, fields_of
 from strands_robots.policies.base import plain_numbers
 from strands_robots.safety.authorization import Approval, Authorization
 from strands_robots.safety.stopping import StopVerdict
-from strands_robots.serving.policy_arguments import profile_list
 from strands_robots.serving.robot_verbs import WORLD_VERBS, served_world, world_stop_answer
+from strands_robots.serving.stops import WorldStop, robot_stop
 from strands_robots.serving.verbs import Verb
-from strands_robots.serving.world_stops import WorldStop, robot_stop
 
-Observed = tuple[float, int, dict[str, dict[str, float]]]
+Observed = tuple[float, int, Mapping[str, dict[str, float]]]
 """Simulated time, physics steps, and the joints of each robot."""
 
 
@@ -33,6 +31,7 @@ class SimulationDeviceDriver(RobotDriver):
     """
 
     device_type = "strands_sim"
+    noun = "Simulation"
     labels: ClassVar[Labels] = {"category": ["robot", "simulation"]}
     verbs: ClassVar[Mapping[str, Verb]] = WORLD_VERBS
 
@@ -47,19 +46,7 @@ class SimulationDeviceDriver(RobotDriver):
         world = served_world(sim)
         super().__init__(world, hardware=hardware, authorization=authorization, approval=approval)
         self.world = world
-        self._model = world.tool_name_str
         self.device_type = stated_type(sim, self.device_type)
-        self._observed: dict[str, dict[str, float]] = {}
-
-    @property
-    def identity(self) -> DeviceIdentity:
-        """Identity of this device; ``model`` is the simulation's own name."""
-        return DeviceIdentity(
-            device_type=self.device_type,
-            manufacturer="strands-robots",
-            model=self._model,
-            description=f"Simulation {self._model}{profile_list()}",
-        )
 
     def stop_target(self, robot_name: str = "") -> Haltable:
         """Return what ``stop`` halts: one robot, or the world and each rollout."""
@@ -150,41 +137,34 @@ class SimulationDeviceDriver(RobotDriver):
         """
 
     def glance(self) -> Activity:
-        """Return time, steps and policies of the world; store the joints for events."""
+        """Return time, steps, policies and joints of the world."""
         facts = fields_of(self.world.get_state())
         rows = self.world.list_policies_running()
         running = {str(row.get("robot", "")): {k: v for k, v in row.items() if k != "robot"} for row in rows}
         robots = facts.get("robots")
-        self._observed = {
-            str(name): plain_numbers(joints) for name, joints in (robots.items() if isinstance(robots, Mapping) else ())
+        joints = {
+            str(name): plain_numbers(each) for name, each in (robots.items() if isinstance(robots, Mapping) else ())
         }
         told = plain_numbers({key: facts.get(key) for key in ("sim_time", "step_count")})
-        return Activity(
-            bool(running),
-            {
-                "sim_time": told.get("sim_time", 0.0),
-                "step_count": int(told.get("step_count", 0)),
-                "running_policies": running,
-            },
-        )
-
-    def unchanged(self) -> bool:
-        """Look at the world, on a worker; False when its state or a joint is another one."""
-        observed = self._observed
-        return super().unchanged() and self._observed == observed
+        state = {
+            "sim_time": told.get("sim_time", 0.0),
+            "step_count": int(told.get("step_count", 0)),
+            "running_policies": running,
+        }
+        return Activity(bool(running), state, joints=joints)
 
     def watches(self) -> list[Any]:
         """State as every robot, and observations besides."""
         hz = settings.number("STRANDS_DC_OBSERVATION_HZ")
-        return [*super().watches(), self.reporting(self._look_at_joints, self._tell_observations, eq, hz, hz)]
+        return [*super().watches(), self.reports.watch(self._look_at_joints, self._tell_observations, eq, hz, hz)]
 
     async def tell(self, activity: Activity) -> None:
         """Emit ``stateUpdate``."""
         await self.stateUpdate(**activity.facts)
 
     async def _look_at_joints(self) -> Observed | None:
-        activity = await self.refresh()
-        return None if activity.fault else (activity.facts["sim_time"], activity.facts["step_count"], self._observed)
+        activity = await self.reports.refresh()
+        return None if activity.fault else (activity.facts["sim_time"], activity.facts["step_count"], activity.joints)
 
     async def _tell_observations(self, observed: Observed) -> None:
         sim_time, step_count, robots = observed
@@ -193,26 +173,10 @@ class SimulationDeviceDriver(RobotDriver):
 
     async def tell_rollout(self, event: RolloutEvent) -> None:
         """Emit ``policyStarted``, ``streamStep`` or ``policyComplete``."""
+        fields = {"robot_name": event.robot, **rollout_fields(event)}
         if event.kind == "started":
-            await self.policyStarted(
-                robot_name=event.robot,
-                instruction=event.instruction,
-                policy_provider=event.policy,
-                follows_instruction=event.follows_instruction,
-            )
+            await self.policyStarted(**fields)
         elif event.kind == "step":
-            await self.streamStep(
-                step=event.step,
-                observation=plain_numbers(event.observation),
-                action=plain_numbers(event.action),
-                robot_name=event.robot,
-            )
+            await self.streamStep(**fields)
         else:
-            await self.policyComplete(
-                robot_name=event.robot,
-                instruction=event.instruction,
-                steps=event.step,
-                state=event.state,
-                error=event.error,
-                loop=dict(event.loop),
-            )
+            await self.policyComplete(**fields)

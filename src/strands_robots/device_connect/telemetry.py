@@ -13,12 +13,19 @@ import operator
 import threading
 import time
 from collections import deque
-from collections.abc import Awaitable, Callable
-from typing import Protocol, TypeVar
+from collections.abc import Awaitable, Callable, Coroutine, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol, TypeVar
 
-from strands_robots.contract import RolloutEvent
-from strands_robots.serving.rate_limiter import RateLimiter
-from strands_robots.serving.workers import UNBOUNDED, ShareFullError
+from strands_robots import settings
+from strands_robots.contract import Robot, RolloutEvent
+from strands_robots.device_connect._compat import describe_anew
+from strands_robots.device_connect.presence import lock_stated
+from strands_robots.policies.base import plain_numbers
+from strands_robots.rate_limits import RateLimiter
+from strands_robots.serving.offered_verbs import Offers
+from strands_robots.serving.pipeline import Pipeline
+from strands_robots.serving.workers import UNBOUNDED, ShareFullError, called
 
 logger = logging.getLogger(__name__)
 
@@ -32,6 +39,12 @@ CATCH_UP = 50.0
 
 CATCH_UP_AT_START = 2.0
 """The same for a loop that has just started."""
+
+READ_DEADLINE_S = 5.0
+"""Seconds in which a robot has to have answered a read."""
+
+FIRST_LOOK_S = 0.02
+"""Seconds from the start of a device to its first state."""
 
 AGAIN_S = 10.0
 """Seconds after which an unchanged state is told again, unread, for listeners that came later or lost one."""
@@ -227,3 +240,188 @@ def sweep(hz: float) -> IdleSweep:
     if loop not in _SWEEPS:
         _SWEEPS[loop] = IdleSweep(loop, hz)
     return _SWEEPS[loop]
+
+
+def rollout_fields(event: RolloutEvent) -> dict[str, Any]:
+    """Return what a device tells of an event of a rollout."""
+    if event.kind == "started":
+        return {
+            "instruction": event.instruction,
+            "policy_provider": event.policy,
+            "follows_instruction": event.follows_instruction,
+        }
+    if event.kind == "step":
+        observation, action = plain_numbers(event.observation), plain_numbers(event.action)
+        return {"step": event.step, "observation": observation, "action": action}
+    return {
+        "instruction": event.instruction,
+        "steps": event.step,
+        "state": event.state,
+        "error": event.error,
+        "loop": dict(event.loop),
+    }
+
+
+@dataclass(frozen=True, slots=True)
+class Activity:
+    """Present activity of a robot, as status, presence and events report it.
+
+    Attributes:
+        joints: of each robot of a world, which events of their own tell.
+    """
+
+    busy: bool = False
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    fault: str = ""
+    joints: Mapping[str, dict[str, float]] = field(default_factory=dict, compare=False)
+
+
+class ReportedDevice(Protocol):
+    """A driver whose robot's activity is reported."""
+
+    robot: Robot
+    runtime: Any
+    offers: Offers
+    pipeline: Pipeline
+
+    @property
+    def peer_id(self) -> str:
+        """The device's id on the network."""
+
+    def glance(self) -> Activity:
+        """Ask the robot for its activity. May block: runs on a thread."""
+
+    def same(self, one: Activity, other: Activity) -> bool:
+        """Return True for two activities of which the second one need not be told."""
+
+    def status_of(self, activity: Activity) -> dict[str, Any]:
+        """Return the fields of the device's status."""
+
+    async def tell_rollout(self, event: RolloutEvent) -> None:
+        """Emit the events that belong to ``event``."""
+
+
+class StateReports:
+    """The activity of one device's robot: read on threads, told when it changes."""
+
+    def __init__(self, device: Any) -> None:
+        self._device: ReportedDevice = device
+        self.activity = Activity()
+        """As it was read last."""
+        self._read = False
+        self._changed: list[asyncio.Event] = []
+        self._looking = 0
+        self._rolling: set[str] = set()
+
+    @property
+    def present(self) -> Activity:
+        """The activity as it was read last; before the first look it is read now."""
+        if self._read:
+            return self.activity
+        try:
+            return self._device.pipeline.shares.read.call(self._device.glance).result(1.0)
+        except Exception as exc:  # noqa: BLE001 - a robot that cannot answer is shown with its fault
+            return Activity(fault=f"{type(exc).__name__}: {exc}")
+
+    @property
+    def quiet(self) -> bool:
+        """True while the robot does nothing and is not being looked at."""
+        return not (self.activity.busy or self._rolling or self.activity.fault or self._looking)
+
+    def unchanged(self) -> bool:
+        """Look at the robot, on a worker; False when its state, verbs or lock are others."""
+        device = self._device
+        if not lock_stated(device).items() <= device.runtime.status.items():
+            return False
+        activity = device.glance()
+        same = device.same(activity, self.activity) and activity.joints == self.activity.joints
+        return same and not device.robot.gate.under_way and not device.offers.look()
+
+    def wake(self) -> None:
+        """Look at the robot at once; on the loop."""
+        for changed in self._changed:
+            changed.set()
+
+    def watch(
+        self,
+        look: Callable[[], Awaitable[T | None]],
+        tell: Callable[[T], Awaitable[None]],
+        same: Callable[[T, T], bool],
+        busy_hz: float,
+        moving_hz: float,
+    ) -> Coroutine[Any, Any, None]:
+        """Return a watch that tells a state whenever it changed.
+
+        Args:
+            look: reads the state; None when it cannot be read.
+            tell: emits it.
+            same: returns True for two states of which the second one need not be told.
+            busy_hz: looks a second while something runs.
+            moving_hz: the same while nothing runs and the state changes nevertheless.
+        """
+        idle_hz, changed = settings.number("STRANDS_DC_STATE_HZ"), asyncio.Event()
+        self._changed.append(changed)
+
+        def rate(moved: bool) -> float:
+            # A robot may tell that a rollout began before its own status says so.
+            if self.activity.busy or self._rolling:
+                return busy_hz
+            # A quiet robot is looked at by the sweep.
+            return moving_hz if moved else idle_hz if self.activity.fault else 0.0
+
+        async def after_the_start() -> None:
+            # The first look costs the start of the device nothing.
+            await asyncio.sleep(FIRST_LOOK_S)
+            await report_changes(look, tell, rate=rate, changed=changed, most_hz=busy_hz, same=same)
+
+        return after_the_start()
+
+    async def look(self) -> Activity | None:
+        """Ask the robot again; None where it cannot be read."""
+        activity = await self.refresh()
+        return None if activity.fault else activity
+
+    async def read(self) -> None:
+        """Ask the robot for its activity, once until :meth:`end`."""
+        if not self._read:
+            self.activity = await self._looked()
+            self._read = True
+
+    async def refresh(self) -> Activity:
+        """Ask the robot again; the answer is what status and presence say from now on."""
+        activity = self.activity = await self._looked()
+        # The runtime announces this very mapping in its presence.
+        self._device.runtime.status.update(self._device.status_of(activity))
+        describe_anew(self._device.runtime, self._device)
+        return activity
+
+    async def on_rollout(self, event: RolloutEvent) -> None:
+        """Tell an event of a rollout, and look at the robot where one began or ended."""
+        if event.kind == "started":
+            self._rolling.add(event.robot)
+        elif event.kind == "finished":
+            self._rolling.discard(event.robot)
+        await self._device.tell_rollout(event)
+        if event.kind != "step":
+            self.wake()
+
+    def end(self) -> None:
+        """Forget the watches; the next status asks the robot."""
+        self._changed, self._read = [], False
+
+    async def _looked(self) -> Activity:
+        def glance() -> Activity:
+            device.offers.look()
+            return device.glance()
+
+        device, self._looking = self._device, self._looking + 1
+        try:
+            activity = await called(device.pipeline.shares.read, glance, READ_DEADLINE_S)
+            return replace(activity, busy=True) if device.robot.gate.under_way else activity
+        except Exception as exc:  # noqa: BLE001 - whatever a robot's read raises is its state to tell
+            fault = f"{type(exc).__name__}: {exc}"
+            if fault != self.activity.fault:
+                logger.warning("%s: its state cannot be read: %s", device.peer_id, fault)
+            return replace(self.activity, fault=fault)
+        finally:
+            self._looking -= 1

@@ -28,7 +28,7 @@ from strands_robots.fleet.adapter import (
     silent,
 )
 from strands_robots.fleet.joining import Joining, on_own_thread, side_by_side, those
-from strands_robots.serving.known_verbs import READS, RESUMES, STOPS
+from strands_robots.serving.advertised import READS, RESUMES, STOPS
 from strands_robots.utils import near, plain_text
 
 if TYPE_CHECKING:

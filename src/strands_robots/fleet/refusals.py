@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Awaitable, Mapping
 from typing import Any, Protocol
 
-from strands_robots.envelope import Envelope, error, text_of
+from strands_robots.envelope import Envelope, RefusalReason, error, text_of
 from strands_robots.errors import (
     ApprovalError,
     ArgumentsError,
@@ -24,7 +24,6 @@ from strands_robots.errors import (
     UnknownVerbError,
     UnreachableError,
 )
-from strands_robots.serving.refused import RefusalReason
 from strands_robots.utils import near, plain_text
 
 WHY_MAX = 500

@@ -32,8 +32,15 @@ from strands_robots.fleet.networks import STILL, Networks
 from strands_robots.fleet.refusals import refusal_of
 from strands_robots.fleet.reports import EventFeed
 from strands_robots.safety.stopping import StopVerdict
-from strands_robots.serving.advertised import PYTHON_TYPES, AdvertisedParameter, AdvertisedVerb, RobotDescription
-from strands_robots.serving.known_verbs import READS, RESUMES, STOPS
+from strands_robots.serving.advertised import (
+    PYTHON_TYPES,
+    READS,
+    RESUMES,
+    STOPS,
+    AdvertisedParameter,
+    AdvertisedVerb,
+    RobotDescription,
+)
 from strands_robots.serving.verbs import LEASE_ID
 from strands_robots.utils import DURATION_MAX_S, START_S, WAIT_S, near, number, optional_module, shown, text
 

@@ -37,7 +37,7 @@ from strands_robots.fleet.refusals import refusal_of
 from strands_robots.mcp.caller import Caller, ClientAccess
 from strands_robots.mcp.results import jpeg_of, result
 from strands_robots.safety.authorization import Approval, Grants, digest
-from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS
+from strands_robots.serving.arm_verbs import ARM_MOTION_VERBS
 from strands_robots.state_files import StateFileError, state_dir
 from strands_robots.utils import ValidationError
 

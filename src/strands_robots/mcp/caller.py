@@ -235,7 +235,10 @@ class Caller:
     async def query(
         self, robot: str, verb: str, params: Mapping[str, Any] | None = None, lasts_s: float = 0.0
     ) -> Envelope:
-        """Call a read that may last so long, in the client's turn: no burst of reads fills the robot."""
+        """Call a read in the client's turn, so that no burst of reads fills the robot.
+
+        It may last ``lasts_s`` seconds besides the usual time of an answer.
+        """
         try:
             async with self._queries.turn(robot, ANSWER_S):
                 return await self.call(robot, verb, params, ANSWER_S + lasts_s)
@@ -256,9 +259,10 @@ class Caller:
         return network.received(robot, _named_on(network, verb), params)
 
     async def move(self, robot: str, verb: str, params: Mapping[str, Any]) -> Envelope:
-        """Carry out a motion of an arm, to its end with ``wait``; a call that is given up halts it.
+        """Carry out a motion of an arm; a call that is given up halts it.
 
-        Without ``wait`` the lease has to be held, whose end halts the robot of a client that went away.
+        With ``wait`` it is followed to its end. Without it the lease has to be held, whose end halts the robot of a
+        client that went away.
         """
         named = {name: value for name, value in params.items() if name == "robot_name"}
 

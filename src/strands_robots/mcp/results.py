@@ -15,8 +15,7 @@ from strands_robots.envelope import Envelope, error, is_error, jsonable, success
 from strands_robots.errors import NoSuchRobotError, RefusalError
 from strands_robots.fleet.adapter import FoundRobot
 from strands_robots.fleet.refusals import answer_to
-from strands_robots.serving.advertised import AdvertisedVerb, RobotDescription, find_verb, fitting, verb_names
-from strands_robots.serving.known_verbs import STOPS
+from strands_robots.serving.advertised import STOPS, AdvertisedVerb, RobotDescription, find_verb, fitting, verb_names
 from strands_robots.utils import near, shown
 
 T = TypeVar("T")

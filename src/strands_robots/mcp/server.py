@@ -317,7 +317,7 @@ class _Lines:
 
 
 async def serve_stdio(networks: Networks, source: str, *, read_only: bool = False) -> None:
-    """Serve one client of this name on stdio; at its end halt what it moves and holds."""
+    """Serve one client on stdio; at its end halt what it moves and holds."""
     pictures, caller, standing = PictureFiles(), Caller(networks), StandingController(source, networks)
     access = ClientAccess(caller, approves=True, show_picture=pictures.show)
     resources = RobotResources(networks)

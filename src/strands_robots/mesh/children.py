@@ -25,12 +25,11 @@ from strands_robots.mesh.session import Context
 from strands_robots.mesh.transport import Declaration, Sample, TransportError, undeclare
 from strands_robots.safety.gate import MotionRequest
 from strands_robots.safety.identity import SigningIdentity
-from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS
+from strands_robots.serving.arm_verbs import ARM_MOTION_VERBS, PICTURE_VERBS
 from strands_robots.serving.peer_verbs import PEER_VERBS, TELEOP_VERBS, description_of
-from strands_robots.serving.picture_verbs import PICTURE_VERBS
 from strands_robots.serving.pipeline import Own, Pipeline
+from strands_robots.serving.stops import OneRobot
 from strands_robots.serving.verbs import Arguments, Verb
-from strands_robots.serving.world_stops import OneRobot
 from strands_robots.utils import ValidationError, identifier
 
 logger = logging.getLogger(__name__)

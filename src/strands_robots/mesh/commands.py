@@ -9,7 +9,7 @@ from types import MappingProxyType
 from typing import Any, Literal
 
 from strands_robots.contract import Haltable, Robot, holds_robots
-from strands_robots.envelope import Envelope, is_error
+from strands_robots.envelope import Envelope, RefusalReason, Refused, is_error
 from strands_robots.mesh import topics, wire
 from strands_robots.mesh.estop_retry import ESTOP
 from strands_robots.mesh.scheduler import RecentKeys
@@ -19,16 +19,12 @@ from strands_robots.mesh.wire_identity import MOTION, IdentityError
 from strands_robots.safety.identity import SigningIdentity
 from strands_robots.safety.statements import with_stop_statement
 from strands_robots.safety.stopping import Outcome, StopVerdict, explain, grade
-from strands_robots.serving.leave import Command
-from strands_robots.serving.peer_verbs import PEER_VERBS
-from strands_robots.serving.pipeline import Own, Pipeline, Result, busy
-from strands_robots.serving.refused import RefusalReason, Refused
-from strands_robots.serving.robot_verbs import peer_stop_answer, run_to_end
-from strands_robots.serving.stop_requests import Request as StopRequest
-from strands_robots.serving.stop_requests import StopRequests
+from strands_robots.serving.peer_verbs import PEER_VERBS, peer_stop_answer, run_to_end
+from strands_robots.serving.pipeline import Command, Own, Pipeline, Result, busy
+from strands_robots.serving.stops import Request as StopRequest
+from strands_robots.serving.stops import StopRequests, robot_stop, stop_within
 from strands_robots.serving.verbs import Arguments, Kind, Verb
 from strands_robots.serving.workers import ShareFullError
-from strands_robots.serving.world_stops import robot_stop, stop_within
 from strands_robots.stop_log import stop_logger
 from strands_robots.utils import RESERVED_IDS, ValidationError, shown
 
@@ -119,7 +115,7 @@ class SenderCheck:
 
     def _require_first(self, request: wire.Request) -> None:
         """Raise :class:`IdentityError` for another's command, or one sent before."""
-        if not request.is_for(self._context.peer_id):
+        if request.body.get("target_id") not in (self._context.peer_id, wire.BROADCAST_TARGET):
             raise IdentityError("it was signed for another peer")
         if request.timestamp is None or self._context.predates(request.timestamp):
             raise IdentityError("it was issued before this peer started, by its sender's clock; send it again")
@@ -209,18 +205,18 @@ class CommandReceiver:
             self._lock_first(request, sample)
             self._stop(request, verb)
             return
-        named = request.command.get("robot_name")
-        arrived = self._pipeline.pending.arrive(named if isinstance(named, str) else "")
         # A verb of a robot's own refuses what it does not have; the others drop it.
         arguments = {name: value for name, value in request.command.items() if name != "action"}
-        command = Command(verb, arguments if verb.own else request.command, request.sender_id, arrived, request)
+        given = arguments if verb.own else request.command
         answered = partial(self._answer, request, verb)
         if verb.name == "ping":
             # It reaches nothing below the mesh, so it waits for no worker and no worker waits for it.
-            self._pipeline.serve(command, answered)
+            self._pipeline.serve(Command(verb, given, request.sender_id, proof=request), answered)
             return
+        arrived = self._pipeline.pending.arrive(request.command.get("robot_name"))
+        command = Command(verb, given, request.sender_id, arrived, request)
         try:
-            self._pipeline.share(verb).submit(partial(self._pipeline.serve, command, answered))
+            self._pipeline.shares.by_name[verb.share].submit(partial(self._pipeline.serve, command, answered))
         except ShareFullError:
             answered(busy(command))
 

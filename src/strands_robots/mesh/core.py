@@ -36,12 +36,12 @@ from strands_robots.safety.gate import MotionGate
 from strands_robots.safety.persistence import simulation_key
 from strands_robots.safety.plane import SafetyPlane
 from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope, none_known, own_cell
-from strands_robots.serving.own_verbs import own_verbs
+from strands_robots.serving.offered_verbs import own_verbs
 from strands_robots.serving.peer_verbs import description_of
 from strands_robots.serving.pipeline import Own, Pipeline
 from strands_robots.serving.robot_verbs import served
 from strands_robots.tags import tags_of
-from strands_robots.utils import number, text
+from strands_robots.utils import DURATION_MAX_S, number, text
 
 logger = logging.getLogger(__name__)
 
@@ -431,7 +431,7 @@ class Mesh(SensorLoopsMixin):
     def tell(self, target: str, instruction: str, **kw: Any) -> dict[str, Any]:
         """Ask a peer to ``execute`` with a ``policy_provider`` and wait."""
         duration = kw.get("duration")
-        patience = 30.0 + (duration if isinstance(duration, int | float) and 0 < duration <= 3600 else 30.0)
+        patience = 30.0 + (duration if isinstance(duration, int | float) and 0 < duration <= DURATION_MAX_S else 30.0)
         timeout = kw.pop("timeout", patience)
         return self.send(target, {"action": "execute", "instruction": instruction, **kw}, timeout)
 

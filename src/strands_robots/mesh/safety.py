@@ -35,9 +35,8 @@ from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope, none_know
 from strands_robots.safety.statements import Proof, Purpose, enrolled_peers, proof_of, record_heads
 from strands_robots.safety.stop_link import ESTOP, StopEvent
 from strands_robots.safety.stopping import Outcome, StopVerdict
-from strands_robots.serving.peer_verbs import PEER_VERBS
+from strands_robots.serving.peer_verbs import PEER_VERBS, peer_stop_answer
 from strands_robots.serving.pipeline import Own
-from strands_robots.serving.robot_verbs import peer_stop_answer
 from strands_robots.serving.verbs import Arguments
 from strands_robots.serving.workers import Share, ShareFullError
 from strands_robots.stop_log import stop_logger
@@ -83,7 +82,7 @@ def status_of(robot: Robot, facts: Callable[[str], Mapping[str, Any]]) -> Own:
 
 
 class FleetSafety:
-    """Issues and receives fleet e-stops and resumes for one peer.
+    """Emergency stops, resumes and check-ins of one peer.
 
     Args:
         resumes: checks a relayed resume off the transport's thread.

@@ -171,39 +171,30 @@ def checked_speeds(value: object, keys: Iterable[str]) -> dict[str, float]:
     }
 
 
-class SpeedLimit:
-    """Bound on how fast each target may change, in units a second of its key.
+def speeds_across(ranges: Ranges, full_ranges_per_s: float, unbounded_per_s: float) -> dict[str, float]:
+    """Return speeds by key: its range so often a second, or one without a range.
 
     Args:
-        ranges: a key with a finite range may cross it ``full_ranges_per_s`` times a second.
         full_ranges_per_s: above 0.
-        unbounded_per_s: bound of a key without a range, in its unit a second.
-        speeds: bound of each key's own speed; a key that is named in neither has none.
+        unbounded_per_s: in the key's unit a second.
     """
+    return {
+        key: (high - low) * full_ranges_per_s if math.isfinite(high - low) else unbounded_per_s
+        for key, (low, high) in ranges.items()
+    }
 
-    def __init__(
-        self,
-        ranges: Ranges,
-        full_ranges_per_s: float,
-        unbounded_per_s: float,
-        *,
-        speeds: Mapping[str, float] | None = None,
-    ) -> None:
-        self._per_s: dict[str, float] = {
-            key: (high - low) * full_ranges_per_s if math.isfinite(high - low) else unbounded_per_s
-            for key, (low, high) in ranges.items()
-        } | dict(speeds or {})
 
-    def limit(self, target: Action, last: Mapping[str, float], dt: float) -> Action:
-        """Return ``target``, moved no further from ``last`` than ``dt`` seconds allow.
+def limited(target: Action, last: Mapping[str, float], speeds: Mapping[str, float], dt: float) -> Action:
+    """Return ``target``, moved no further from ``last`` than ``dt`` seconds allow.
 
-        A key without a last value, or without a bound, is not limited.
-        """
-        limited: Action = {}
-        for key, value in target.items():
-            per_s, before = self._per_s.get(key), last.get(key, value)
-            limited[key] = value if per_s is None else min(max(value, before - per_s * dt), before + per_s * dt)
-        return limited
+    Args:
+        speeds: greatest speed by key, in its unit a second; a key without one, or without a last value, has no bound.
+    """
+    bounded: Action = {}
+    for key, value in target.items():
+        per_s, before = speeds.get(key), last.get(key, value)
+        bounded[key] = value if per_s is None else min(max(value, before - per_s * dt), before + per_s * dt)
+    return bounded
 
 
 logger = logging.getLogger(__name__)
@@ -257,21 +248,21 @@ class MockPolicy:
             present = numbers(observation)
             self._start = {key: min(max(present.get(key, (a + b) / 2), a), b) for key, (a, b) in self._ranges.items()}
         seconds = self._step * self._dt
-        faded = min(seconds / self._fade_s, 1.0)
+        part = min(seconds / self._fade_s, 1.0)
         # The quintic from 0 to 1, smooth in velocity and acceleration.
-        share = faded * faded * faded * (faded * (6 * faded - 15) + 10)
+        share = part * part * part * (part * (6 * part - 15) + 10)
         self._step += 1
-        return {key: (1 - share) * self._start[key] + share * self._wave(key, seconds) for key in self._ranges}
+        action: Action = {}
+        for key, (low, high) in self._ranges.items():
+            slow, slow_phase, fast, fast_phase = self._waves[key]
+            swing = 0.7 * math.sin(math.tau * slow * seconds + slow_phase)
+            swing += 0.3 * math.sin(math.tau * fast * seconds + fast_phase)
+            wave = (low + high) / 2 + self._amplitude * (high - low) / 2 * swing
+            action[key] = (1 - share) * self._start[key] + share * wave
+        return action
 
     def interrupt(self) -> None:
         """Do nothing: this policy never waits."""
 
     def close(self) -> None:
         """Do nothing: this policy has no resources."""
-
-    def _wave(self, key: str, seconds: float) -> float:
-        low, high = self._ranges[key]
-        slow, slow_phase, fast, fast_phase = self._waves[key]
-        swing = 0.7 * math.sin(math.tau * slow * seconds + slow_phase)
-        swing += 0.3 * math.sin(math.tau * fast * seconds + fast_phase)
-        return (low + high) / 2 + self._amplitude * (high - low) / 2 * swing

@@ -18,7 +18,16 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from typing import Any, Protocol, runtime_checkable
 
-from strands_robots.policies.base import Action, Policy, PolicyError, Ranges, SpeedLimit, is_velocity, numbers
+from strands_robots.policies.base import (
+    Action,
+    Policy,
+    PolicyError,
+    Ranges,
+    is_velocity,
+    limited,
+    numbers,
+    speeds_across,
+)
 from strands_robots.policies.check import CONVERTIBLE, PolicyCheckError, RobotFacts, check_policy, statements_of
 from strands_robots.policies.preload import Warmable, computing, require_warm
 from strands_robots.policies.profiles import CameraMap, Profile
@@ -390,7 +399,7 @@ class ProfiledPolicy:
         self._now: Callable[[], float] = time.monotonic
         self._scale: dict[str, float] = {}
         self._unanswered_logged = False
-        self._limit: SpeedLimit | None = None
+        self._speeds: dict[str, float] = {}
         self._last: Action = {}
         self._hz = profile.rate or 0.0
         self._inference: Inference = InferenceWorker(profile.name, self._infer, inner.close)
@@ -458,7 +467,8 @@ class ProfiledPolicy:
     def reset(self, instruction: str, ranges: Ranges) -> None:
         profile = self.profile
         inner = {key: _scaled_range(ranges[key], self._scale[key]) for key in profile.action}
-        self._limit = None if profile.max_speed is None else SpeedLimit(ranges, profile.max_speed, UNBOUNDED_PER_S)
+        fastest = profile.max_speed
+        self._speeds = {} if fastest is None else speeds_across(ranges, fastest, UNBOUNDED_PER_S)
         self._last = {}
         horizon = 1 if getattr(self._inner, "every_tick", False) else profile.horizon
         self._player = ChunkPlayer(rate=profile.rate or self._hz, hz=self._hz, horizon=horizon)
@@ -577,10 +587,9 @@ class ProfiledPolicy:
             raise PolicyError(str(exc)) from None
 
     def _limited(self, target: Action) -> Action:
-        if self._limit is not None:
-            limited = self._limit.limit(target, self._last, 1 / self._hz)
-            self._counts.speed_limited_steps += limited != target
-            target = limited
+        bounded = limited(target, self._last, self._speeds, 1 / self._hz)
+        self._counts.speed_limited_steps += bounded != target
+        target = bounded
         self._last = target
         return target
 

@@ -14,7 +14,18 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from strands_robots import settings
-from strands_robots.utils import ValidationError, choice, flag, identifier, mapping, number, shown, text, whole
+from strands_robots.utils import (
+    ValidationError,
+    choice,
+    duration,
+    flag,
+    identifier,
+    mapping,
+    number,
+    shown,
+    text,
+    whole,
+)
 
 UNITS = ("degrees", "radians", "normalized", "percent", "metres")
 LAYOUTS = ("libero", "droid", "aloha", "n1.5", "n1.6", "n1.6-flat")
@@ -268,7 +279,7 @@ def _text(longest: int) -> Callable[[str, object], str]:
 
 
 def _seconds(name: str, value: object) -> float:
-    return number(name, value, above=0, high=3600)
+    return duration(name, value)
 
 
 _ENTRIES: dict[str, Callable[[str, object], Any]] = {

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from typing import Any, Literal, Protocol, TypedDict
 
-from strands_robots.contract import Observer, RolloutEvent, Unsubscribe
+from strands_robots.contract import Observers, RolloutEvent
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.policies.base import (
     Action,
@@ -24,9 +24,9 @@ from strands_robots.policies.base import (
     Policy,
     PolicyError,
     Ranges,
-    SpeedLimit,
     checked_action,
     is_velocity,
+    limited,
     numbers,
 )
 from strands_robots.safety.gate import Permit, PermitVoidError
@@ -129,39 +129,8 @@ class Clock:
             stop.wait(left)
 
 
-class RolloutObservers:
-    """Observers of rollout events; one that raises is logged and stays subscribed."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._observers: tuple[Observer, ...] = ()
-        self._logged: set[tuple[int, str]] = set()
-
-    def subscribe(self, observer: Observer) -> Unsubscribe:
-        """Call ``observer`` with every event; the returned callable ends that."""
-        with self._lock:
-            self._observers = (*self._observers, observer)
-        once = threading.Lock()
-
-        def unsubscribe() -> None:
-            if once.acquire(blocking=False):
-                with self._lock:
-                    left = list(self._observers)
-                    left.remove(observer)
-                    self._observers = tuple(left)
-
-        return unsubscribe
-
-    def notify(self, event: RolloutEvent) -> None:
-        """Call every observer, in the calling thread."""
-        for observer in self._observers:
-            try:
-                observer(event)
-            except Exception as exc:
-                failure = (id(observer), type(exc).__name__)
-                if failure not in self._logged:
-                    self._logged.add(failure)
-                    logger.exception("An observer of %s raised; it stays subscribed.", event.robot)
+RolloutObservers = Observers[RolloutEvent]
+"""Observers of the rollouts of one robot."""
 
 
 def unfollowed(rollout: Rollout) -> str:
@@ -221,12 +190,12 @@ class Rollout:
         self._observers = observers or RolloutObservers()
         self._clock = clock or Clock()
         self._ends_at_rest = ends_at_rest
-        self._speed = SpeedLimit({}, 1.0, 1.0, speeds=body.speeds)
+        self._speeds = dict(body.speeds)
         self._last: dict[str, float] = {}
         self._written_at = -math.inf
         self._held_back: Action = {}
         self._moving = False
-        self._holds = permit.holds
+        self._holds = permit.request.gate.holds
         self._stop_requested = threading.Event()
         self._begun = threading.Event()
         self._paced = policy if isinstance(policy, Paced) else None
@@ -338,7 +307,7 @@ class Rollout:
                         self._begun.set()
                     finally:
                         self._notify("started")
-                    self._permit.begin()
+                    self._permit.request.begun = True
                     state = self._loop(bounds)
                 except PermitVoidError:
                     state = "stopped"
@@ -387,7 +356,7 @@ class Rollout:
                 wanted = chunk.popleft()
                 checked = checked_action(wanted, bounds)
                 self.out_of_range_steps += any(checked[key] != wanted[key] for key in checked)
-                action = self._limited(checked, observation)
+                action = self._limited(checked, observation) if self._speeds else checked
                 sent = self._body.send_action(action, self._permit)
                 self._moving = any(is_velocity(key) and value for key, value in sent.items())
                 self.step_count += 1
@@ -414,7 +383,7 @@ class Rollout:
             self._moving = False
             self._body.hold(self._permit)
         self._permit.wait()
-        before, self._holds = self._holds, self._permit.holds
+        before, self._holds = self._holds, self._permit.request.gate.holds
         return self._holds != before
 
     def _limited(self, action: Action, observation: Mapping[str, Any]) -> Action:
@@ -423,10 +392,10 @@ class Rollout:
         # A pause must not add up to a jump.
         dt = min(now - self._written_at, self._period)
         wanted = {**self._held_back, **action}
-        limited = self._speed.limit(wanted, {**numbers(observation), **self._last}, dt)
-        self._written_at, self._last = now, {**self._last, **limited}
-        self._held_back = {key: value for key, value in wanted.items() if limited[key] != value}
-        return limited
+        bounded = limited(wanted, {**numbers(observation), **self._last}, self._speeds, dt)
+        self._written_at, self._last = now, {**self._last, **bounded}
+        self._held_back = {key: value for key, value in wanted.items() if bounded[key] != value}
+        return bounded
 
     def _next(self, tick: int, started: float) -> int:
         late = int((self._clock.now() - started) / self._period) - tick

@@ -78,18 +78,6 @@ def bare_kind(kind: str) -> str:
     return f"{found[1]}/{found[2]}" if found else kind
 
 
-def class_place(kind: str, section: str) -> tuple[str, str]:
-    """Return module and class of an interface; ``section``: msg, srv or action.
-
-    Raises:
-        ValidationError: ``kind`` is no interface type.
-    """
-    found = _KIND.match(kind)
-    if found is None:
-        raise ValidationError(f"type must be a ROS type such as geometry_msgs/msg/Twist, not {shown(kind)}.")
-    return f"{found[1]}.{section}", found[2]
-
-
 def node_name(name: str, value: object) -> str:
     """Check the name of a node: letters, digits and underscores, the first no digit."""
     if not isinstance(value, str) or len(value) > NAME_MAX or not _NODE.match(value):

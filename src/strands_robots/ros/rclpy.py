@@ -22,8 +22,8 @@ from strands_robots.ros.link import (
     Unwatch,
     absolute,
     bare_kind,
-    class_place,
     domain,
+    interface,
     is_latched,
     never,
     next_message,
@@ -447,7 +447,8 @@ def _send(publisher: Any, message: Any, topic: str, kind: str) -> None:
 
 def interface_class(kind: str, section: str) -> Any:
     """Return the class of an interface; ``section`` is msg, srv or action."""
-    module, name = class_place(kind, section)
+    package, _, name = bare_kind(interface("type", kind)).partition("/")
+    module = f"{package}.{section}"
     try:
         found = getattr(import_module(module), name, None)
     except ModuleNotFoundError as exc:

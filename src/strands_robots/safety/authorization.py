@@ -87,7 +87,7 @@ def motion_refusal(source: object, allow: Sequence[str], *, hardware: bool) -> s
             "A caller without a name may not move this robot: add 'anonymous' to DEVICE_CONNECT_RPC_ALLOW to admit "
             "those, or have the caller name itself."
         )
-    if matches(name, [pattern for pattern in listed if pattern != ANONYMOUS]):
+    if any(fnmatchcase(name, pattern) for pattern in listed if pattern != ANONYMOUS):
         return None
     return f"Caller {shown(name)} may not move this robot: no entry of DEVICE_CONNECT_RPC_ALLOW fits it."
 
@@ -128,9 +128,9 @@ class Authorization:
         self._robot = robot
         self._warned = threading.Event()
 
-    def motion(self, source: object, verb: str) -> str | None:
-        """Return and log the reason why ``source`` may not do ``verb``, or None."""
-        allow = self._read("DEVICE_CONNECT_RPC_ALLOW")
+    def motion(self, source: object, verb: str, provider: str = "") -> str | None:
+        """Return and log why ``source`` may not do ``verb`` by a policy, or None."""
+        allow, providers = self._read("DEVICE_CONNECT_RPC_ALLOW"), self._read("STRANDS_MESH_POLICY_TYPE_ALLOW")
         refusal = motion_refusal(source, allow, hardware=self.hardware)
         if refusal is not None:
             logger.warning("%s: %s refused to caller %s (self-declared).", self._robot, verb, shown(source))
@@ -140,6 +140,8 @@ class Authorization:
                 "%s moves for any caller on its network: it is a simulation and DEVICE_CONNECT_RPC_ALLOW is not set.",
                 self._robot,
             )
+        if refusal is None and provider and providers:
+            return provider_refusal(provider, providers)
         return refusal
 
     def opened(self) -> str | None:
@@ -151,10 +153,6 @@ class Authorization:
     def estop(self, source: object) -> str | None:
         """Return the reason why an emergency stop of ``source`` does not count, or None."""
         return estop_refusal(source, self._read("DEVICE_CONNECT_ESTOP_ALLOW"))
-
-    def provider(self, provider: str) -> str | None:
-        """Return the reason why ``provider`` is refused over the network, or None."""
-        return provider_refusal(provider, self._read("STRANDS_MESH_POLICY_TYPE_ALLOW"))
 
 
 GRANT_S = 300.0
@@ -325,6 +323,11 @@ class Approval:
         self._bypass = bypass
         self._grants = grants
 
+    def standing(self, verb: str, peer: str, callers: Collection[str]) -> bool:
+        """Return whether ``verb`` is approved without a grant."""
+        allow = self._read("STRANDS_ROBOT_COMMAND_ALLOW")
+        return (bool(allow) and listed(verb, peer, allow, callers)) or self._bypass()
+
     def claim(self, verb: str, peer: str, callers: Collection[str] = (), arguments_digest: str = "") -> Leave | None:
         """Return leave to do ``verb`` on ``peer`` now, or None when not approved.
 
@@ -332,18 +335,15 @@ class Approval:
             callers: the names that an approval may know the caller by.
             arguments_digest: of the command's arguments, see :func:`digest`.
         """
-        if self._standing(verb, peer, callers):
+        if self.standing(verb, peer, callers):
             return Leave()
         return self._grants().claim(verb, peer, callers, arguments_digest)
 
     def given(self, verb: str, peer: str, callers: Collection[str] = (), arguments_digest: str = "") -> bool:
         """Return whether :meth:`claim` would give leave now; nothing is taken."""
-        if self._standing(verb, peer, callers):
+        if self.standing(verb, peer, callers):
             return True
         return bool(self._grants().fitting(verb, peer, callers, arguments_digest))
-
-    def _standing(self, verb: str, peer: str, callers: Collection[str]) -> bool:
-        return listed(verb, peer, self._read("STRANDS_ROBOT_COMMAND_ALLOW"), callers) or self._bypass()
 
     @staticmethod
     def refusal(verb: str, peer: str) -> str:

@@ -189,7 +189,7 @@ def chosen(log: str, audits: set[str]) -> list[str]:
 
 
 class CheckInAnswers:
-    """Answers to check-ins with the head of the own audit, one in ten seconds; thread-safe."""
+    """Answers to check-ins with the head of this machine's audit. Thread-safe."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock

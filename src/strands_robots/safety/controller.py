@@ -70,7 +70,7 @@ from strands_robots.safety.stop_link import (
 )
 from strands_robots.state_files import uptime
 from strands_robots.stop_log import stop_logger
-from strands_robots.utils import ValidationError, device_id, number, shown
+from strands_robots.utils import ValidationError, device_id, duration, number, shown
 
 logger = stop_logger(__name__)
 
@@ -216,7 +216,7 @@ class SafetyController:
             on_report: called with what standing controllers say they miss, on a thread of its own.
             scope: the robots that it is for; those that read no scope stop all the same.
         """
-        number("deadline_s", deadline_s, above=0, high=3600)
+        duration("deadline_s", deadline_s)
         if isinstance(expected, str):
             raise ValidationError(f"expected must be a collection of robot ids, not the text {expected!r}.")
         estop_id = estop_id or new_epoch()

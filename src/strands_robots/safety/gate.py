@@ -97,9 +97,9 @@ class MotionRequest:
 
     __slots__ = ("__weakref__", "begun", "gate", "generation", "given_up", "read")
 
-    def __init__(self, gate: MotionGate, generation: int, read: str = "") -> None:
+    def __init__(self, gate: MotionGate, generation: int | None = None, read: str = "") -> None:
         self.gate = gate
-        self.generation = generation
+        self.generation = gate.generation if generation is None else generation
         self.read = read
         self.given_up = False
         self.begun = False
@@ -157,11 +157,6 @@ class Permit:
     def held(self) -> bool:
         """True while motions hold: nothing may be written now, and the permit lives on."""
         return self._gate.held
-
-    @property
-    def holds(self) -> int:
-        """Rises with every hold of the robot."""
-        return self._gate.holds
 
     def wait(self) -> None:
         """Wait until no hold is on, or this permit is void.
@@ -246,7 +241,7 @@ class MotionGate:
     def held(self) -> bool:
         """True while motions hold: by :meth:`hold`, or after the process did not run."""
         now = self._awake.look()
-        return self._awake.held_at(now) or now < self._held_until
+        return now < self._awake.held_until or now < self._held_until
 
     @property
     def holds(self) -> int:
@@ -364,7 +359,13 @@ class MotionGate:
 
     def refusal(self, verb: str, request: MotionRequest | None = None) -> Envelope | None:
         """Return the refusal of ``verb`` while locked or halted since, else None."""
-        return self._refusal(verb, self._dated(request))
+        dated = self._dated(request)
+        if dated.read:
+            return error(f"{verb} is refused: {dated.read} is declared a read, and a read moves nothing.")
+        locked = self.lockout(verb)
+        if locked is not None:
+            return locked
+        return error(_LATE.format(verb)) if dated.overtaken else None
 
     def permit(self, verb: str, request: MotionRequest | None = None) -> Permit:
         """Return leave to move; raise :class:`MotionRefused` if locked or halted.
@@ -377,7 +378,7 @@ class MotionGate:
         dated = self._dated(request)
         permit = Permit(dated, verb)
         for _ in range(2):
-            refusal = self._refusal(verb, dated)
+            refusal = self.refusal(verb, dated)
             if refusal is not None:
                 raise MotionRefused(refusal)
             # Counted between two looks at the latches: a settling that begins beside this either is a latch that
@@ -410,7 +411,9 @@ class MotionGate:
             if valid:
                 self.generation += 1
             request = MotionRequest(self, self.generation)
-        refusal = self._refusal(permit.verb, request) if valid else error(_LATE.format(permit.verb))
+        refusal = self.lockout(permit.verb) if valid else None
+        if refusal is None and not (valid and not request.overtaken):
+            refusal = error(_LATE.format(permit.verb))
         if refusal is not None:
             raise MotionRefused(refusal)
         return Permit(request, permit.verb)
@@ -419,19 +422,15 @@ class MotionGate:
         return getattr(self._of_thread, "request", None)
 
     def _dated(self, request: MotionRequest | None) -> MotionRequest:
-        made = MotionRequest(self, self.generation)
-        if request is not None and request.gate is not self:
-            # It was made of a robot that has this one inside: a halt of either refuses the motion.
-            made.given_up, request = request.overtaken, None
-        return self._outer() or request or made
-
-    def _refusal(self, verb: str, request: MotionRequest) -> Envelope | None:
-        if request.read:
-            return error(f"{verb} is refused: {request.read} is declared a read, and a read moves nothing.")
-        locked = self.lockout(verb)
-        if locked is not None:
-            return locked
-        return error(_LATE.format(verb)) if request.overtaken else None
+        outer: MotionRequest | None = getattr(self._of_thread, "request", None)
+        if outer is not None:
+            return outer
+        if request is not None and request.gate is self:
+            return request
+        made = MotionRequest(self)
+        # One of a robot that has this one inside: a halt of either refuses the motion.
+        made.given_up = request is not None and request.overtaken
+        return made
 
 
 _LATE = "{} is refused: the robot was halted after it was asked for; nothing was started."

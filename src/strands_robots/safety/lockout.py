@@ -181,7 +181,10 @@ class LockoutLatch:
 
     def refusal(self, verb: str) -> Envelope | None:
         """Return the refusal of ``verb`` while locked, or None while free."""
-        return refusal(self.state, self.robot_id, verb)
+        state = self.state
+        # Asked before every motion: the sentence is made for a refusal only.
+        free = not state.lockouts and state.overflow is None
+        return None if free else refusal(state, self.robot_id, verb)
 
     def engage(self, epoch: str, source: str, reason: str, scope: Scope = EVERY_ROBOT) -> bool:
         """Lock under ``epoch``; False, without a change, when it was seen before."""

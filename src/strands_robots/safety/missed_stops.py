@@ -104,7 +104,7 @@ AUDIT_EVERY_S = 10.0
 
 
 class MissedStopsPort(ABC):
-    """A process as asker and answerer on one network; without robots it only answers.
+    """A process as asker and answerer; one without robots only answers.
 
     No method blocks on the network, and none raises for its state.
     """

@@ -1,4 +1,4 @@
-"""The process: time slices and collector of its interpreter, and its pauses."""
+"""Time slices, garbage collector and pauses of the process's interpreter."""
 
 from __future__ import annotations
 
@@ -153,16 +153,13 @@ class AwakeClock:
     def __init__(self, clock: Callable[[], float] = uptime) -> None:
         self._clock = clock
         self._last = float("inf")
-        self._held_until = float("-inf")
-        self._pauses = 0
+        self.held_until = float("-inf")
+        """Moment until which every motion holds; never to come where nothing watches."""
+        self.pauses = 0
+        """Number of times that the process was found not to have run."""
         self._watching = threading.Lock()
         self._watchers: tuple[Callable[[], None], ...] = ()
         self._over: threading.Event | None = None
-
-    @property
-    def pauses(self) -> int:
-        """Number of times that the process was found not to have run."""
-        return self._pauses
 
     def look(self) -> float:
         """Return the present moment, in s of the clock; hold the motions after a pause.
@@ -176,15 +173,13 @@ class AwakeClock:
             return now
         if now - last >= PAUSE_S:
             # Before the mark below: whoever finds a fresh mark also finds the hold.
-            self._held_until = now + (HOLD_S if now - last < LINKS_LOST_S else LONG_HOLD_S)
-            self._pauses += 1
+            self.held_until = now + (HOLD_S if now - last < LINKS_LOST_S else LONG_HOLD_S)
+            self.pauses += 1
+            if self._over is None:  # the last watcher ended meanwhile
+                self.held_until = float("-inf")
         if now > last:
             self._last = now
         return now
-
-    def held_at(self, moment: float) -> bool:
-        """Return True while every motion holds; never where nothing watches."""
-        return self._over is not None and moment < self._held_until
 
     def watch(self, woke: Callable[[], None]) -> Callable[[], None]:
         """Call ``woke`` after each pause, on a thread of this clock; return its end.
@@ -202,7 +197,7 @@ class AwakeClock:
                 if not self._watchers and self._over is not None:
                     self._over.set()
                     self._over = None
-                    self._last = float("inf")
+                    self._last, self.held_until = float("inf"), float("-inf")
 
         return unwatch
 
@@ -217,14 +212,14 @@ class AwakeClock:
             self._over = over
 
     def _run(self, over: threading.Event) -> None:
-        reported = self._pauses
+        reported = self.pauses
         while not over.wait(BEAT_S):
             self.look()
-            if self._pauses == reported:
+            if self.pauses == reported:
                 continue
-            reported = self._pauses
+            reported = self.pauses
             logger.warning(
-                "This process did not run for a while; its motions hold for %.1f s.", self._held_until - self._last
+                "This process did not run for a while; its motions hold for %.1f s.", self.held_until - self._last
             )
             for woke in self._watchers:
                 try:

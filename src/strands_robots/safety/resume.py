@@ -1,4 +1,4 @@
-"""Resume: the operator's signed one, checked by each robot, and ``--local``.
+"""Resume: the operator's signed one, and ``resume --local``.
 
 An assertion is exactly ``v``, ``epoch``, ``targets``, ``t``, ``nonce`` and ``sig``, the Ed25519 signature over the
 canonical JSON of the other five. It clears one epoch of the robots it names, once, within a minute. Why one was

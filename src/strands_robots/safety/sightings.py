@@ -9,6 +9,7 @@ what could be read.
 from __future__ import annotations
 
 import atexit
+import contextlib
 import fcntl
 import hashlib
 import os
@@ -24,7 +25,7 @@ from weakref import WeakSet
 
 from strands_robots.audit import log_safety_event
 from strands_robots.errors import StrandsRobotsError
-from strands_robots.safety.identity import ROBOTS, EnrolledKeys, KeyFile, local_name, of_tenant
+from strands_robots.safety.identity import EnrolledKeys, key_here, local_name, of_tenant
 from strands_robots.safety.network_key import DEVICE_CONNECT, MESH, NetworkKey
 from strands_robots.safety.sighting_file import (
     RECENT_S,
@@ -32,8 +33,8 @@ from strands_robots.safety.sighting_file import (
     Known,
     Moment,
     Note,
+    RosterRow,
     Served,
-    Sighting,
     SightingFile,
     SightingFileError,
     process_start,
@@ -45,7 +46,7 @@ from strands_robots.stop_log import stop_logger
 
 logger = stop_logger(__name__)
 
-__all__ = ["RECENT_S", "Known", "Moment", "Sighting", "Sightings", "flush_sightings", "sightings", "this_moment"]
+__all__ = ["RECENT_S", "Known", "Moment", "RosterRow", "Sightings", "flush_sightings", "sightings", "this_moment"]
 
 
 T = TypeVar("T")
@@ -112,6 +113,7 @@ class Sightings:
         self.directory = directory
         self.file = SightingFile(directory)
         self._starts = StartLocks(directory)
+        self._starts_seen: dict[tuple[NetworkKey, str], int] = {}
         self.problem = ""
         """Empty, or the reason why the last write did not succeed."""
         self._clock = clock
@@ -296,8 +298,16 @@ class Sightings:
             time.sleep(LEAVES_EVERY_S)
 
     def _looked(self, network: NetworkKey, name: str, *, begins: bool) -> tuple[bool, list[Served]]:
+        if not begins:
+            # The count first: a row that is written after it counts anew. Without it the next look reads the rows.
+            with contextlib.suppress(OSError):
+                self._starts_seen[network, name] = self._starts.count(network, name)
+            return True, self.file.served(name)
         # The lock first: who had it before has written by now.
-        return not begins or self._starts.take(network, name), self.file.served(name)
+        before, seen = self._starts.take(network, name), self._starts_seen.pop((network, name), None)
+        if before is not None and before == seen:
+            return True, []
+        return before is not None, self.file.served(name)
 
     def flush(self, within: float = ENDING_S) -> bool:
         """Write what is queued now; False where that takes over ``within`` seconds."""
@@ -318,7 +328,7 @@ class Sightings:
         # The interpreter ends and gives no more threads.
         return self._write_batch() == ""
 
-    def read(self, now: Moment | None = None) -> tuple[list[Sighting], str]:
+    def read(self, now: Moment | None = None) -> tuple[list[RosterRow], str]:
         """Return the robots of the ten minutes before ``now``, and a problem or "".
 
         A robot that was heard since ``now`` is among them. It waits a second at most for the disk; never call it before
@@ -452,17 +462,10 @@ class Sightings:
             network = answer.network
             known = of_tenant(enrolled, network.tenant).values()
             here = (each for each in known if not each.networks or any(own.meets(network) for own in each.networks))
-            return key in keys or all(each.exemption for each in here) or key == self._key_here(network, answer.name)
+            own = key_here(local_name(network.tenant, answer.name), self.directory)
+            return key in keys or all(each.exemption for each in here) or key == own
 
         return [(answer, key) for answer, key in signed if counts(answer, key)]
-
-    def _key_here(self, network: NetworkKey, name: str) -> bytes | None:
-        """Return the key of a robot of this machine."""
-        try:
-            identity = KeyFile(ROBOTS, local_name(network.tenant, name), self.directory).load()
-        except (StrandsRobotsError, OSError):
-            return None
-        return None if identity is None else identity.public
 
     def _heard_signed(self, proven: Iterable[tuple[NetworkKey, str, bytes]]) -> None:
         """End the exemption of enrolled robots that were heard, and keep their network."""
@@ -539,12 +542,17 @@ def sightings() -> Sightings:
     return _of(state_dir())
 
 
+PLACES = 2**20
+"""Locks of the file. Robots that share one by chance begin one after another, no more."""
+
+
 class StartLocks:
     """Locks by which processes begin to serve a robot one after another.
 
     They are of one state directory; any thread may call. A process holds the lock of a robot from its last look at who
     serves it until its own row is on disk, so that of two which begin at once the later one sees the earlier. Locks
-    are bytes of one empty file; the system frees those of a process that dies.
+    are bytes of one file; the system frees those of a process that dies. Each counts how often it was given back,
+    after the row was written: a process sees by it that no row has come since it looked.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -553,38 +561,72 @@ class StartLocks:
         self._held: dict[tuple[NetworkKey, str], int] = {}
         self._descriptor: int | None = None
 
-    def take(self, network: NetworkKey, name: str) -> bool:
-        """Take the lock of a robot, at once; False while another process holds it.
+    def count(self, network: NetworkKey, name: str) -> int:
+        """Return how often the lock of a robot was given back, modulo 256.
+
+        Raises:
+            OSError: the file cannot be read.
+        """
+        with self._lock:
+            try:
+                return self._count(self._opened(), _place(network, name))
+            finally:
+                self._close_unused()
+
+    def take(self, network: NetworkKey, name: str) -> int | None:
+        """Take the lock of a robot, at once; None while another process holds it.
 
         Robots of one name and tenant share a lock, whatever their network.
+
+        Returns:
+            The present :meth:`count`.
 
         Raises:
             OSError: the file cannot be locked.
         """
-        place = int.from_bytes(hashlib.sha256(f"{network.tenant} {name}".encode()).digest()[:7], "big")
+        place = _place(network, name)
         with self._lock:
-            if self._descriptor is None:
-                make_private(self._path.parent)
-                flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
-                self._descriptor = os.open(self._path, flags, 0o600)
             try:
-                fcntl.lockf(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, place)
+                descriptor = self._opened()
+                fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, place)
+                self._held[network, name] = place
+                return self._count(descriptor, place)
             except BlockingIOError:
+                return None
+            finally:
                 self._close_unused()
-                return False
-            self._held[network, name] = place
-            return True
 
     def free(self, network: NetworkKey, name: str) -> None:
         """Give the lock of a robot back, where this process holds it."""
         with self._lock:
             place = self._held.pop((network, name), None)
-            if self._descriptor is not None and place is not None and place not in self._held.values():
+            if self._descriptor is None or place is None:
+                return
+            # On a full disk the row was not written either.
+            with contextlib.suppress(OSError):
+                os.pwrite(self._descriptor, bytes([(self._count(self._descriptor, place) + 1) % 256]), place)
+            if place not in self._held.values():
                 fcntl.lockf(self._descriptor, fcntl.LOCK_UN, 1, place)
-                self._close_unused()
+            self._close_unused()
+
+    @staticmethod
+    def _count(descriptor: int, place: int) -> int:
+        return int.from_bytes(os.pread(descriptor, 1, place), "big")
+
+    def _opened(self) -> int:
+        if self._descriptor is None:
+            make_private(self._path.parent)
+            flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
+            self._descriptor = os.open(self._path, flags, 0o600)
+        return self._descriptor
 
     def _close_unused(self) -> None:
         # Closing any descriptor of the file frees every lock of this process.
         if self._descriptor is not None and not self._held:
             os.close(self._descriptor)
             self._descriptor = None
+
+
+def _place(network: NetworkKey, name: str) -> int:
+    digest = hashlib.sha256(f"{network.tenant} {name}".encode()).digest()
+    return int.from_bytes(digest[:4], "big") % PLACES

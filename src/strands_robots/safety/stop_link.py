@@ -121,7 +121,7 @@ class StopCodec:
         return rules.order(stop.source, fields, path, stop.payload, stop.at, network=stop.network, age_s=age_s)
 
     def vouches(self, rules: StopRules) -> bool:
-        """Return True where each stop that counts is signed: its source gets its own share."""
+        """Return True where each stop that counts is signed."""
         return rules.signed
 
     def refused(self, refused: StopRefused) -> bool:
@@ -248,7 +248,7 @@ class FairQueue:
             bucket.later.append(received)
 
     def take(self) -> StopEvent | None:
-        """Return the next event, of the crowd and of vouched sources in turn, or None."""
+        """Return the next event, of the crowd and of vouched sources in turn."""
         self._crowd_next = not self._crowd_next
         for share in (self._crowd, self._signed) if self._crowd_next else (self._signed, self._crowd):
             buckets = share.buckets

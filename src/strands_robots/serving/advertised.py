@@ -1,9 +1,12 @@
-"""Verbs as a robot advertises them, read from its description within bounds.
+"""Verbs as a robot advertises them, read within bounds, and the names of ours.
 
 A description is data of its robot. Whatever it holds, nothing raises here, the work is bounded, and texts lose control
 characters, terminal escapes and invisible characters. What is out of bounds is left out and named: more than
 :data:`VERBS_MAX` verbs or :data:`TOTAL_MAX` characters, names that are no identifiers, a schema that nests deeper than
 :data:`DEPTH_MAX`.
+
+The names of our robots' verbs are here for callers that need no more of them than that: their tables are slow to load.
+``tests/serving/test_known_verbs.py`` holds them to those tables. No verb of a robot's own has one of these names.
 """
 
 from __future__ import annotations
@@ -18,10 +21,50 @@ from types import MappingProxyType
 from typing import Any, Literal, TypeAlias, TypeVar
 
 from strands_robots.errors import StrandsRobotsError
-from strands_robots.serving.known_verbs import STOPS
 from strands_robots.serving.verbs import LEASE_NAMES
 from strands_robots.utils import DURATION_MAX_S, ValidationError, number, plain_text, shown, whole
 from strands_robots.verb_parameters import JSON_TYPES, UNIT_MAX
+
+READS = frozenset(
+    {
+        *("describe", "features", "ping", "state", "status", "teleop_status", "teleop_stop"),
+        *("getControl", "getDaemonStatus", "getFeatures", "getImu", "getJoints", "getObjects", "getPicture", "getPose"),
+        *("getState", "getStatus", "listCameras", "listMoves"),
+    }
+)
+"""Reads that are answered at once."""
+
+STOPS = frozenset({"stop", "stopMotion"})
+
+RESUMES = frozenset({"resume", "renewControl", "releaseControl", "takeControl"})
+"""Verbs that free a robot and move nothing."""
+
+QUICK = READS | STOPS | RESUMES
+"""Verbs that are answered at once and start no motion."""
+
+WAITING = frozenset({"goTo", "moveBy", "moveJoints", "moveTo", "pick", "place", "setGripper", "wait"})
+"""Verbs that may wait for the end of a motion."""
+
+STARTING = frozenset(
+    {
+        *("acquireControl", "antennas", "body", "disableMotors", "drive", "enableMotors", "execute", "happy", "look"),
+        *("navigateTo", "nod", "playMove", "releaseTorque", "reset", "savePlace", "shake", "sleep", "start", "step"),
+        *("teleop_receive", "wakeUp"),
+    }
+)
+"""Motions that are only started, and what is asked for as one."""
+
+VERBS = QUICK | WAITING | STARTING
+
+TEXTS = frozenset(
+    {
+        *("camera", "device_name", "direction", "frame_id", "instruction", "kind", "lease_id", "library", "motor_ids"),
+        *("move_name", "nonce", "object", "on", "picture", "place", "policy_host", "policy_provider"),
+        *("pretrained_name_or_path", "reason", "robot_name", "source_peer_id", "task_id"),
+    }
+)
+"""Parameters of those verbs that are texts; every other one is none."""
+
 
 TOTAL_MAX, VERB_MAX = 64_000, 16_000
 """Characters that all verbs of a robot may take together, and those of one verb."""

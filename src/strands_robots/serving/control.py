@@ -6,7 +6,7 @@ and a lockout is separate and stronger. A lease prevents accidents among program
 authorization and the operator's approval.
 
 Leases live in memory: a restart of the robot's process ends them all. Their epochs outlive it, see
-:mod:`~strands_robots.serving.control_epochs`.
+:mod:`~strands_robots.safety.lease_signatures`.
 
 Nothing foreign delays the end of a lease. The stop executor carries out the halt, its verdict and the observers come
 afterwards, and a robot whose state cannot be read in time counts as moving.
@@ -15,32 +15,27 @@ afterwards, and a robot whose state cannot be read in time counts as moving.
 from __future__ import annotations
 
 import hmac
+import math
 import secrets
 import threading
 import time
-import weakref
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Protocol, cast
 
-from strands_robots.contract import Robot, WorldRobot, body_of, holds_robots, robots_in, task_runs
+from strands_robots.contract import Observers
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.errors import StrandsRobotsError
-from strands_robots.identity_map import IdentityMap
 from strands_robots.safety.authorization import ANONYMOUS, Leave, caller_name
+from strands_robots.safety.lease_signatures import outdated, reserve_epochs, unproven
+from strands_robots.safety.process import undisturbed
 from strands_robots.safety.resume import configured_keys
-from strands_robots.safety.stop_executor import stop_executor
 from strands_robots.safety.stopping import StopVerdict
-from strands_robots.serving.control_changes import ControlChange, Observers, OnChange
-from strands_robots.serving.control_epochs import FirstEpoch
-from strands_robots.serving.lease_watch import LeaseWatch
-from strands_robots.serving.starting_motions import StartingMotions
-from strands_robots.serving.take_assertion import outdated, unproven
-from strands_robots.serving.workers import BoundedCall, Share, ShareFullError
-from strands_robots.serving.world_stops import RobotStop, stop_within
+from strands_robots.serving.workers import UNBOUNDED, BoundedCall
 from strands_robots.stop_log import stop_logger
+from strands_robots.threads import WokenThread
 
 logger = stop_logger(__name__)
 
@@ -65,8 +60,14 @@ LATE_STATUS_S = 0.03
 EPOCH_S = 1.0
 """Longest wait of a call for the disk to reserve the first epoch."""
 
-CHANGES_MAX = 256
-"""Changes that wait for an observer that hangs; the next is not told."""
+START_WAIT_S = 1.0
+"""Longest wait of a motion for the start of another caller's, which the robot may yet refuse."""
+
+LOOK_S = 0.02
+"""Seconds between two looks whether a motion has begun."""
+
+AHEAD_S = 0.25
+"""Time before the end of a lease in which its robot is read: one at rest by its own word is not halted."""
 
 Halt = Callable[[str], Future[StopVerdict] | None]
 """Orders a halt for a reason, and returns before it is carried out; None where there is no verdict to wait for."""
@@ -105,6 +106,160 @@ class Lease:
     def left(self, now: float) -> float | None:
         """Return the seconds left, None for the lease of one motion."""
         return None if self.until is None or self.one_motion else round(max(self.until - now, 0.0), 3)
+
+
+@dataclass(frozen=True, slots=True)
+class ControlChange:
+    """A change of the holder, as observers are told.
+
+    Attributes:
+        event: ``acquired``, ``released``, ``expired`` or ``taken``.
+        reason: the one that a human gave for taking control.
+    """
+
+    event: str
+    robot: str
+    holder: str
+    kind: str
+    epoch: int
+    reason: str = ""
+
+
+OnChange = Callable[[ControlChange], None]
+
+
+class FirstEpoch:
+    """First epoch of the leases of one robot, 0 until it is reserved; thread-safe.
+
+    Args:
+        reserve: returns it; :func:`reserve_epochs` by default.
+    """
+
+    def __init__(self, reserve: Callable[[], int] = reserve_epochs) -> None:
+        self._reserve = BoundedCall(reserve)
+        self._changing = threading.Lock()
+        self.value = 0
+
+    def reserved(self, within: float) -> str | None:
+        """Reserve it unless that is done; return what prevents it, or None.
+
+        A disk that hangs is waited for at most ``within`` seconds.
+        """
+        if self.value:
+            return None
+        try:
+            value = self._reserve(within)
+        except (OSError, ValueError, RuntimeError) as exc:
+            return f"{type(exc).__name__}: {exc}"
+        with self._changing:
+            self.value = self.value or value
+        return None
+
+
+class StartingMotions:
+    """The motions that are about to begin, and those that wait for their start.
+
+    Args:
+        changing: the lock of the robot's lease.
+    """
+
+    def __init__(self, changing: threading.RLock) -> None:
+        self._closed = threading.Condition(changing)
+        self.begun: dict[object, Callable[[], bool]] = {}
+        """The motions that are about to begin, each with what is true once it has begun."""
+        self.waiting: list[object] = []
+
+    @property
+    def undecided(self) -> bool:
+        """True while the robot may yet refuse one of them."""
+        return any(not begun() for begun in self.begun.values())
+
+    def close(self, motion: object) -> None:
+        """Note that it has begun or was refused; who waits looks anew."""
+        self.begun.pop(motion, None)
+        self._closed.notify_all()
+
+    def wait(self, undecided: Callable[[], bool], free: Callable[[], bool]) -> None:
+        """Wait for the start of another's motion, in the order of arrival.
+
+        A call that the robot refuses would keep others from it otherwise, again and again.
+
+        Args:
+            undecided: whether the motion of another holds the robot, and may yet be refused.
+            free: whether nobody holds it.
+        """
+        if not undecided() and not (self.waiting and free()):
+            return
+        turn = object()
+        self.waiting.append(turn)
+        deadline = time.monotonic() + START_WAIT_S
+        while not (self.waiting[0] is turn if free() else not undecided()) and time.monotonic() < deadline:
+            # A motion that begins tells nobody.
+            self._closed.wait(LOOK_S)
+        self.waiting.remove(turn)
+        self._closed.notify_all()
+
+
+class TimedLease(Protocol):
+    """A lease that ends by itself."""
+
+    @property
+    def due(self) -> float | None:
+        """The monotonic moment at which it is over; None where there is none."""
+
+    def expire(self, ahead: float) -> None:
+        """End it in its time; return at once where that is more than ``ahead`` s away."""
+
+
+class LeaseWatch:
+    """One thread that ends leases in time."""
+
+    def __init__(self) -> None:
+        self._changing = threading.Lock()
+        self._leases: set[TimedLease] = set()
+        self._thread = WokenThread("control-leases", self._end_due, self._due_in)
+
+    @property
+    def running(self) -> bool:
+        """True while there is a lease to end."""
+        return bool(self._leases)
+
+    def add(self, lease: TimedLease) -> None:
+        """Watch a lease until it is over.
+
+        Raises:
+            RuntimeError: no thread can be started.
+        """
+        with self._changing:
+            self._leases.add(lease)
+        self._thread.wake()
+
+    def _due_in(self) -> float:
+        with self._changing:
+            moments = [at for each in self._leases if (at := each.due) is not None]
+        return min(moments, default=math.inf) - AHEAD_S - time.monotonic()
+
+    def _end_due(self) -> None:
+        now = time.monotonic()
+        with self._changing:
+            due = {each: at for each in self._leases if (at := each.due) is not None}
+            ending = [each for each, at in due.items() if at - AHEAD_S <= now]
+            self._leases = set(due).difference(ending)
+        for each in ending:
+            UNBOUNDED.submit(partial(self._end, each))
+
+    def _end(self, lease: TimedLease) -> None:
+        # A whole collection at this moment would hold the halts back.
+        calm = undisturbed(many=False)
+        try:
+            lease.expire(AHEAD_S)
+        except Exception:
+            logger.critical("What the holder of a lease moved was not halted at its end.", exc_info=True)
+        finally:
+            calm()
+            # It may have been renewed meanwhile.
+            if lease.due is not None:
+                self.add(lease)
 
 
 watch: Callable[[ControlLease], None] = LeaseWatch().add
@@ -146,14 +301,14 @@ class ControlLease:
         self._moving = BoundedCall(moving)
         self._fault = ""
         self._led_by = led_by
-        self._hardware = hardware
+        self.hardware = hardware
         self._keys = keys
         self._clock, self._wall, self._watched = clock, wall, watched
         self._changing = threading.RLock()
         self._lease: Lease | None = None
         self._starting = StartingMotions(self._changing)
         self._displaced: dict[str, str] = {}
-        self._observers = Observers()
+        self._observers = Observers[ControlChange]()
         self._first_epoch = first_epoch
         self._holders = 0
 
@@ -170,7 +325,7 @@ class ControlLease:
 
     def observe(self, observer: OnChange) -> Callable[[], None]:
         """Tell ``observer`` of every change of the holder; return what ends that."""
-        return self._observers.add(observer)
+        return self._observers.subscribe(observer)
 
     def facts(self) -> dict[str, Any]:
         """Return the holder as everyone may read it."""
@@ -195,7 +350,7 @@ class ControlLease:
         Raises:
             NotHolderError: another holds it.
         """
-        holder = _name(caller)
+        holder = caller_name(caller) or ANONYMOUS
         self._settle()
         leader = self._led_by()
         if leader:
@@ -240,9 +395,9 @@ class ControlLease:
 
         Args:
             robot: the name that the assertion has to bear.
-            assertion: of :func:`~strands_robots.serving.take_assertion.sign_take`.
+            assertion: of :func:`~strands_robots.safety.lease_signatures.sign_take`.
         """
-        holder, keys = _name(caller), self._keys()
+        holder, keys = caller_name(caller) or ANONYMOUS, self._keys()
         problem = self._unproven(robot, assertion, keys)
         with self._changing:
             if problem is None and keys:
@@ -283,32 +438,37 @@ class ControlLease:
         Raises:
             NotHolderError: another holds the robot, or the lease is over.
         """
-        self._settle()
+        holder = caller_name(caller) or ANONYMOUS
+        if self._lease is not None:
+            self._settle()
         with self._changing:
-            holder = _name(caller)
-            if hold:
-                self._starting.wait(partial(self._undecided, holder, lease_id), lambda: self._lease is None)
-            elif self._undecided(holder, lease_id):
-                return Leave()
+            if self._lease is not None or self._starting.waiting:
+                if hold:
+                    self._starting.wait(partial(self._undecided, holder, lease_id), lambda: self._lease is None)
+                elif self._undecided(holder, lease_id):
+                    return Leave()
             before = self._lease
-            self._refuse(verb, holder, lease_id, ttl_s)
+            if lease_id and (before is not None or not ttl_s):
+                self._required(verb, lease_id)
+            elif before is not None and not _owns(before, holder):
+                raise self._not_holder(verb, before)
             if not hold:
                 return Leave()
-            if before is None:
-                after = self._hold_for_motion(holder, HUMAN if verb == FOLLOW else AGENT, lease_id, ttl_s)
-            else:
+            if before is not None:
                 after = self._used(verb, lease_id, ttl_s) if lease_id else before
+            else:
+                # Without a time it is known by its holder's name alone, and nobody can renew it.
+                kind, secret = HUMAN if verb == FOLLOW else AGENT, lease_id if ttl_s else secrets.token_hex(16)
+                until = self._clock() + ttl_s if ttl_s else None
+                after = Lease(holder, kind, secret, ttl_s or None, until, one_motion=True)
+                if ttl_s:
+                    self._hold(after)
+                else:
+                    self._lease = after
             motion = object()
             if after.one_motion:
-                self._starting.add(motion, begun)
+                self._starting.begun[motion] = begun
             return Leave(lambda begun: self._admitted(motion, begun, before, after))
-
-    def _refuse(self, verb: str, holder: str, lease_id: str, ttl_s: float) -> None:
-        lease = self._lease
-        if lease_id and (lease is not None or not ttl_s):
-            self._required(verb, lease_id)
-        elif lease is not None and not _owns(lease, holder):
-            raise self._not_holder(verb, lease)
 
     def _undecided(self, holder: str, lease_id: str) -> bool:
         """True while the robot may yet refuse the motion of another that holds it."""
@@ -326,17 +486,10 @@ class ControlLease:
                 return
             if begun:
                 self._lease = lease if lease.begun else replace(lease, begun=True)
-            elif lease.one_motion and not lease.begun and not self._starting:
+            elif lease.one_motion and not lease.begun and not self._starting.begun:
                 self._lease = None
             elif lease is after is not before and before is not None:
                 self._hold(before)  # the watch may wait for a later moment
-
-    def _hold_for_motion(self, holder: str, kind: str, lease_id: str, ttl_s: float) -> Lease:
-        if not ttl_s:
-            # Known by its name alone; without a lease_id nobody can renew it.
-            lease = self._lease = Lease(holder, kind, secrets.token_hex(16), one_motion=True)
-            return lease
-        return self._hold(Lease(holder, kind, lease_id, ttl_s, self._clock() + ttl_s, one_motion=True))
 
     def refuse_others(self, verb: str, caller: object, lease_id: str) -> None:
         """Refuse a motion of the whole world, unless it is the holder's.
@@ -347,7 +500,7 @@ class ControlLease:
         self._settle()
         with self._changing:
             lease = self._lease
-            if lease is not None and not _owns(lease, _name(caller), lease_id):
+            if lease is not None and not _owns(lease, caller_name(caller) or ANONYMOUS, lease_id):
                 raise self._not_holder(verb, lease)
 
     def expire(self, ahead: float = 0.0) -> None:
@@ -361,7 +514,7 @@ class ControlLease:
             return
         # An unknown state is no rest: what cannot be read is halted.
         moves, fault = True, ""
-        if lease.one_motion and not self._starting:
+        if lease.one_motion and not self._starting.begun:
             state, fault = self._state(max(left, LATE_STATUS_S) if ahead else STATUS_S)
             moves = state is not False
         # A motion that is admitted meanwhile renews the lease, so a robot that was at rest still is.
@@ -396,14 +549,14 @@ class ControlLease:
         """End a lease that is over, by its time or with its motion."""
         self.expire()
         lease = self._lease
-        if lease is None or not lease.one_motion or self._starting:
+        if lease is None or not lease.one_motion or self._starting.begun:
             return
         moves, fault = self._state(STATUS_S)
         self._note(fault)
         if moves:
             return
         with self._changing:
-            if self._lease is lease and not self._starting:
+            if self._lease is lease and not self._starting.begun:
                 self._lease = None
 
     def _hold(self, lease: Lease) -> Lease:
@@ -425,7 +578,7 @@ class ControlLease:
         held = f"{lease.holder} holds control for {lease.ttl_s:g} s"
         text = f"{held}; give lease_id with every motion, each one renews it."
         if verdict is not None and not verdict.stopped:
-            text = f"{text} {self._robot} may still move: {_doubts(verdict)}"
+            text = f"{text} {self._robot} may still move: {doubts(verdict)}"
         return success(
             text,
             lease_id=lease.lease_id,
@@ -471,7 +624,7 @@ class ControlLease:
         """Return why the robot is not shown to be taken by an operator, or None."""
         if not keys:
             setting = "STRANDS_MESH_RESUME_PUBLIC_KEY; strands-robots keys resume"
-            return f"no operator's key is configured here ({setting})" if self._hardware else None
+            return f"no operator's key is configured here ({setting})" if self.hardware else None
         problem = unproven(assertion, robot, keys)
         if problem is not None:
             return problem
@@ -487,195 +640,13 @@ class ControlLease:
 
     def _tell(self, event: str, lease: Lease, reason: str = "") -> None:
         change = ControlChange(event, self._robot, lease.holder, lease.kind, self.epoch, reason)
-        self._observers.tell(change)
+        self._observers.notify(change)
 
 
-class InputStreams(Protocol):
-    """Streams of remote leaders, which move the first robot of a world."""
-
-    def leading(self) -> bool:
-        """Return True while a leader moves the robot."""
-
-    def void(self) -> None:
-        """Let no frame move the robot from now on; wait for nothing."""
-
-
-class ControlLeases:
-    """The leases of one robot, one for each robot of a world.
-
-    They keep no robot alive: they refer to what its networks serve, as long as that lives.
-    """
-
-    def __init__(self) -> None:
-        self._hardware = False
-        self._served: list[weakref.ref[Robot]] = []
-        self._by_name: dict[str, ControlLease] = {}
-        self._changing = threading.Lock()
-        self._observers, self._telling = Observers(), Share(1, CHANGES_MAX)
-        self._first_epoch = FirstEpoch()
-        self._first_robot = ""
-        self._streams: weakref.WeakSet[InputStreams] = weakref.WeakSet()
-
-    def attach(self, streams: InputStreams) -> None:
-        """Count the motions of these streams as long as they live."""
-        self._streams.add(streams)
-
-    def only(self, name: str) -> ControlLeases:
-        """Return the same leases, for a network peer that is one robot of the world."""
-        return _OneOf(self, name)
-
-    def serve(self, robot: Robot, *, hardware: bool) -> None:
-        """Add the robot as one of its networks serves it."""
-        with self._changing:
-            self._hardware = self._hardware or hardware
-            self._served = [*(each for each in self._served if each() is not None), weakref.ref(robot)]
-
-    def observe(self, observer: OnChange) -> Callable[[], None]:
-        """Tell ``observer``, on another thread, of every change; return what ends that."""
-        return self._observers.add(observer)
-
-    def of(self, name: str = "") -> ControlLease:
-        """Return the lease of the robot, or of the named robot of the world."""
-        robot = self._robot()
-        # Kept: an expiry asks the world for nothing.
-        self._first_robot = next(iter(robots_in(robot)), "")
-        name = (name or self._first_robot) if holds_robots(robot) else ""
-        with self._changing:
-            lease = self._by_name.get(name)
-            if lease is None:
-                shown_as = name or ("" if robot is None else robot.tool_name_str)
-                lease = self._by_name[name] = ControlLease(
-                    shown_as,
-                    lambda reason: self._halt(name, shown_as, reason),
-                    lambda: self._moves(name),
-                    led_by=lambda: self._led_by(name),
-                    hardware=self._hardware,
-                    first_epoch=self._first_epoch,
-                )
-                lease.observe(self._tell)
-        return lease
-
-    def admit(
-        self, command: str, caller: object, lease_id: str, name: str | None, ttl_s: float = 0.0, **how: Any
-    ) -> Leave:
-        """Admit a motion of the named robot; with None of all robots of the world.
-
-        Raises:
-            NotHolderError: another holds the robot, or the lease is over.
-        """
-        if name is not None or not holds_robots(self._robot()):
-            return self.of(name or "").admit(command, caller, lease_id, ttl_s, **how)
-        for each in tuple(self._by_name.values()):
-            each.refuse_others(command, caller, lease_id)
-        return Leave()
-
-    def facts(self) -> dict[str, Any]:
-        """Return the holder of the robot; by name for the robots of a world."""
-        robot = self._robot()
-        names = robots_in(robot)
-        return {name: self.of(name).facts() for name in names} if len(names) > 1 else self.of().facts()
-
-    def _robot(self) -> Robot | None:
-        return next((robot for each in self._served if (robot := each()) is not None), None)
-
-    def _tell(self, change: ControlChange) -> None:
-        try:
-            self._telling.submit(partial(self._observers.tell, change))
-        except ShareFullError:
-            logger.warning("%s: an observer of its holder hangs and is not told: %s.", change.robot, change.event)
-
-    def _streams_of(self, name: str) -> list[InputStreams]:
-        return list(self._streams) if name == self._first_robot else []
-
-    def _led_by(self, name: str) -> str:
-        """Return the leader at this machine that drives the robot, empty without one."""
-        robot = self._robot()
-        led = getattr(body_of(robot), "teleoperated_by", None)
-        return str(led(name or getattr(robot, "tool_name_str", ""))) if callable(led) else ""
-
-    def _moves(self, name: str) -> bool | None:
-        if any(each.leading() for each in self._streams_of(name)):
-            return True
-        robot = self._robot()
-        return False if robot is None else task_runs(robot, name)
-
-    def _halt(self, name: str, shown_as: str, reason: str) -> Future[StopVerdict] | None:
-        """Order the halt of the robot, or of the named robot of the world."""
-        for each in self._streams_of(name):
-            each.void()
-        robot = self._robot()
-        if robot is None:
-            return None
-        target = RobotStop(cast(WorldRobot, robot), name) if name else robot
-        halting = stop_executor().submit(target, shown_as, reason, within=stop_within(target))
-        halting.add_done_callback(partial(_report, shown_as))
-        return halting
-
-
-_LEASES: IdentityMap[ControlLeases] = IdentityMap()
-
-
-def leases_of(robot: Robot, *, hardware: bool) -> ControlLeases:
-    """Return the leases of a robot, the same on every network that serves it."""
-    referable = hasattr(robot, "__weakref__")
-    leases = _LEASES.of(body_of(robot), lambda: ControlLeases() if referable else _Strong(robot))
-    leases.serve(robot, hardware=hardware)
-    return leases
-
-
-class _OneOf(ControlLeases):
-    """The leases of a world as one of its robots has them."""
-
-    def __init__(self, world: ControlLeases, name: str) -> None:
-        super().__init__()
-        self._world = world
-        self._name = name
-
-    def of(self, name: str = "") -> ControlLease:
-        """Return the lease of this robot."""
-        return self._world.of(self._name)
-
-    def admit(
-        self, command: str, caller: object, lease_id: str, name: str | None, ttl_s: float = 0.0, **how: Any
-    ) -> Leave:
-        """Admit a motion of this robot."""
-        return self._world.admit(command, caller, lease_id, self._name, ttl_s, **how)
-
-    def facts(self) -> dict[str, Any]:
-        """Return the holder of this robot."""
-        return self.of().facts()
-
-
-class _Strong(ControlLeases):
-    """Leases of a robot without weak references, which is kept with them."""
-
-    def __init__(self, robot: Robot) -> None:
-        super().__init__()
-        self._kept = robot
-
-    def serve(self, robot: Robot, *, hardware: bool) -> None:
-        """Add the robot as one of its networks serves it."""
-        with self._changing:
-            self._hardware = self._hardware or hardware
-
-    def _robot(self) -> Robot | None:
-        return self._kept
-
-
-def _report(robot: str, halted: Future[StopVerdict]) -> None:
-    """Log a robot that may still move."""
-    verdict = halted.result()
-    if not verdict.stopped:
-        logger.critical("%s may still move after the end of a lease: %s", robot, _doubts(verdict))
-
-
-def _doubts(verdict: StopVerdict) -> str:
+def doubts(verdict: StopVerdict) -> str:
+    """Return why a robot may still move, by what was asked to stop."""
     reasons = {**verdict.unknown, **verdict.not_stopped}
     return "; ".join(f"{name}: {why}" for name, why in reasons.items())
-
-
-def _name(caller: object) -> str:
-    return caller_name(caller) or ANONYMOUS
 
 
 def _owns(lease: Lease, holder: str, lease_id: str = "") -> bool:

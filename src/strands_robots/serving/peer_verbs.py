@@ -5,36 +5,47 @@ A peer does not tell its verbs apart by its robot's kind: a robot that lacks wha
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import inspect
+import time
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from types import MappingProxyType
 from typing import Any
 
-from strands_robots.contract import Robot, body_of, holds_robots
+from strands_robots.contract import (
+    SETTLE,
+    Robot,
+    RolloutEvent,
+    body_of,
+    for_request,
+    holds_robots,
+    robots_in,
+    task_runs,
+)
 from strands_robots.drivers.reachy import ReachyDriver
-from strands_robots.envelope import Envelope, error, success
+from strands_robots.envelope import Envelope, error, is_error, success
 from strands_robots.safety.gate import MotionRequest
-from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS, for_robot
-from strands_robots.serving.base_verbs import DRIVE, NAVIGATE_TO
-from strands_robots.serving.control_verbs import CONTROL_VERBS
+from strands_robots.safety.stopping import StopVerdict
+from strands_robots.serving.arm_verbs import ARM_MOTION_VERBS, PICTURE_VERBS, for_robot
+from strands_robots.serving.control_leases import CONTROL_VERBS
 from strands_robots.serving.offered_verbs import offered
-from strands_robots.serving.picture_verbs import PICTURE_VERBS
 from strands_robots.serving.policy_arguments import known_provider, policy_host, repository, vector
 from strands_robots.serving.reachy_verbs import REACHY_VERBS
 from strands_robots.serving.robot_verbs import (
+    DRIVE,
     GET_FEATURES,
     GET_STATE,
+    NAVIGATE_TO,
     WORLD_VERBS,
     is_world,
     release_torque,
     releases_torque,
     reset_world,
-    start,
-    status,
+    robot_of,
     step_world,
     takes_tasks,
 )
-from strands_robots.serving.verb_schema import described
 from strands_robots.serving.verbs import (
     ASSERTION,
     DURATION,
@@ -42,17 +53,23 @@ from strands_robots.serving.verbs import (
     MOTOR_IDS,
     NONCE,
     POLICY_PROVIDER,
-    REQUIRED,
     RESUME,
     Arguments,
     Kind,
-    Parameter,
     Verb,
     between,
+    described,
     release_torque_verb,
     table,
 )
 from strands_robots.utils import identifier, number, port
+from strands_robots.verb_parameters import REQUIRED, Parameter
+
+POLL_S = 0.05
+EXECUTE_GRACE_S = 10.0
+"""Seconds besides its duration that a policy may take to end before ``execute`` of the mesh gives up on it."""
+
+END_EVENT_S = 0.5
 
 
 def _optional(name: str, type_: type, meaning: str, check: Any) -> Parameter:
@@ -82,6 +99,91 @@ _PEER_POLICY = (
 _SOURCE = Parameter("source_peer_id", str, "Peer that leads", identifier)
 _PEER_ASSERTION = _optional("assertion", dict, ASSERTION.meaning, ASSERTION.check)
 _DEVICE = _optional("device_name", str, "The leader's device; leader where left out", identifier)
+
+
+def policy_start(robot: Robot, arguments: Arguments, request: MotionRequest | None = None) -> Callable[[], Envelope]:
+    """Return the call that starts a policy with a mesh peer's options."""
+    options = {name: value for name, value in arguments.items() if name != "robot_name"}
+    if options.get("policy_host") == "localhost":
+        del options["policy_host"]
+    instruction = options.pop("instruction", "")
+    if holds_robots(robot):
+        name = robot_of(robot, arguments.get("robot_name"))
+        return partial(for_request(request, robot.start_policy), name, instruction, **options)
+    unknown = sorted(set(options) - _accepted(robot.start_task, options))
+    if unknown:
+        return partial(error, f"start: this robot takes no {', '.join(unknown)}.")
+    return partial(for_request(request, robot.start_task), instruction, **options)
+
+
+def run_to_end(
+    robot: Robot, arguments: Arguments, closing: Callable[[], bool], request: MotionRequest | None = None
+) -> Envelope:
+    """Start a policy and wait for its end or for ``closing``."""
+    name = (arguments.get("robot_name") or next(iter(robots_in(robot)), "")) if holds_robots(robot) else None
+    ends: list[RolloutEvent] = []
+
+    def observe(event: RolloutEvent) -> None:
+        if event.kind == "finished" and event.policy != SETTLE and name in (None, event.robot):
+            ends.append(event)
+
+    unsubscribe = robot.subscribe(observe)
+    try:
+        started = policy_start(robot, arguments, request)()
+        if is_error(started):
+            return started
+        deadline = time.monotonic() + arguments["duration"] + EXECUTE_GRACE_S
+        return _awaited_end(robot, name, started, ends, deadline, closing)
+    finally:
+        unsubscribe()
+
+
+def _awaited_end(  # noqa: PLR0917 - one call, for the length of run_to_end
+    robot: Robot,
+    name: str | None,
+    started: Envelope,
+    ends: list[RolloutEvent],
+    deadline: float,
+    closing: Callable[[], bool],
+) -> Envelope:
+    while not ends and task_runs(robot, name or ""):
+        if closing():
+            return error("execute: this peer left the mesh while the policy ran.", started=started)
+        if time.monotonic() >= deadline:
+            return error("execute: the policy outlived its duration.", started=started)
+        time.sleep(POLL_S)
+    # A rollout that runs no more has told its end, or is about to.
+    last = time.monotonic() + END_EVENT_S
+    while not ends and holds_robots(robot) and time.monotonic() < last:
+        time.sleep(POLL_S)
+    if not ends:
+        return {**started, "state": "unknown"} if holds_robots(robot) else robot.get_task_status()
+    end = ends[-1]
+    facts = {"state": end.state, "task_status": end.state, "step_count": end.step, "elapsed_s": end.elapsed_s}
+    if end.state == "error":
+        return error(f"execute: {end.error or 'the policy failed'}", robot=end.robot, **facts)
+    return success(f"{end.robot} {end.state} after {end.step} steps.", robot=end.robot, **facts)
+
+
+def _accepted(method: Callable[..., Any], options: dict[str, Any]) -> set[str]:
+    parameters = inspect.signature(method).parameters
+    if any(each.kind is each.VAR_KEYWORD for each in parameters.values()):
+        return set(options)
+    return set(parameters)
+
+
+def status(robot: Robot, arguments: Arguments) -> Envelope:
+    """Return the task of a robot, or the policies that run in a world."""
+    if not holds_robots(robot):
+        return robot.get_task_status()
+    running = robot.list_policies_running()
+    return success(
+        f"{len(running)} of {len(robot.list_robots())} robots run a policy.",
+        task_status="running" if running else "idle",
+        robots=robot.list_robots(),
+        policies=running,
+        **{name: getattr(robot, name)() for name in ("failed_policies", "outcomes") if hasattr(robot, name)},
+    )
 
 
 def _peer_verb(name: str, kind: Kind, summary: str, parameters: tuple[Parameter, ...] = (), **carried_out: Any) -> Verb:
@@ -122,7 +224,12 @@ PEER_VERBS = table(
             "execute", Kind.MOTION, "Run a policy and wait for its end.", _PEER_POLICY, lasts=True, suits=takes_tasks
         ),
         _peer_verb(
-            "start", Kind.MOTION, "Start a policy and return at once.", _PEER_POLICY, begin=start, suits=takes_tasks
+            "start",
+            Kind.MOTION,
+            "Start a policy and return at once.",
+            _PEER_POLICY,
+            begin=lambda robot, arguments, request: policy_start(robot, arguments, request)(),
+            suits=takes_tasks,
         ),
         _peer_verb(
             "step",
@@ -207,3 +314,18 @@ def kind_of(robot: Robot) -> str:
     if not callable(getattr(body, "start_drive", None)):
         return "robot"
     return "mobile_base" if getattr(body, "nav_action", None) is None else "navigating_base"
+
+
+def peer_stop_answer(verdict: StopVerdict) -> dict[str, Any]:
+    """Return a verdict as a mesh peer answers ``stop``."""
+    doubts = {**verdict.not_stopped, **verdict.unknown}
+    result: dict[str, Any] = {
+        "ok": verdict.stopped is True,
+        "stopped": list(verdict.halted),
+        "not_stopped": list(doubts),
+        "results": {**dict.fromkeys(verdict.halted, "stopped"), **doubts},
+        **({"settling": True} if verdict.settling else {}),
+    }
+    if doubts:
+        result["error"] = "; ".join(f"{name}: {why}" for name, why in doubts.items())
+    return result

@@ -13,21 +13,10 @@ from strands_robots.drivers.reachy.rest import DaemonError
 from strands_robots.drivers.reachy.target import HeadPose, Target, bounded
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.safety.gate import MotionRequest
-from strands_robots.serving.control_verbs import CONTROL_VERBS
-from strands_robots.serving.verbs import (
-    NONCE,
-    RESUME,
-    Arguments,
-    Begin,
-    Check,
-    Kind,
-    Parameter,
-    Run,
-    Verb,
-    release_torque_verb,
-    table,
-)
+from strands_robots.serving.control_leases import CONTROL_VERBS
+from strands_robots.serving.verbs import NONCE, RESUME, Arguments, Begin, Kind, Run, Verb, release_torque_verb, table
 from strands_robots.utils import choice, identifier, shown
+from strands_robots.verb_parameters import Check, Parameter
 
 P = ParamSpec("P")
 

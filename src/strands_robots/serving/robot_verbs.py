@@ -5,31 +5,24 @@ Device Connect serves :data:`ARM_VERBS` and :data:`WORLD_VERBS`, the mesh :data:
 
 from __future__ import annotations
 
-import inspect
-import time
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 from strands_robots.bus_access import read_joints
 from strands_robots.contract import (
-    SETTLE,
     Robot,
-    RolloutEvent,
     WorldRobot,
     behind_contract,
     body_of,
     for_request,
     holds_robots,
-    robots_in,
-    task_runs,
 )
-from strands_robots.envelope import Envelope, error, is_error, success
+from strands_robots.envelope import Envelope, error, success
+from strands_robots.ros.gate import Approved
 from strands_robots.safety.gate import MotionRequest
 from strands_robots.safety.stopping import StopVerdict
-from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS, WORLD_MOTION_VERBS, for_robot
-from strands_robots.serving.control_verbs import CONTROL_VERBS
-from strands_robots.serving.picture_verbs import PICTURE_VERBS
+from strands_robots.serving.arm_verbs import ARM_MOTION_VERBS, PICTURE_VERBS, WORLD_MOTION_VERBS, for_robot
+from strands_robots.serving.control_leases import CONTROL_VERBS
 from strands_robots.serving.verbs import (
     DURATION,
     INSTRUCTION,
@@ -41,18 +34,14 @@ from strands_robots.serving.verbs import (
     RESUME,
     ROBOT_NAME,
     Arguments,
+    Begin,
     Kind,
     Verb,
     release_torque_verb,
     table,
 )
-from strands_robots.utils import ValidationError, shown
-
-POLL_S = 0.05
-EXECUTE_GRACE_S = 10.0
-"""Seconds besides its duration that a policy may take to end before ``execute`` of the mesh gives up on it."""
-
-END_EVENT_S = 0.5
+from strands_robots.utils import DURATION_MAX_S, ValidationError, duration, number, shown, text
+from strands_robots.verb_parameters import Parameter
 
 WORLD_MEMBERS = (
     *("tool_name_str", "gate", "halt", "subscribe", "list_robots", "start_policy", "stop_policy"),
@@ -113,21 +102,6 @@ def world_stop_answer(verdict: StopVerdict) -> Envelope:
     return success(f"Stopped {', '.join(stopped)}." if stopped else "Nothing was moving.", **fields)
 
 
-def peer_stop_answer(verdict: StopVerdict) -> dict[str, Any]:
-    """Return a verdict as a mesh peer answers ``stop``."""
-    doubts = {**verdict.not_stopped, **verdict.unknown}
-    result: dict[str, Any] = {
-        "ok": verdict.stopped is True,
-        "stopped": list(verdict.halted),
-        "not_stopped": list(doubts),
-        "results": {**dict.fromkeys(verdict.halted, "stopped"), **doubts},
-        **({"settling": True} if verdict.settling else {}),
-    }
-    if doubts:
-        result["error"] = "; ".join(f"{name}: {why}" for name, why in doubts.items())
-    return result
-
-
 def _execute(world: WorldRobot, arguments: Arguments, request: MotionRequest | None) -> Envelope:
     policy = dict(arguments)
     name = robot_of(world, policy.pop("robot_name"), first=True)
@@ -149,94 +123,9 @@ def reset_world(robot: Robot, arguments: Arguments, request: MotionRequest | Non
     return for_request(request, robot.reset)()
 
 
-def status(robot: Robot, arguments: Arguments) -> Envelope:
-    """Return the task of a robot, or the policies that run in a world."""
-    if not holds_robots(robot):
-        return robot.get_task_status()
-    running = robot.list_policies_running()
-    return success(
-        f"{len(running)} of {len(robot.list_robots())} robots run a policy.",
-        task_status="running" if running else "idle",
-        robots=robot.list_robots(),
-        policies=running,
-        **{name: getattr(robot, name)() for name in ("failed_policies", "outcomes") if hasattr(robot, name)},
-    )
-
-
 def _world_status(world: WorldRobot, arguments: Arguments) -> Envelope:
     running = world.list_policies_running()
     return {**world.get_state(), "task_status": "running" if running else "idle"}
-
-
-def start(robot: Robot, arguments: Arguments, request: MotionRequest | None = None) -> Envelope:
-    """Start a policy with a mesh peer's options, on ``robot_name`` of a world."""
-    options = {name: value for name, value in arguments.items() if name != "robot_name"}
-    if options.get("policy_host") == "localhost":
-        del options["policy_host"]
-    instruction = options.pop("instruction", "")
-    if holds_robots(robot):
-        name = robot_of(robot, arguments.get("robot_name"))
-        return for_request(request, robot.start_policy)(name, instruction, **options)
-    unknown = sorted(set(options) - _accepted(robot.start_task, options))
-    if unknown:
-        return error(f"start: this robot takes no {', '.join(unknown)}.")
-    return for_request(request, robot.start_task)(instruction, **options)
-
-
-def run_to_end(
-    robot: Robot, arguments: Arguments, closing: Callable[[], bool], request: MotionRequest | None = None
-) -> Envelope:
-    """Start a policy and wait for its end or for ``closing``."""
-    name = (arguments.get("robot_name") or next(iter(robots_in(robot)), "")) if holds_robots(robot) else None
-    ends: list[RolloutEvent] = []
-
-    def observe(event: RolloutEvent) -> None:
-        if event.kind == "finished" and event.policy != SETTLE and name in (None, event.robot):
-            ends.append(event)
-
-    unsubscribe = robot.subscribe(observe)
-    try:
-        started = start(robot, arguments, request)
-        if is_error(started):
-            return started
-        deadline = time.monotonic() + arguments["duration"] + EXECUTE_GRACE_S
-        return _awaited_end(robot, name, started, ends, deadline, closing)
-    finally:
-        unsubscribe()
-
-
-def _awaited_end(  # noqa: PLR0917 - one call, for the length of run_to_end
-    robot: Robot,
-    name: str | None,
-    started: Envelope,
-    ends: list[RolloutEvent],
-    deadline: float,
-    closing: Callable[[], bool],
-) -> Envelope:
-    while not ends and task_runs(robot, name or ""):
-        if closing():
-            return error("execute: this peer left the mesh while the policy ran.", started=started)
-        if time.monotonic() >= deadline:
-            return error("execute: the policy outlived its duration.", started=started)
-        time.sleep(POLL_S)
-    # A rollout that runs no more has told its end, or is about to.
-    last = time.monotonic() + END_EVENT_S
-    while not ends and holds_robots(robot) and time.monotonic() < last:
-        time.sleep(POLL_S)
-    if not ends:
-        return {**started, "state": "unknown"} if holds_robots(robot) else robot.get_task_status()
-    end = ends[-1]
-    facts = {"state": end.state, "task_status": end.state, "step_count": end.step, "elapsed_s": end.elapsed_s}
-    if end.state == "error":
-        return error(f"execute: {end.error or 'the policy failed'}", robot=end.robot, **facts)
-    return success(f"{end.robot} {end.state} after {end.step} steps.", robot=end.robot, **facts)
-
-
-def _accepted(method: Callable[..., Any], options: dict[str, Any]) -> set[str]:
-    parameters = inspect.signature(method).parameters
-    if any(each.kind is each.VAR_KEYWORD for each in parameters.values()):
-        return set(options)
-    return set(parameters)
 
 
 def release_torque(robot: Robot, arguments: Arguments) -> Envelope:
@@ -368,3 +257,74 @@ WORLD_VERBS = table(
         *(for_robot(verb, ROBOT_NAME) for verb in CONTROL_VERBS.values()),
     ]
 )
+
+
+def _of_base(method: str, cannot: str) -> Begin:
+    """Carry a verb out by a method of a mobile base; any other robot refuses it."""
+
+    def begin(robot: Robot, arguments: Arguments, request: MotionRequest | None) -> Envelope:
+        start = getattr(body_of(robot), method, None)
+        if not callable(start):
+            return error(cannot)
+        # The operator's approval of this verb is the approval of what it sends.
+        answer: Envelope = for_request(request, start)(**arguments, tool_context=Approved())
+        return answer
+
+    return begin
+
+
+def _navigates(robot: Robot) -> bool:
+    """Return True for a base with a navigation stack."""
+    body = body_of(robot)
+    return callable(getattr(body, "start_navigation", None)) and getattr(body, "nav_action", None) is not None
+
+
+DRIVE = Verb(
+    "drive",
+    Kind.MOTION,
+    "Drive for some seconds and return at once; follow it with getStatus or the taskComplete event.",
+    (
+        Parameter("linear", float, "Speed forwards in m/s; negative reverses", number),
+        Parameter("angular", float, "Turning rate in rad/s; positive turns left", number),
+        Parameter(
+            "duration",
+            float,
+            f"Seconds until the base is stopped again, above 0 and at most {DURATION_MAX_S:g}",
+            duration,
+        ),
+    ),
+    returns="task_status",
+    method="start_drive",
+    begin=_of_base("start_drive", "drive: this robot is no mobile base."),
+)
+NAVIGATE_TO = Verb(
+    "navigateTo",
+    Kind.MOTION,
+    "Send the base to a place around obstacles and return at once; follow it with getStatus or taskComplete.",
+    (
+        Parameter("x", float, "Position of the goal in metres, along the frame's x axis", number),
+        Parameter("y", float, "Position of the goal in metres, along the frame's y axis", number),
+        Parameter("yaw", float, "Heading at the goal in radians; positive is to the left", number, default=0.0),
+        Parameter(
+            "frame_id",
+            str,
+            "Frame in which the goal is given, such as map or odom",
+            lambda name, value: text(name, value, longest=255),
+            default="map",
+        ),
+        Parameter(
+            "timeout",
+            float,
+            f"Seconds after which the goal is cancelled, above 0 and at most {DURATION_MAX_S:g}",
+            duration,
+            default=120.0,
+        ),
+    ),
+    returns="task_status",
+    method="start_navigation",
+    suits=_navigates,
+    begin=_of_base("start_navigation", "navigateTo: this robot has no navigation stack."),
+)
+
+BASE_VERBS = {**ARM_VERBS, **table([DRIVE])}
+NAVIGATING_BASE_VERBS = {**BASE_VERBS, **table([NAVIGATE_TO])}

@@ -16,12 +16,10 @@ from strands_robots.contract import for_request
 from strands_robots.safety.gate import MotionRequest
 from strands_robots.safety.lockout import is_epoch
 from strands_robots.utils import DURATION_MAX_S, ValidationError, duration, identifier, number, shown, text, whole
+from strands_robots.verb_parameters import JSON_TYPES, REQUIRED, Check, Parameter, checked_arguments
 
 Arguments = Mapping[str, Any]
 """Checked arguments, by parameter."""
-
-Check = Callable[[str, object], Any]
-"""Gives the value that is used, or raises :class:`ValidationError` naming parameter, value and domain."""
 
 Run = Callable[[Any, Arguments], object]
 """Carries a verb out on a robot; returns an envelope. What it raises is reported as a failure inside the device."""
@@ -31,9 +29,6 @@ Begin = Callable[[Any, Arguments, MotionRequest | None], object]
 
 Suits = Callable[[Any], bool]
 """Says whether a robot can carry a verb out now."""
-
-REQUIRED: Any = object()
-"""Stands for the default of a parameter that has none."""
 
 
 class Kind(Enum):
@@ -50,24 +45,6 @@ class Kind(Enum):
 
     RESUME = "resume"
     """Authorized by what it brings: the operator's signature, or the secret of a lease."""
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """One parameter of a verb.
-
-    Attributes:
-        meaning: a line for callers, with the unit and the domain.
-        type: the Python type that its schema is made from.
-        schema: JSON Schema of a robot's own verb; the others have that of their type.
-    """
-
-    name: str
-    type: type
-    meaning: str
-    check: Check
-    default: Any = REQUIRED
-    schema: Mapping[str, Any] | None = None
 
 
 LEASE_ID = "lease_id"
@@ -166,17 +143,20 @@ class Verb:
     own: bool = False
     lasts_s: float = 0.0
     by_name: Mapping[str, Parameter] = field(init=False, repr=False, compare=False)
+    _defaults: Mapping[str, Any] = field(init=False, repr=False, compare=False)
+    share: str = field(init=False, repr=False, compare=False)
+    """The share of a robot's threads that carries it out, by its name in :class:`~.workers.Shares`."""
+    leased: bool = field(init=False, repr=False, compare=False)
+    """True for a motion of the lease's holder alone; it takes :data:`OF_THE_LEASE`."""
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "share", self._share())
+        object.__setattr__(self, "leased", self.kind is Kind.MOTION and not self.while_locked)
         if self.leased and all(each.name != LEASE_ID for each in self.parameters):
             more = [replace(each, default=None) if self.drops_unknown else each for each in OF_THE_LEASE]
             object.__setattr__(self, "parameters", (*self.parameters, *more))
         object.__setattr__(self, "by_name", {each.name: each for each in self.parameters})
-
-    @property
-    def leased(self) -> bool:
-        """True for a motion of the lease's holder alone; it takes :data:`OF_THE_LEASE`."""
-        return self.kind is Kind.MOTION and not self.while_locked
+        object.__setattr__(self, "_defaults", {each.name: each.default for each in self.parameters})
 
     def call(self, robot: Any, arguments: Arguments, request: MotionRequest | None = None) -> Callable[[], object]:
         """Return the call that carries the verb out with a robot, and returns its answer.
@@ -192,12 +172,21 @@ class Verb:
             return partial(self.run, robot, arguments)
         return partial(for_request(request, getattr(robot, self.method)), **arguments)
 
+    def _share(self) -> str:
+        # Only motions wait for motions.
+        if self.urgent:
+            return "urgent"
+        if self.lasts and not (self.own and self.kind is Kind.READ):
+            return "lasting"
+        return "motion" if self.kind is Kind.MOTION else "own_read" if self.own else "read"
+
     def unfit(self, names: Collection[str]) -> str | None:
         """Return the reason why arguments of these names do not fit, or None."""
         unknown = [name for name in names if name not in self.by_name]
         missing = [each.name for each in self.parameters if each.default is REQUIRED and each.name not in names]
-        if not unknown and not missing:
-            return None
+        return self._unfit(unknown, missing) if unknown or missing else None
+
+    def _unfit(self, unknown: list[str], missing: list[str]) -> str:
         takes = ", ".join(name for name in self.by_name if name not in LEASE_NAMES) or "no parameters"
         problem = f"it has no {', '.join(unknown)}" if unknown else f"{', '.join(missing)} is missing"
         return f"{self.name} takes {takes}: {problem}."
@@ -210,13 +199,7 @@ class Verb:
         """
         if self.drops_unknown:
             given = {name: value for name, value in given.items() if name in self.by_name and value is not None}
-        problem = self.unfit(given)
-        if problem is not None:
-            raise ValidationError(problem)
-        arguments = {
-            each.name: each.check(each.name, given[each.name]) if each.name in given else each.default
-            for each in self.parameters
-        }
+        arguments = {**self._defaults, **checked_arguments(self.by_name, given, self._unfit)}
         return {name: value for name, value in arguments.items() if value is not None or not self.drops_unknown}
 
     def readable(self, given: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
@@ -329,3 +312,49 @@ RESUME = Verb(
     returns="epoch, locked, epochs",
     urgent=True,
 )
+
+
+Labels = dict[str, str | list[str]]
+
+
+def labels_of(verb: Verb) -> Labels:
+    """Return the labels of a verb: direction, whose it is, seconds to return."""
+    kind: Labels = {"direction": "read"} if verb.kind is Kind.READ else {"direction": "write"}
+    if verb.kind is not Kind.READ and verb.critical:
+        kind["safety"] = "critical"
+    if verb.own:
+        kind["own"] = "true"
+    duration = verb.by_name.get("duration") if verb.lasts else None
+    lasts_s = verb.lasts_s if duration is None else float(duration.default)
+    if lasts_s:
+        kind["lasts_s"] = f"{lasts_s:g}"
+    return kind
+
+
+def text_of(verb: Verb) -> str:
+    """Return the text that describes a verb and its parameters."""
+    lines = [verb.summary, *(["", verb.note] if verb.note else [])]
+    if verb.parameters:
+        lines += ["", "Args:", *(f"    {each.name}: {each.meaning}" for each in verb.parameters)]
+    return "\n".join(lines)
+
+
+def described(verb: Verb) -> dict[str, Any]:
+    """Return the description of a verb, in Device Connect's shape for a function."""
+    return {
+        "name": verb.name,
+        "description": text_of(verb),
+        "parameters": {
+            "type": "object",
+            "properties": {each.name: _schema(each) for each in verb.parameters},
+            "required": [each.name for each in verb.parameters if each.default is REQUIRED],
+        },
+        "labels": labels_of(verb),
+    }
+
+
+def _schema(parameter: Parameter) -> dict[str, Any]:
+    if parameter.schema is not None:
+        return dict(parameter.schema)
+    kind = {"type": JSON_TYPES.get(parameter.type, "string"), "description": parameter.meaning}
+    return kind if parameter.default is REQUIRED else {**kind, "default": parameter.default}

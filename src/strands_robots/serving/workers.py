@@ -198,6 +198,7 @@ class Shares:
         self.read = Share(pool=pool)
         self.own_read = Share(pool=pool)
         self.urgent = Share(pool=pool)
+        self.by_name: dict[str, Share] = {name: each for name, each in vars(self).items() if isinstance(each, Share)}
 
 
 _SHARES: IdentityMap[Shares] = IdentityMap()

@@ -26,7 +26,7 @@ from strands_robots.fleet.profiles import networks_for_stop, networks_of, profil
 from strands_robots.fleet.refusals import near_verbs, said
 from strands_robots.fleet.stops import answer_of, estop_all, stop_all
 from strands_robots.fleet.verdicts import by_bearer, combined_verdict
-from strands_robots.serving import known_verbs
+from strands_robots.serving import advertised
 from strands_robots.serving.advertised import RobotDescription, fitting
 from strands_robots.serving.robot_verbs import ARM_VERBS, WORLD_VERBS
 from strands_robots.serving.stop_arguments import noted, stop_reason, stop_robot, stop_scope
@@ -158,7 +158,7 @@ def _started(there: Networks, robot: str, task: Mapping[str, Any]) -> Envelope:
 
 def _called(there: Networks, robot: str, verb: str, arguments: Mapping[str, Any]) -> Envelope:
     """Call any verb of the robot, and wait as long as it lasts by its description."""
-    if verb in known_verbs.STOPS:
+    if verb in advertised.STOPS:
         return there.call(robot, verb, arguments, STOP_S)
     network, described = there.described(robot, verb)
     try:

@@ -12,9 +12,9 @@ import pytest
 from websockets.sync.server import ServerConnection, serve
 
 from strands_robots.policies.remote import RemotePolicy
-from strands_robots.serving import policy_hosts
+from strands_robots.serving import policy_arguments
 from strands_robots.serving.peer_verbs import PEER_VERBS
-from strands_robots.serving.policy_hosts import PolicyHosts
+from strands_robots.serving.policy_arguments import PolicyHosts
 from strands_robots.utils import ValidationError
 
 NAME = "gpu-1.lan"
@@ -24,7 +24,7 @@ GOOD, EVIL = "127.0.0.1", "127.0.0.2"
 @pytest.fixture(autouse=True)
 def listed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("STRANDS_MESH_POLICY_HOST_ALLOW", NAME)
-    monkeypatch.setattr(policy_hosts, "_HOSTS", PolicyHosts())
+    monkeypatch.setattr(policy_arguments, "_HOSTS", PolicyHosts())
 
 
 class Resolver:
@@ -110,7 +110,7 @@ def test_name_that_is_not_listed_is_never_resolved() -> None:
 
 
 def test_resolver_that_hangs_holds_no_caller_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(policy_hosts, "RESOLVE_S", 0.1)
+    monkeypatch.setattr(policy_arguments, "RESOLVE_S", 0.1)
     hang, asked = threading.Event(), []
 
     def resolve(name: str) -> list[str]:
@@ -122,5 +122,5 @@ def test_resolver_that_hangs_holds_no_caller_up(monkeypatch: pytest.MonkeyPatch)
     for _ in range(50):
         with pytest.raises(ValidationError, match=r"cannot be resolved: no answer in 0\.1 s"):
             hosts.address(NAME)
-    assert len(asked) <= 1 + (time.monotonic() - began) / policy_hosts.FAILED_S
+    assert len(asked) <= 1 + (time.monotonic() - began) / policy_arguments.FAILED_S
     hang.set()

@@ -22,7 +22,7 @@ from strands_robots.device_connect import (
     stop_device_connect,
 )
 from strands_robots.device_connect.backends import open_client, register
-from strands_robots.serving.arm_motion_verbs import ARM_MOTION_VERBS
+from strands_robots.serving.arm_verbs import ARM_MOTION_VERBS
 from strands_robots.simulation import Simulation
 
 

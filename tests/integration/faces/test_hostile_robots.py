@@ -8,7 +8,7 @@ from fixtures.faces import Face, described_by
 from fixtures.hostile_robots import DEPTH, MANY
 from fixtures.waiting import eventually
 
-from strands_robots.serving.known_verbs import READS
+from strands_robots.serving.advertised import READS
 
 pytestmark = pytest.mark.timeout(300)
 ROBOTS = ("barista-1", "preacher-1", "digger-1", "crowd-1")

@@ -16,7 +16,7 @@ pytest.importorskip("mcp.server.mcpserver", reason="needs the extra mcp", exc_ty
 import httpx2
 from mcp import MCPError
 
-from strands_robots.serving.control import leases_of
+from strands_robots.serving.control_leases import leases_of
 
 BOTH = pytest.mark.parametrize("mode", ["legacy", "2026-07-28"])
 

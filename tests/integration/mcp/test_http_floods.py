@@ -23,7 +23,7 @@ import httpx2
 
 from strands_robots.mcp import connections, http
 from strands_robots.mesh.keys import CA_CERT, init, issue
-from strands_robots.serving.control import leases_of
+from strands_robots.serving.control_leases import leases_of
 
 BOTH = pytest.mark.parametrize("mode", ["legacy", "2026-07-28"])
 HALF_SENT, SESSIONS = 1300, 3000

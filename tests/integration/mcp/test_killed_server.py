@@ -11,7 +11,7 @@ from fixtures.mcp_site import WAVE, McpSite
 pytest.importorskip("mcp.server.mcpserver", reason="needs the extra mcp", exc_type=ImportError)
 
 from strands_robots.mcp.caller import SILENCE_S
-from strands_robots.serving.control import leases_of
+from strands_robots.serving.control_leases import leases_of
 
 HELD = {"robot": "arm-1", "robot_name": "left", "ttl_s": 600.0}
 

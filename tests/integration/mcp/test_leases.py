@@ -14,7 +14,7 @@ pytest.importorskip("mcp.server.mcpserver", reason="needs the extra mcp", exc_ty
 
 from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
 from strands_robots.mcp.results import MARK
-from strands_robots.serving.control import leases_of
+from strands_robots.serving.control_leases import leases_of
 
 pytestmark = pytest.mark.parametrize("site", [DEVICE_CONNECT, MESH], indirect=True)
 

@@ -22,7 +22,7 @@ from functools import partial
 from typing import Any
 
 from ... import bounded_json
-from ...serving.rate_limiter import RateLimiter
+from ...rate_limits import RateLimiter
 from . import jsonrpc
 
 logger = logging.getLogger(__name__)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from strands_robots.envelope import Envelope, is_error, text_of
 from strands_robots.errors import NoAnswerError, NoSuchRobotError, RefusalError, RobotError, UnreachableError
 from strands_robots.fleet.mesh.network import MeshNetwork
-from strands_robots.policies.base import Ranges, SpeedLimit, checked_action, numbers
+from strands_robots.policies.base import Ranges, checked_action, limited, numbers, speeds_across
 from strands_robots.teleoperators import UNBOUNDED_PER_S, BoundedLeader, LeaderFinished, LeaderPolicy
 from strands_robots.utils import ValidationError, mapping, number, plain_text, shown, text
 
@@ -119,7 +119,8 @@ class LimitedFollower:
 
     def __init__(self, body: Any, max_speed: float, now: Callable[[], float] = time.monotonic) -> None:
         self._bounds: Ranges = dict(body.bounds)
-        self._limit = SpeedLimit(self._bounds, number("max_speed", max_speed, above=0, high=20), UNBOUNDED_PER_S)
+        speed = number("max_speed", max_speed, above=0, high=20)
+        self._speeds = speeds_across(self._bounds, speed, UNBOUNDED_PER_S)
         self._last = {key: value for key, value in body.get_joints().items() if key in self._bounds}
         self._now = now
         self._at = now()
@@ -130,7 +131,7 @@ class LimitedFollower:
         now = self._now()
         # The time of a pause does not count, or the next frame could jump.
         passed, self._at = min(now - self._at, _PAUSE_MAX_S), now
-        self._last |= self._limit.limit(target, self._last, passed)
+        self._last |= limited(target, self._last, self._speeds, passed)
         return robot.send_action({key: self._last[key] for key in target})
 
 

@@ -572,7 +572,7 @@ def _owns(mesh: Mesh, robot: str, verb: str) -> bool:
 
 def _given_to(mesh: Mesh | None, robot: str, verb: str, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return the arguments that an action of ours is sent with."""
-    from strands_robots.serving.known_verbs import STOPS  # noqa: PLC0415 - loaded when it is used
+    from strands_robots.serving.advertised import STOPS  # noqa: PLC0415 - loaded when it is used
     from strands_robots.serving.peer_verbs import PEER_VERBS  # noqa: PLC0415 - as above
 
     if mesh is None or _owns(mesh, robot, verb):

@@ -126,7 +126,7 @@ def functions_of_kind(row: Mapping[str, Any], usual: str = "") -> list[Any]:
         usual: the kind where it states none that is known; without one it has its own verbs alone.
     """
     from strands_robots.serving.peer_verbs import KINDS, PEER_VERBS  # noqa: PLC0415 - loaded when it is used
-    from strands_robots.serving.verb_schema import described  # noqa: PLC0415 - as above
+    from strands_robots.serving.verbs import described  # noqa: PLC0415 - as above
 
     kind, own = row.get("robot_kind"), row.get("own_verbs")
     actions = KINDS.get(kind if isinstance(kind, str) else "", KINDS.get(usual, ()))

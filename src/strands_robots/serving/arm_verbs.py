@@ -1,21 +1,102 @@
-"""Verbs of an arm: where its tip is, moving it, and its gripper.
+"""Verbs of an arm: its tip, its motions, its gripper; pictures of any robot.
 
 Metres and degrees in the base frame, x forward; the gripper's opening is 0 closed to 1 open.
 """
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 from strands_robots.contract import Robot, body_of, for_request
-from strands_robots.envelope import Envelope, error, is_error
-from strands_robots.recording.cameras import camera_named
+from strands_robots.envelope import Envelope, error, is_error, success
+from strands_robots.recording.cameras import (
+    PICTURE_MAX_BYTES,
+    camera_list,
+    camera_named,
+    has_cameras,
+    jpeg,
+    take_picture,
+)
 from strands_robots.safety.gate import MotionRequest
-from strands_robots.serving.picture_verbs import picture
-from strands_robots.serving.verbs import ROBOT_NAME, Arguments, Begin, Check, Kind, Parameter, Verb, table
-from strands_robots.utils import WAIT_S, ValidationError, flag, identifier, mapping, number, shown, text
+from strands_robots.serving.verbs import ROBOT_NAME, Arguments, Begin, Kind, Verb, between, table
+from strands_robots.utils import (
+    WAIT_S,
+    MissingExtraError,
+    ValidationError,
+    flag,
+    identifier,
+    mapping,
+    number,
+    shown,
+    text,
+)
+from strands_robots.verb_parameters import Check, Parameter
+
+WIDTH, HEIGHT = 640, 480
+"""Size of a picture where none is asked for, in pixels."""
+
+
+def _list(robot: Robot, arguments: Arguments) -> Envelope:
+    names = camera_list(robot)
+    return success(f"{len(names)} cameras: {', '.join(names) or 'none'}.", cameras=names)
+
+
+def _get_picture(robot: Robot, arguments: Arguments) -> Envelope:
+    # The mesh leaves out what was not given.
+    return picture(robot, arguments.get("camera", ""), arguments.get("width", WIDTH), arguments.get("height", HEIGHT))
+
+
+def picture(robot: Robot, camera: str, width: int = WIDTH, height: int = HEIGHT) -> Envelope:
+    """Return a picture as ``camera``, ``width``, ``height``, ``format``, ``jpeg``."""
+    try:
+        name, pixels = take_picture(robot, camera, width, height)
+        encoded = jpeg(name, pixels)
+    except (ValidationError, MissingExtraError) as refused:
+        return error(str(refused))
+    except Exception as exc:  # noqa: BLE001 - a camera may raise anything; the answer says what
+        return error(f"{camera or 'The camera'} gave no picture: {type(exc).__name__}: {exc}")
+    if len(encoded) > PICTURE_MAX_BYTES:
+        return error(
+            f"A picture of {width} x {height} has {len(encoded)} bytes and a message {PICTURE_MAX_BYTES}; "
+            "ask for a smaller one."
+        )
+    high, wide = pixels.shape[:2]
+    answer = success(f"{name}, {wide} x {high} pixels.", camera=name, width=wide, height=high, format="jpeg")
+    # It is not in the content besides, which would double the message.
+    return {**answer, "jpeg": base64.b64encode(encoded).decode("ascii")}
+
+
+PICTURE_VERBS = table(
+    [
+        Verb(
+            "listCameras", Kind.READ, "Read the names of the cameras.", returns="cameras", run=_list, suits=has_cameras
+        ),
+        Verb(
+            "getPicture",
+            Kind.READ,
+            "Take one picture, as base64 of a JPEG.",
+            (
+                Parameter(
+                    "camera",
+                    str,
+                    "Name of the camera, as listCameras has it; empty for the first",
+                    lambda name, value: text(name, value, longest=128, empty=True),
+                    default="",
+                ),
+                Parameter("width", int, "Largest width in pixels, 16 to 1920", between(16, 1920), default=WIDTH),
+                Parameter("height", int, "Largest height in pixels, 16 to 1440", between(16, 1440), default=HEIGHT),
+            ),
+            returns="camera, width, height, format, jpeg",
+            run=_get_picture,
+            suits=has_cameras,
+        ),
+    ]
+)
+"""The verbs of every robot with cameras."""
+
 
 REACH_MAX_M = 3.0
 """Largest coordinate of a goal."""
@@ -147,124 +228,82 @@ def _motion(method: str) -> Begin:
     return begin
 
 
+def _moves(name: str, method: str, summary: str, *parameters: Parameter, kind: Kind = Kind.MOTION) -> Verb:
+    """Describe a verb that may wait for the end of a motion, and bring a picture."""
+    begin = _motion(method)
+    return Verb(name, kind, summary, parameters, returns=RESULT, method=method, begin=begin, lasts=True)
+
+
+def _reads(name: str, method: str, summary: str, returns: str) -> Verb:
+    return Verb(name, Kind.READ, summary, returns=returns, method=method, begin=of_arm(method))
+
+
+_HOW = (SPEED, WAIT, PICTURE, AROUND)
 _VERBS = (
-    Verb(
+    _reads(
         "getPose",
-        Kind.READ,
+        "arm_pose",
         "Read where the tip of the gripper is, its approach and the joints, in metres and degrees in the base frame.",
-        returns="x, y, z, approach, joints, gripper, holding, model",
-        method="arm_pose",
-        begin=of_arm("arm_pose"),
+        "x, y, z, approach, joints, gripper, holding, model",
     ),
-    Verb(
+    _moves(
         "moveJoints",
-        Kind.MOTION,
+        "move_joints",
         "Move joints to positions; the way is checked for limits, and with a model for contacts, before it moves.",
-        (
-            Parameter("joints", dict, "Degrees by joint name, metres for a slide; joints left out stay", _positions),
-            SPEED,
-            WAIT,
-            PICTURE,
-            AROUND,
-        ),
-        returns=RESULT,
-        method="move_joints",
-        begin=_motion("move_joints"),
-        lasts=True,
+        Parameter("joints", dict, "Degrees by joint name, metres for a slide; joints left out stay", _positions),
+        *_HOW,
     ),
-    Verb(
+    _moves(
         "moveTo",
-        Kind.MOTION,
+        "move_to",
         "Move the tip of the gripper to a point; the way is checked for limits and contacts before anything moves.",
-        (*(_coordinate(axis) for axis in "xyz"), APPROACH, SPEED, WAIT, PICTURE, AROUND),
-        returns=RESULT,
-        method="move_to",
-        begin=_motion("move_to"),
-        lasts=True,
+        *(_coordinate(axis) for axis in "xyz"),
+        APPROACH,
+        *_HOW,
     ),
-    Verb(
+    _moves(
         "moveBy",
-        Kind.MOTION,
+        "move_by",
         "Move the tip of the gripper on a straight line, by an offset or in a direction.",
-        (
-            *(_offset(axis, way) for axis, way in zip("xyz", ("forward", "to the left", "up"), strict=True)),
-            _DIRECTION,
-            _DISTANCE,
-            SPEED,
-            WAIT,
-            PICTURE,
-            AROUND,
-        ),
-        returns=RESULT,
-        method="move_by",
-        begin=_motion("move_by"),
-        lasts=True,
+        *(_offset(axis, way) for axis, way in zip("xyz", ("forward", "to the left", "up"), strict=True)),
+        _DIRECTION,
+        _DISTANCE,
+        *_HOW,
     ),
-    Verb(
+    _moves(
         "setGripper",
-        Kind.MOTION,
+        "set_gripper",
         "Open or close the gripper; holding says whether something is between the jaws.",
-        (Parameter("opening", float, "From 0 (closed) to 1 (open)", within(0, 1)), WAIT, PICTURE),
-        returns=RESULT,
-        method="set_gripper",
-        begin=_motion("set_gripper"),
-        lasts=True,
+        Parameter("opening", float, "From 0 (closed) to 1 (open)", within(0, 1)),
+        WAIT,
+        PICTURE,
     ),
-    Verb(
-        "goTo",
-        Kind.MOTION,
-        "Move to a place that was saved, or to home.",
-        (PLACE, SPEED, WAIT, PICTURE, AROUND),
-        returns=RESULT,
-        method="go_to",
-        begin=_motion("go_to"),
-        lasts=True,
-    ),
-    Verb(
+    _moves("goTo", "go_to", "Move to a place that was saved, or to home.", PLACE, *_HOW),
+    _reads(
         "getObjects",
-        Kind.READ,
+        "get_objects",
         "Read the objects that can be seen: centre and extents in metres and yaw in degrees in the base frame.",
-        returns="objects",
-        method="get_objects",
-        begin=of_arm("get_objects"),
+        "objects",
     ),
-    Verb(
+    _moves(
         "pick",
-        Kind.MOTION,
+        "pick",
         "Pick an object up, by its name in getObjects or by its place; holding says whether it is between the jaws.",
-        (
-            Parameter("object", str, "Name of the object; empty to give its place", _name, default=""),
-            *(_optional_coordinate(axis, "the object's centre") for axis in "xyz"),
-            Parameter("width", float, "Metres between the jaws, for a place", within(0.002, 0.2), default=0.025),
-            Parameter("yaw", float, "Degrees by which it is turned, for a place", within(-360, 360), default=0.0),
-            APPROACH,
-            SPEED,
-            WAIT,
-            PICTURE,
-            AROUND,
-        ),
-        returns=RESULT,
-        method="pick",
-        begin=_motion("pick"),
-        lasts=True,
+        Parameter("object", str, "Name of the object; empty to give its place", _name, default=""),
+        *(_optional_coordinate(axis, "the object's centre") for axis in "xyz"),
+        Parameter("width", float, "Metres between the jaws, for a place", within(0.002, 0.2), default=0.025),
+        Parameter("yaw", float, "Degrees by which it is turned, for a place", within(-360, 360), default=0.0),
+        APPROACH,
+        *_HOW,
     ),
-    Verb(
+    _moves(
         "place",
-        Kind.MOTION,
+        "place",
         "Put the held object down at a point, or on another object.",
-        (
-            *(_optional_coordinate(axis, "the place; z is the table's height where left out") for axis in "xyz"),
-            Parameter("on", str, "Name of the object on which to put it; empty for a point", _name, default=""),
-            APPROACH,
-            SPEED,
-            WAIT,
-            PICTURE,
-            AROUND,
-        ),
-        returns=RESULT,
-        method="place",
-        begin=_motion("place"),
-        lasts=True,
+        *(_optional_coordinate(axis, "the place; z is the table's height where left out") for axis in "xyz"),
+        Parameter("on", str, "Name of the object on which to put it; empty for a point", _name, default=""),
+        APPROACH,
+        *_HOW,
     ),
     Verb(
         "savePlace",
@@ -276,25 +315,20 @@ _VERBS = (
         begin=of_arm("save_place"),
         critical=False,
     ),
-    Verb(
+    _moves(
         "wait",
-        Kind.READ,
+        "wait_for",
         "Wait for the end of a motion and read its result.",
-        (
-            Parameter(
-                "task_id",
-                str,
-                "The motion's task_id; empty for the last one",
-                lambda name, value: text(name, value, longest=64, empty=True),
-                default="",
-            ),
-            Parameter("seconds", float, f"Longest wait, 0 to {WAIT_S:g}", within(0, WAIT_S), default=WAIT_S),
-            PICTURE,
+        Parameter(
+            "task_id",
+            str,
+            "The motion's task_id; empty for the last one",
+            lambda name, value: text(name, value, longest=64, empty=True),
+            default="",
         ),
-        returns=RESULT,
-        method="wait_for",
-        begin=_motion("wait_for"),
-        lasts=True,
+        Parameter("seconds", float, f"Longest wait, 0 to {WAIT_S:g}", within(0, WAIT_S), default=WAIT_S),
+        PICTURE,
+        kind=Kind.READ,
     ),
 )
 

@@ -1,17 +1,25 @@
-"""Operator's assertion that takes a robot from its holder, and its check.
+"""Operator's assertion that takes a robot from its holder, and its fresh epochs.
 
-It names the robot and the epoch of its control lease. Taking control raises the epoch, so an assertion is good once.
+It names the robot and the epoch of its control lease. The epoch rises with each holder, so an assertion is good once,
+and a restarted process begins above all epochs of the one before, so that a recorded assertion never fits again.
+Neither a clock that is set back nor a second process with the same state directory changes that. The file
+``control-epochs`` there has one byte for each robot that ever reserved its first epoch; the byte's place is the high
+part of the epoch. The low part is random, so that a state directory that was lost or put back does not bring an epoch
+back either.
 """
 
 from __future__ import annotations
 
+import os
 import secrets
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 from strands_robots.safety import ed25519
 from strands_robots.safety.resume import NEWEST_S, OLDEST_S
+from strands_robots.state_files import adopt, make_private, read_private, require_private, state_dir
 from strands_robots.utils import canonical_json, shown
 
 PURPOSE = "take-control"
@@ -22,6 +30,9 @@ TEXT_MAX = 1024
 """Longest text of a field, in characters."""
 
 VERSION = 1
+
+EPOCHS_EACH = 2**28
+"""Epochs from one reservation to the next; the first half is where a lease may begin."""
 
 
 def sign_take(signing_key: Any, robot: str, epoch: int, *, clock: Callable[[], float] = time.time) -> dict[str, Any]:
@@ -76,3 +87,28 @@ def outdated(assertion: Mapping[str, Any], epoch: int, now: float) -> str | None
 
 def _is_scalar(value: object) -> bool:
     return isinstance(value, int | float) or (isinstance(value, str) and len(value) <= TEXT_MAX)
+
+
+def reserve_epochs() -> int:
+    """Return an epoch above all that were ever reached here, kept on the disk.
+
+    Raises:
+        OSError: the state directory cannot be written.
+        StateFileError: it, or the file, is not this user's alone.
+    """
+    root = state_dir()
+    path = root / "control-epochs"
+    adopt(root)
+    make_private(root)
+    require_private(root, root)
+    with suppress(FileNotFoundError):
+        read_private(path, root, longest=0)
+    descriptor = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+    try:
+        os.write(descriptor, b".")
+        os.fsync(descriptor)
+        # Appending is atomic: no other process ends its byte at this place.
+        place = os.lseek(descriptor, 0, os.SEEK_CUR)
+    finally:
+        os.close(descriptor)
+    return place * EPOCHS_EACH + secrets.randbelow(EPOCHS_EACH // 2)
