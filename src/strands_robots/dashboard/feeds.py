@@ -36,6 +36,7 @@ from strands_robots.fleet.verdicts import NetworkVerdict
 from strands_robots.safety.identity import KeyFileError
 from strands_robots.serving.advertised import AdvertisedParameter, AdvertisedVerb, RobotDescription
 from strands_robots.serving.control_leases import CONTROL_VERBS
+from strands_robots.threads import LoopThread
 from strands_robots.utils import plain_text
 
 logger = logging.getLogger(__name__)
