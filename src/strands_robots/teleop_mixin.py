@@ -71,9 +71,7 @@ class TeleopMixin:
         )
         with self.tasks.starting:
             if name in self.teleoperating():
-                return error(
-                    f"{name} teleoperates {self.tasks.latest_sessions()[name].robot} now; stop_teleoperate it first."
-                )
+                return error(f"{name} teleoperates {self.tasks.by_leader[name].robot} now; stop_teleoperate it first.")
             self._teleop_leaders[name] = (robot, policy)
         return success(f"{name} will lead {robot}.", name=name, robot=robot)
 
@@ -119,7 +117,7 @@ class TeleopMixin:
 
     def teleop_status(self) -> Envelope:
         """Answer with one row for each leader that leads or has led."""
-        rows = self._teleop_rows(self.tasks.latest_sessions())
+        rows = self._teleop_rows(dict(self.tasks.by_leader))
         return success(f"{len(self.teleoperating())} leaders lead.", running=list(self.teleoperating()), leaders=rows)
 
     def teleoperating(self) -> dict[str, Rollout]:

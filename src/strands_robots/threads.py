@@ -1,15 +1,21 @@
-"""Threads that stand ready for work, and threads that sleep until there is some."""
+"""Threads that stand ready, threads that sleep until woken, and event loops."""
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import itertools
 import math
 import queue
 import threading
-from collections.abc import Callable
-from typing import Generic, TypeVar
+from collections.abc import Callable, Coroutine
+from concurrent.futures import Future
+from typing import Any, Generic, TypeVar
 
 T = TypeVar("T")
+
+LAST_TASKS_S = 1.0
+"""Seconds in which cancelled tasks of a loop have to end."""
 
 
 class ReadyThreads(Generic[T]):
@@ -139,3 +145,46 @@ class WokenThread:
             self._woken.clear()
             if not self._closed:
                 self._step()
+
+
+class LoopThread:
+    """An event loop on a thread of its own."""
+
+    def __init__(self, name: str) -> None:
+        self.loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._live, name=name, daemon=True)
+        self._thread.start()
+
+    def submit(self, coroutine: Coroutine[Any, Any, T]) -> Future[T]:
+        """Run a coroutine on the loop; cancelling the future cancels it."""
+        return asyncio.run_coroutine_threadsafe(coroutine, self.loop)
+
+    def end(self) -> None:
+        """Have what runs there cancelled, and loop and thread end; return at once."""
+        with contextlib.suppress(RuntimeError):  # it has ended
+            self.loop.call_soon_threadsafe(self.loop.stop)
+
+    def join(self, within: float) -> bool:
+        """Wait for the thread to end; False when it did not."""
+        self._thread.join(within)
+        return not self._thread.is_alive()
+
+    def close(self, wait_s: float = 5.0) -> None:
+        """End it, and wait for the thread."""
+        self.end()
+        self.join(wait_s)
+
+    def _live(self) -> None:
+        try:
+            self.loop.run_forever()
+            self.loop.run_until_complete(self._cancel_tasks())
+        finally:
+            self.loop.close()
+
+    async def _cancel_tasks(self) -> None:
+        tasks = asyncio.all_tasks() - {asyncio.current_task()}
+        for task in tasks:
+            task.cancel()
+        if tasks:
+            await asyncio.wait(tasks, timeout=LAST_TASKS_S)
+        await self.loop.shutdown_asyncgens()

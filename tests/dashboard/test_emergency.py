@@ -18,9 +18,9 @@ from strands_robots.fleet import safety_console
 from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
 from strands_robots.fleet.networks import Networks
 from strands_robots.safety.answers import Answer, Progress, StopReport
-from strands_robots.safety.roster import Roster, RosterRow
+from strands_robots.safety.roster import Roster
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
-from strands_robots.safety.sightings import Known, sightings
+from strands_robots.safety.sightings import Known, RosterRow, sightings
 from strands_robots.safety.statements import Proof
 from strands_robots.safety.stop_roster import StopOutcome
 

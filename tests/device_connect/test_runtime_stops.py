@@ -10,7 +10,7 @@ import pytest
 from device_connect_edge.messaging.exceptions import SubscribeError
 
 from strands_robots.device_connect.backends import LinkConfig
-from strands_robots.device_connect.safety_registration import stops_of
+from strands_robots.device_connect.device_stops import stops_of
 
 LINK = LinkConfig(connect=("tcp/127.0.0.1:7447",))
 SUBJECT = "device-connect.default.safety-1.event.emergencyStop"

@@ -18,8 +18,8 @@ from strands_robots.fleet.device_connect import stops
 from strands_robots.safety import stop_roster
 from strands_robots.safety.answers import Answer, Progress, StopReport
 from strands_robots.safety.network_key import DEVICE_CONNECT, NetworkKey
-from strands_robots.safety.roster import Roster, RosterRow, Sending
-from strands_robots.safety.sightings import Known
+from strands_robots.safety.roster import Roster, Sending
+from strands_robots.safety.sightings import Known, RosterRow
 
 NETWORK = NetworkKey.of(DEVICE_CONNECT, ["tcp/127.0.0.1:7447"])
 STOPPED = success("stopped", stopped=True)

@@ -31,8 +31,8 @@ from strands_robots.fleet.adapter import (
 from strands_robots.fleet.fleet import Fleet
 from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.stops import estop_all, stop_all
-from strands_robots.safety.roster import Roster, RosterRow
-from strands_robots.safety.sightings import Known
+from strands_robots.safety.roster import Roster
+from strands_robots.safety.sightings import Known, RosterRow
 
 
 class SlowNetwork(ScriptedNetwork):

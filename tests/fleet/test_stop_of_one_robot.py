@@ -16,8 +16,8 @@ from strands_robots.fleet.fleet import Fleet
 from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.remote_robot import RemoteRobot
 from strands_robots.safety.network_key import NetworkKey
-from strands_robots.safety.roster import Roster, RosterRow
-from strands_robots.safety.sightings import Known
+from strands_robots.safety.roster import Roster
+from strands_robots.safety.sightings import Known, RosterRow
 
 Stop = Callable[[Networks], dict[str, Envelope]]
 

@@ -22,9 +22,9 @@ from strands_robots.fleet.stops import estop_all
 from strands_robots.safety.answers import Answer, Progress
 from strands_robots.safety.identity import ROBOTS, EnrolledKeys, KeyFile
 from strands_robots.safety.network_key import NetworkKey
-from strands_robots.safety.roster import Roster, RosterRow
+from strands_robots.safety.roster import Roster
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
-from strands_robots.safety.sightings import Known
+from strands_robots.safety.sightings import Known, RosterRow
 from strands_robots.utils import ValidationError
 
 NEAR = key_of(DEVICE_CONNECT)

@@ -40,11 +40,45 @@ class RealClock(Clock):
         return time.time()
 
 
+class PartedBus(MemoryBus):
+    """A bus from which a session can be cut off."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._cut: set[MemoryTransport] = set()
+
+    def parted(self, one: MemoryTransport, other: MemoryTransport) -> bool:
+        return one is not other and not self._cut.isdisjoint((one, other))
+
+    def partition(self, transport: MemoryTransport, cut: bool = True, *, stayed: bool = False) -> None:
+        """Lose every message from and to a session; ``cut=False`` heals it.
+
+        Args:
+            stayed: it is told that others of its links were up all the time.
+        """
+        if not cut and transport in self._cut and isinstance(transport, PartedTransport):
+            transport.stayed += stayed
+            transport.healed += 1
+        (self._cut.add if cut else self._cut.discard)(transport)
+
+
+class PartedTransport(MemoryTransport):
+    """A session that counts how often its links came back, and at how many of these others had stayed."""
+
+    healed = stayed = 0
+
+    def links_back(self) -> int:
+        return self.healed
+
+    def rejoined(self) -> int:
+        return self.healed - self.stayed
+
+
 class Fleet:
     """Peers of one process, each with a session, registry and plane of its own."""
 
     def __init__(self, folder: Path, clock: Clock | None = None) -> None:
-        self.bus = MemoryBus()
+        self.bus = PartedBus()
         self.clock = clock or Clock()
         self.meshes: list[Mesh] = []
         self.transports: dict[str, MemoryTransport] = {}
@@ -55,7 +89,7 @@ class Fleet:
     def parts(
         self, peer_id: str, *, identity: Identity | None = None, sessionless: bool = False, keep: bool = False
     ) -> Parts:
-        transport = MemoryTransport(self.bus, sessionless=sessionless)
+        transport = PartedTransport(self.bus, sessionless=sessionless)
         self.transports[peer_id] = transport
         own = self.planes[peer_id] = SafetyPlane(LockoutStore(self._folder / peer_id), deadline_s=20.0)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 import pytest
@@ -11,9 +12,9 @@ from strands_robots.safety import sighting_file, sightings
 from strands_robots.safety.ed25519 import encode
 from strands_robots.safety.identity import EnrolledKeys, Exemption
 from strands_robots.safety.network_key import DEVICE_CONNECT, MESH, NetworkKey
-from strands_robots.safety.roster import Known, Roster, RosterRow, bounded
+from strands_robots.safety.roster import Known, Roster, bounded
 from strands_robots.safety.sighting_file import Note
-from strands_robots.safety.sightings import Sightings, this_moment
+from strands_robots.safety.sightings import RosterRow, Sightings, this_moment
 from strands_robots.state_files import uptime
 
 HERE = NetworkKey.of(DEVICE_CONNECT, ["nats://broker:4222"])
@@ -79,7 +80,7 @@ def test_where_robots_are_enrolled_a_name_that_was_only_heard_is_told(store: Sig
 def test_a_robot_that_is_enrolled_and_dead_is_a_row_without_an_age(store: Sightings, enrolled: EnrolledKeys) -> None:
     enrolled.enroll({"dead-1": ARM}, network=HERE)
     (row,) = Roster.of(HERE, store=store).must_answer
-    assert (row.name, row.age_s) == ("dead-1", None)
+    assert (row.name, row.age_s) == ("dead-1", math.inf)
 
 
 def test_a_stop_asks_the_robots_of_its_own_network_and_counts_the_others(

@@ -27,7 +27,7 @@ from strands_robots.safety.sighting_file import Note, Served, own_run, process_s
 from strands_robots.safety.sightings import (
     Known,
     Moment,
-    Sighting,
+    RosterRow,
     Sightings,
     flush_sightings,
 )
@@ -38,7 +38,7 @@ HERE = NetworkKey.of(DEVICE_CONNECT, ["tcp/127.0.0.1:7447"])
 WEEK_S = 7 * 24 * 3600.0
 
 
-def found(store: Sightings, now: Moment | None = None) -> dict[str, Sighting]:
+def found(store: Sightings, now: Moment | None = None) -> dict[str, RosterRow]:
     """The robots by name; nothing was wrong with the file."""
     rows, problem = store.read(now)
     assert problem in ("", sighting_file.CROWDED)

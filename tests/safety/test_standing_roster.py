@@ -20,12 +20,11 @@ from strands_robots.safety.roster import (
     Roster,
     RosterInbox,
     RosterReport,
-    RosterRow,
     read_report,
     report_fields,
     trusted_controllers,
 )
-from strands_robots.safety.sightings import Known
+from strands_robots.safety.sightings import Known, RosterRow
 from strands_robots.safety.standing_roster import StandingRoster
 from strands_robots.safety.statements import Purpose, signed
 from strands_robots.safety.stop_link import ESTOP, STOP_ROSTER, VERDICT, notification

@@ -18,8 +18,8 @@ from strands_robots.safety import stop_roster
 from strands_robots.safety.answers import Answer, StopReport
 from strands_robots.safety.identity import Exemption
 from strands_robots.safety.network_key import DEVICE_CONNECT, NetworkKey
-from strands_robots.safety.roster import Roster, RosterReport, RosterRow, Sending, process_state, reason_of
-from strands_robots.safety.sightings import Known
+from strands_robots.safety.roster import Roster, RosterReport, Sending, process_state, reason_of
+from strands_robots.safety.sightings import Known, RosterRow
 from strands_robots.safety.stop_notes import stop_notes
 from strands_robots.safety.stop_roster import StopOutcome, StopRoster
 

@@ -34,7 +34,8 @@ from strands_robots.fleet.verdicts import (
 )
 from strands_robots.safety.answers import Answer, Progress, StopReport
 from strands_robots.safety.controller import DEADLINE_S
-from strands_robots.safety.roster import RosterRow, seconds
+from strands_robots.safety.roster import seconds
+from strands_robots.safety.sightings import RosterRow
 from strands_robots.safety.stop_notes import problem_sentence, stop_notes
 from strands_robots.safety.stop_roster import StopOutcome
 from strands_robots.serving.stop_arguments import robot_of_world, stop_reason, stop_robot, stop_scope

@@ -15,7 +15,6 @@ from itertools import islice
 from typing import Any
 
 from strands_robots.dashboard.fleet_model import FleetModel, key_of
-from strands_robots.device_connect.process import LOOP_JOIN_TIMEOUT_S, EventLoopThread
 from strands_robots.envelope import Envelope, is_error
 from strands_robots.errors import RefusalError
 from strands_robots.fleet.adapter import (
@@ -37,6 +36,7 @@ from strands_robots.fleet.verdicts import NetworkVerdict
 from strands_robots.safety.identity import KeyFileError
 from strands_robots.serving.advertised import AdvertisedParameter, AdvertisedVerb, RobotDescription
 from strands_robots.serving.control_leases import CONTROL_VERBS
+from strands_robots.threads import LoopThread
 from strands_robots.utils import plain_text
 
 logger = logging.getLogger(__name__)
@@ -185,9 +185,8 @@ class FleetFeed:
         for pool in (self._searcher, self._describers):
             self._stack.callback(pool.shutdown, wait=False, cancel_futures=True)
         try:
-            thread = EventLoopThread(f"dashboard-{self.network}")
-            self._stack.callback(thread.join, LOOP_JOIN_TIMEOUT_S)
-            self._stack.callback(thread.end)
+            thread = LoopThread(f"dashboard-{self.network}")
+            self._stack.callback(thread.close)
             self._stack.callback(there.subscribe(EVERY, self._take))
         except BaseException:
             self._stack.close()

@@ -27,12 +27,13 @@ from strands_robots.device_connect.backends import LinkConfig, open_client
 from strands_robots.device_connect.backends.base import NoResponderError, ResponderLostError
 from strands_robots.device_connect.backends.config import network_of, usual_link
 from strands_robots.device_connect.discovery import DESCRIBE_S, HEARTBEATS_S, Discovery, Peer, parts
-from strands_robots.device_connect.process import LOOP_JOIN_TIMEOUT_S, EventLoopThread
+from strands_robots.device_connect.process import LOOP_JOIN_TIMEOUT_S
 from strands_robots.envelope import Envelope, error
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety.sightings import sightings
 from strands_robots.safety.statements import Purpose
 from strands_robots.safety.stopping import Outcome, explain, grade
+from strands_robots.threads import LoopThread
 from strands_robots.utils import ValidationError, device_id, finite, shown, text
 
 if TYPE_CHECKING:
@@ -105,7 +106,7 @@ class FleetClient:
     def __init__(self, link: LinkConfig, source: str = "strands-robots") -> None:
         self.link = link
         self.source = device_id("source", source)
-        self._loop: EventLoopThread | None = None
+        self._loop: LoopThread | None = None
         self._messaging: Any = None
         self._discovery: Discovery | None = None
         self._network = network_of(link)
@@ -114,7 +115,7 @@ class FleetClient:
         self._closed = False
 
     def __enter__(self) -> Self:
-        self._loop = EventLoopThread("fleet-client")
+        self._loop = LoopThread("fleet-client")
         try:
             self._messaging = self.run(open_client(self.link), self.link.connect_timeout_s + CONNECT_MARGIN_S)
             self._discovery = Discovery(self._messaging)
@@ -141,8 +142,7 @@ class FleetClient:
             if messaging is not None:
                 loop.submit(messaging.close()).result(LOOP_JOIN_TIMEOUT_S)
         finally:
-            loop.end()
-            loop.join(LOOP_JOIN_TIMEOUT_S)
+            loop.close(LOOP_JOIN_TIMEOUT_S)
 
     def peers(self, timeout: float = 2.0, *, thorough: bool = False) -> list[Peer]:
         """Return the devices of the tenant, sorted by id.

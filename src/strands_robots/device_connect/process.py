@@ -1,4 +1,4 @@
-"""Event loops on threads of their own, and the signal that ends a program.
+"""The event loop of a process's devices, and the signal that ends a program.
 
 The code of a robot runs on workers, so its device needs no loop of its own. The methods of a ready ``DeviceDriver`` are
 coroutines of somebody else; such a driver gets a loop of its own, where it blocks no other device.
@@ -8,63 +8,18 @@ Importing this module needs no extra.
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
 import signal
 import threading
-from collections.abc import Coroutine
-from concurrent.futures import Future
 from types import FrameType
-from typing import Any, Self, TypeVar
+from typing import Any, Self
 
-T = TypeVar("T")
+from strands_robots.threads import LoopThread
 
 LOOP_JOIN_TIMEOUT_S = 5.0
 """Seconds that a failed or stopped bring-up, or a client, waits for its thread to end."""
 
-LAST_TASKS_S = 1.0
-"""Seconds in which cancelled tasks of a loop have to end."""
 
-
-class EventLoopThread:
-    """An event loop on a thread of its own."""
-
-    def __init__(self, name: str) -> None:
-        self.loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self._live, name=name, daemon=True)
-        self._thread.start()
-
-    def submit(self, coroutine: Coroutine[Any, Any, T]) -> Future[T]:
-        """Run a coroutine on the loop; cancelling the future cancels it."""
-        return asyncio.run_coroutine_threadsafe(coroutine, self.loop)
-
-    def end(self) -> None:
-        """Have what runs there cancelled, and loop and thread end; return at once."""
-        with contextlib.suppress(RuntimeError):  # it has ended
-            self.loop.call_soon_threadsafe(self.loop.stop)
-
-    def join(self, within: float) -> bool:
-        """Wait for the thread to end; False when it did not."""
-        self._thread.join(within)
-        return not self._thread.is_alive()
-
-    def _live(self) -> None:
-        try:
-            self.loop.run_forever()
-            self.loop.run_until_complete(self._cancel_tasks())
-        finally:
-            self.loop.close()
-
-    async def _cancel_tasks(self) -> None:
-        tasks = asyncio.all_tasks() - {asyncio.current_task()}
-        for task in tasks:
-            task.cancel()
-        if tasks:
-            await asyncio.wait(tasks, timeout=LAST_TASKS_S)
-        await self.loop.shutdown_asyncgens()
-
-
-class DeviceLoop(EventLoopThread):
+class DeviceLoop(LoopThread):
     """The event loop of devices; it ends when its last user has left."""
 
     def __init__(self) -> None:

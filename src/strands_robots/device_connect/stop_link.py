@@ -10,14 +10,12 @@ import atexit
 import contextlib
 import weakref
 from collections.abc import Collection
-from concurrent.futures import Future
 from dataclasses import replace
 from typing import Any
 
 from device_connect_edge.messaging import MessagingError
 
 from strands_robots.device_connect.backends import LinkConfig
-from strands_robots.device_connect.process import EventLoopThread
 from strands_robots.safety.orders import PARSED_MAX_BYTES
 from strands_robots.safety.stop_link import (
     ANSWER,
@@ -31,6 +29,7 @@ from strands_robots.safety.stop_link import (
     StopLink,
 )
 from strands_robots.stop_log import stop_logger
+from strands_robots.threads import LoopThread
 from strands_robots.zenoh_session import StopSession
 
 logger = stop_logger(__name__)
@@ -111,8 +110,9 @@ class NatsStopLink:
     def __init__(self, link: LinkConfig) -> None:
         self._link = link
         self._root = f"device-connect.{link.tenant}"
-        self._loop: EventLoopThread | None = None
-        self._serving: Future[None] | None = None
+        self._loop: LoopThread | None = None
+        self._end = asyncio.Event()
+        self._task: asyncio.Task[None] | None = None
         self._client: Any = None
         self._up = False
         self._on_state: OnState = lambda up: None
@@ -133,9 +133,8 @@ class NatsStopLink:
 
     def open(self, events: Collection[str], on_event: OnEvent, on_state: OnState) -> None:
         self._on_state = on_state
-        self._loop = EventLoopThread("stop-link")
-        # Kept: a loop itself keeps no task that nothing else refers to.
-        self._serving = self._loop.submit(self._serve(events, on_event))
+        self._loop = LoopThread("stop-link")
+        self._loop.submit(self._serve(events, on_event))
         _OPEN.add(self)
 
     def publish(self, source: str, event: str, payload: bytes) -> bool:
@@ -145,16 +144,18 @@ class NatsStopLink:
         subject = f"{self._root}.{source}.event.{event}"
         if event == ESTOP:
             self._stops.add(subject)
-        loop.loop.call_soon_threadsafe(self._send, subject, payload)
+        try:
+            loop.loop.call_soon_threadsafe(self._send, subject, payload)
+        except RuntimeError:  # it was closed just now
+            return False
         return True
 
     def close(self) -> None:
         loop, self._loop = self._loop, None
         if loop is not None:
-            with contextlib.suppress(TimeoutError, MessagingError):
-                loop.submit(self._sent()).result(CLOSE_S)
-            loop.end()
-            loop.join(CLOSE_S)
+            with contextlib.suppress(TimeoutError):
+                loop.submit(self._leave()).result(CLOSE_S)
+            loop.close(CLOSE_S)
         _OPEN.discard(self)
 
     def _set_up(self, up: bool) -> None:
@@ -164,7 +165,7 @@ class NatsStopLink:
             self._on_state(up)
 
     async def _serve(self, events: Collection[str], on_event: OnEvent) -> None:
-        """Carry events, and connect again after a failure, until it is cancelled."""
+        """Carry events, and connect again after a failure, until the end."""
         from strands_robots.device_connect.backends.nats import NatsBackend  # noqa: PLC0415 - loaded with the first link
 
         def on_message(data: bytes | int, subject: str) -> None:
@@ -178,17 +179,23 @@ class NatsStopLink:
         async def lost() -> None:
             self._set_up(False)
 
-        while True:
+        self._task = asyncio.current_task()
+        ending = asyncio.ensure_future(self._end.wait())
+        while not ending.done():
             client = NatsBackend(self._link)
+            connecting = asyncio.ensure_future(client.connect(servers=[], reconnect_cb=back, disconnect_cb=lost))
             try:
-                await client.connect(servers=[], reconnect_cb=back, disconnect_cb=lost)
+                await asyncio.wait({connecting, ending}, return_when=asyncio.FIRST_COMPLETED)
+                # At the end alone: otherwise it is done.
+                connecting.cancel()
+                await connecting
                 for event in events:
                     await client.listen(f"{self._root}.*.event.{event}", on_message)
                 # The server has the subscriptions when it has answered this.
                 await client.flush()
                 self._client = client
                 self._set_up(True)
-                await asyncio.Event().wait()
+                await ending
             except MessagingError as exc:
                 logger.debug("the e-stop listener's connection does not open yet: %s", exc)
             except Exception:
@@ -198,14 +205,15 @@ class NatsStopLink:
                 self._client = None
                 self._set_up(False)
                 await client.close()
-            await asyncio.sleep(RETRY_S)
+            await asyncio.wait({ending}, timeout=RETRY_S)
 
-    async def _sent(self) -> None:
-        """Return when the server has what was published before."""
+    async def _leave(self) -> None:
+        """Send what was published before, then disconnect."""
         if self._sending:
             await asyncio.wait(self._sending)
-        if self._client is not None:
-            await self._client.flush()
+        self._end.set()
+        if self._task is not None:
+            await asyncio.wait({self._task})
 
     def _send(self, subject: str, payload: bytes) -> None:
         task = asyncio.ensure_future(self._publish(subject, payload))

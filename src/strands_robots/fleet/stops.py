@@ -18,9 +18,8 @@ from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.verdicts import FleetVerdict, NetworkVerdict, not_reached, roster_verdict
 from strands_robots.safety.answers import Progress
 from strands_robots.safety.network_key import NetworkKey
-from strands_robots.safety.roster import RosterRow
 from strands_robots.safety.scope import Scope
-from strands_robots.safety.sightings import Known
+from strands_robots.safety.sightings import Known, RosterRow
 from strands_robots.safety.stop_roster import StopOutcome, robots_known_at
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.utils import plain_text

@@ -360,7 +360,7 @@ class HardwareRobot(ArmMixin, TeleopMixin):
         self.tasks.waiting.void()
         if self.gate.under_way:
             return self.halt("stop_task").envelope()
-        task = self.tasks.latest(self.tool_name_str)
+        task = self.tasks.by_body.get(self.tool_name_str)
         if task is None or not task.running:
             return success("No task runs.", stopped=True, was_running=False, **self._task_fields())
         task.void()
@@ -502,7 +502,7 @@ class HardwareRobot(ArmMixin, TeleopMixin):
             raise ValidationError(f"{self.tool_name_str} is not connected; connect() it first.")
 
     def _task_fields(self) -> dict[str, Any]:
-        task = self.tasks.latest(self.tool_name_str)
+        task = self.tasks.by_body.get(self.tool_name_str)
         return {
             "task_status": "idle" if task is None else task.state,
             "instruction": "" if task is None else task.instruction,

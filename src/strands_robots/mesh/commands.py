@@ -115,7 +115,7 @@ class SenderCheck:
 
     def _require_first(self, request: wire.Request) -> None:
         """Raise :class:`IdentityError` for another's command, or one sent before."""
-        if not request.is_for(self._context.peer_id):
+        if request.body.get("target_id") not in (self._context.peer_id, wire.BROADCAST_TARGET):
             raise IdentityError("it was signed for another peer")
         if request.timestamp is None or self._context.predates(request.timestamp):
             raise IdentityError("it was issued before this peer started, by its sender's clock; send it again")

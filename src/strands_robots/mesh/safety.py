@@ -82,7 +82,7 @@ def status_of(robot: Robot, facts: Callable[[str], Mapping[str, Any]]) -> Own:
 
 
 class FleetSafety:
-    """Issues and receives fleet e-stops and resumes for one peer.
+    """Emergency stops, resumes and check-ins of one peer.
 
     Args:
         resumes: checks a relayed resume off the transport's thread.

@@ -44,7 +44,6 @@ class StepPublisher:
         self._rollouts = RateLimiter(hz)
         self._executor = BoundedExecutor(f"{context.peer_id}-stream", WAITING)
         self._unsubscribe: Unsubscribe | None = None
-        self._several = False
         self._unpublished = 0
 
     def start(self) -> None:
@@ -70,12 +69,12 @@ class StepPublisher:
         if not isinstance(event, RolloutEvent):
             return
         if event.kind == "started":
-            self._several = len(robots_in(self._robot)) > 1
             self._rollouts.forget(event.robot)
         if event.kind == "step" and self._context.running() and self._rollouts.admit(event.robot):
-            stamp, prefix = self._context.clock(), f"{event.robot}/" if self._several else ""
+            stamp = self._context.clock()
 
             def publish() -> None:
+                prefix = f"{event.robot}/" if len(robots_in(self._robot)) > 1 else ""
                 observation = {prefix + key: value for key, value in event.observation.items()}
                 action = {prefix + key: value for key, value in event.action.items()}
                 self._put(stamp, event.step, observation, action, instruction=event.instruction, policy=event.policy)

@@ -164,10 +164,6 @@ class Request:
             "target_id": self.target_id,
         }
 
-    def is_for(self, peer_id: str) -> bool:
-        """True where the stated target is the peer, or all of them."""
-        return self.body.get("target_id") in (peer_id, BROADCAST_TARGET)
-
     @classmethod
     def of(cls, body: Mapping[str, Any]) -> Request:
         """Parse ``body``; the time may be missing. Raises WireError."""

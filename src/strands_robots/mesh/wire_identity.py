@@ -296,6 +296,8 @@ class Identity:
     def __init__(self, signer: Signer | None = None, verifier: Verifier | None = None, required: bool = False) -> None:
         self._signer = signer
         self._verifier = verifier
+        self.checks = verifier is not None
+        """True when there are roots to check a signature against."""
         self.required = required
 
     @classmethod
@@ -333,11 +335,6 @@ class Identity:
     def signs(self) -> bool:
         """True when this peer holds a certificate."""
         return self._signer is not None
-
-    @property
-    def checks(self) -> bool:
-        """True when there are roots to check a signature against."""
-        return self._verifier is not None
 
 
 def visitor_id(prefix: str) -> str:

@@ -230,14 +230,14 @@ def _inside(
     question, change = "range of the actions", "check units, and that the actions are positions of joints"
     changes = states is not None and 0 < max(_shares(profile, states, bounds), default=0.0) < CHANGES_SHARE
     if narrow and not outside and not changes:
-        return _vouched(profile, question, of(wrong, source), of(theirs, ROBOT), change)
+        return _vouched(profile, question, of(wrong, source), of(theirs, ROBOT), f"{change};", by="units")
     return compared(question, of(wrong, source), of(theirs, ROBOT), not outside and not narrow, change)
 
 
-def _vouched(profile: Profile, question: str, policy: str, robot: str, change: str) -> CheckRow:
-    """Return the row of a difference that the operator may vouch for."""
-    outcome: Outcome = "confirmed" if "units" in profile.confirmed else "unverified"
-    return CheckRow(question, policy, robot, outcome, f'{change}; or list "units" under confirmed')
+def _vouched(profile: Profile, question: str, policy: str, robot: str, change: str, *, by: str) -> CheckRow:
+    """Return the row of a question for which the operator may vouch in the profile."""
+    outcome: Outcome = "confirmed" if by in profile.confirmed else "unverified"
+    return CheckRow(question, policy, robot, outcome, f'{change} or list "{by}" under confirmed')
 
 
 def _shares(profile: Profile, states: Spread, actions: Spread) -> list[float]:
@@ -286,7 +286,7 @@ def _same_data(
     )
     change = "name the dataset that the checkpoint was trained on, or the checkpoint of this dataset"
     if far and not disjoint and 2 * sum(map(_is_unit, ratios)) < len(ratios):
-        return _vouched(profile, question, mine, theirs, change)
+        return _vouched(profile, question, mine, theirs, f"{change};", by="units")
     return compared(question, mine, theirs, not far, change)
 
 
@@ -340,9 +340,8 @@ def _picture(profile: Profile, key: str, seen: tuple[Size, str], data: tuple[Map
         return compared(question, mine, have, fits=False, change="name the dataset that it was trained on")
     if theirs[key] == size:
         return compared(question, mine, of(_shown(theirs[key]), owner), fits=True, change="")
-    outcome: Outcome = "confirmed" if "image size" in profile.confirmed else "unverified"
-    change = 'name the dataset that it was trained on, or list "image size" under confirmed'
-    return CheckRow(question, mine, of(_shown(theirs[key]), owner), outcome, change)
+    change = "name the dataset that it was trained on,"
+    return _vouched(profile, question, mine, of(_shown(theirs[key]), owner), change, by="image size")
 
 
 def _shown(size: Size) -> str:
@@ -550,9 +549,8 @@ def _camera(profile: Profile, camera: CameraMap, robot: RobotFacts) -> Iterator[
         if x + width > size[1] or y + height > size[0]:
             yield CheckRow(question, f"crop {list(camera.crop)}", shown, "refused", f"{where}.crop is outside of it")
     if camera.size is None and (size is None or profile.url):
-        outcome: Outcome = "confirmed" if "image size" in profile.confirmed else "unverified"
-        change = f'set {where}.size, or list "image size" under confirmed'
-        yield CheckRow(f"{question}, image size", "not stated", shown, outcome, change)
+        change = f"set {where}.size,"
+        yield _vouched(profile, f"{question}, image size", "not stated", shown, change, by="image size")
 
 
 def _size(camera: CameraMap, robot: RobotFacts) -> tuple[int, int] | None:
@@ -583,9 +581,8 @@ def _units(profile: Profile, robot: RobotFacts) -> Iterator[CheckRow]:
             change = f'units."{key}" must be {its}, or the robot configured for {mine}'
             yield compared(f"unit of {key}", of(mine, PROFILE), of(its, ROBOT), fits, change)
         elif key in profile.action:
-            outcome: Outcome = "confirmed" if "units" in profile.confirmed else "unverified"
-            change = 'set units, or list "units" under confirmed'
-            yield CheckRow(f"unit of {key}", mine or "not stated", its or "not stated", outcome, change)
+            sides = mine or "not stated", its or "not stated"
+            yield _vouched(profile, f"unit of {key}", *sides, "set units,", by="units")
 
 
 def _rate(profile: Profile, statements: Sequence[Statement], robot: RobotFacts) -> Iterator[CheckRow]:
@@ -593,10 +590,9 @@ def _rate(profile: Profile, statements: Sequence[Statement], robot: RobotFacts) 
     if profile.rate is not None and not stated:
         yield unanswered("rate of the data", robot=of(f"{profile.rate:g} Hz", PROFILE))
     if profile.rate is None:
-        outcome: Outcome = "confirmed" if "rate" in profile.confirmed else "unverified"
         hint = f", {stated[0][1]:g} in {stated[0][0]}" if stated else ""
-        change = f'set rate to that of the data{hint}, or list "rate" under confirmed'
-        yield CheckRow("rate", "not stated", of(f"{robot.rate:g} Hz", ROBOT), outcome, change)
+        change = f"set rate to that of the data{hint},"
+        yield _vouched(profile, "rate", "not stated", of(f"{robot.rate:g} Hz", ROBOT), change, by="rate")
         return
     for source, rate in stated:
         same = math.isclose(rate, profile.rate, rel_tol=1e-3)

@@ -356,7 +356,7 @@ class Rollout:
                 wanted = chunk.popleft()
                 checked = checked_action(wanted, bounds)
                 self.out_of_range_steps += any(checked[key] != wanted[key] for key in checked)
-                action = self._limited(checked, observation)
+                action = self._limited(checked, observation) if self._speeds else checked
                 sent = self._body.send_action(action, self._permit)
                 self._moving = any(is_velocity(key) and value for key, value in sent.items())
                 self.step_count += 1

@@ -81,8 +81,10 @@ class TaskEngine:
         self.rate = rate
         self._body, self._ready, self._facts = body, ready, facts
         self._lines: dict[str, threading.RLock] = {}
-        self._tasks: dict[str, Rollout] = {}
-        self._sessions: dict[str, Rollout] = {}
+        self.by_body: dict[str, Rollout] = {}
+        """The running or the last task of each body."""
+        self.by_leader: dict[str, Rollout] = {}
+        """The running or the last session of each leader."""
         self._sends: set[Permit] = set()
         self._moved: dict[str, None] = {}
         self._halting: dict[str, None] = {}
@@ -134,14 +136,18 @@ class TaskEngine:
         with waiting.until_begun(permit, leader or label), self.line(label):
             policy = None
             if new.load is not None:
-                self._free_body(label, permit)
+                self.require_free(label)
                 policy = new.load()
                 if not permit.valid:
                     raise MotionRefused(error(_LATE.format(verb)))
             with self.starting:
-                rollout = new.make(self._free_body(label, permit), permit, policy)
                 permit.check()
-                (self._sessions if leader else self._tasks)[leader or label] = rollout
+                body = self._body(label)
+                self.require_free(label)
+                self._ready()
+                rollout = new.make(body, permit, policy)
+                permit.check()
+                (self.by_leader if leader else self.by_body)[leader or label] = rollout
                 rollout.start()
                 return rollout
 
@@ -151,18 +157,11 @@ class TaskEngine:
 
     def require_free(self, name: str) -> None:
         """Raise :class:`ValidationError` while something drives a body."""
-        task = self._tasks.get(name)
-        if self._sessions or (task is not None and task.running):
+        task = self.by_body.get(name)
+        if self.by_leader or (task is not None and task.running):
             driver = self.occupied(name) or self.leader_of(name)
             if driver:
                 raise ValidationError(f"{name} is driven by {driver}; stop that first.")
-
-    def _free_body(self, name: str, permit: Permit) -> Body:
-        permit.check()
-        body = self._body(name)
-        self.require_free(name)
-        self._ready()
-        return body
 
     @contextmanager
     def sending(self, permit: Permit) -> Iterator[None]:
@@ -173,25 +172,13 @@ class TaskEngine:
         finally:
             self._sends.discard(permit)
 
-    def latest(self, name: str) -> Rollout | None:
-        """Return the running or the last task of a body; leaders are none."""
-        return self._tasks.get(name)
-
-    def latest_of_all(self) -> dict[str, Rollout]:
-        """Return the running or the last task of each body."""
-        return dict(self._tasks)
-
     def running(self) -> dict[str, Rollout]:
         """Return the running tasks by body."""
-        return {name: task for name, task in list(self._tasks.items()) if task.running}
+        return {name: task for name, task in list(self.by_body.items()) if task.running}
 
     def leading(self) -> dict[str, Rollout]:
         """Return the running sessions by leader."""
-        return {name: session for name, session in list(self._sessions.items()) if session.running}
-
-    def latest_sessions(self) -> dict[str, Rollout]:
-        """Return the running or the last session of each leader."""
-        return dict(self._sessions)
+        return {name: session for name, session in list(self.by_leader.items()) if session.running}
 
     def leader_of(self, name: str) -> str:
         """Return the leader that drives a body; empty when none does."""
@@ -199,7 +186,7 @@ class TaskEngine:
 
     def occupied(self, name: str) -> str:
         """Name the task that drives a body, for a refusal; empty when none does."""
-        task = self._tasks.get(name)
+        task = self.by_body.get(name)
         if task is None or not task.running:
             return ""
         instruction = repr(task.instruction)
@@ -207,8 +194,8 @@ class TaskEngine:
 
     def moving(self) -> list[str]:
         """Name what moves now, as a verdict does."""
-        names = [self._task_label or name for name, task in list(self._tasks.items()) if task.running]
-        names += [f"teleoperation {leader}" for leader, session in list(self._sessions.items()) if session.running]
+        names = [self._task_label or name for name, task in list(self.by_body.items()) if task.running]
+        names += [f"teleoperation {leader}" for leader, session in list(self.by_leader.items()) if session.running]
         if self.settlings.by_body:
             names += [f"settling {name}" if self._of_world else "settling" for name in self.settlings.running()]
         return names + ["send_action"] * bool(self._sends)
@@ -223,8 +210,8 @@ class TaskEngine:
 
     def void(self) -> dict[str, Rollout]:
         """Void every running loop; return them as a verdict names them."""
-        loops = {self._task_label or name: task for name, task in list(self._tasks.items()) if task.running}
-        loops |= {f"teleoperation {leader}": each for leader, each in list(self._sessions.items()) if each.running}
+        loops = {self._task_label or name: task for name, task in list(self.by_body.items()) if task.running}
+        loops |= {f"teleoperation {leader}": each for leader, each in list(self.by_leader.items()) if each.running}
         for loop in loops.values():
             loop.void()
         return loops

@@ -105,60 +105,55 @@ class LatchAnswers:
         return False
 
 
-@dataclass(frozen=True, slots=True)
-class Member:
-    """A robot of this process on one network.
+@dataclass(eq=False)
+class ListenerRegistration:
+    """Registration of a device with the listener; the last one closes the link."""
 
-    Attributes:
-        robot_id: its id in this process.
-        name: its name on the network.
-        identity: returns what signs for it.
-        was_here: it was served from this machine in the ten minutes before its start.
-        asks: False for what moves nothing, which answers with what it sent.
-    """
-
+    listener: EstopListener
     robot_id: str
-    name: str
+    key: Hashable
+    link: StopLink
     identity: Callable[[], SigningIdentity | None]
-    was_here: bool = False
-    asks: bool = True
+    network: NetworkKey | None
+    was_here: bool
+    codec: StopCodec
+    asks: bool
 
+    @property
+    def name(self) -> str:
+        """The name of the device on its network."""
+        return self.listener.wire_id(self.robot_id)
 
-@dataclass(frozen=True, slots=True)
-class Stated:
-    """A missed stop as an answer has it: its bytes, its age in s and who answered."""
+    def open(self) -> None:
+        """Open the link, unless it is open or this registration has ended."""
+        self.listener.open(self)
 
-    payload: bytes
-    age_s: float
-    answerer: str
+    def close(self) -> None:
+        """Unregister. Safe to call twice."""
+        self.listener.unregister(self)
 
 
 class RobotsPort(MissedStopsPort):
-    """The robots of a process on one network.
+    """The robots of a process on the network of one link, which no missed stop leaves.
 
     Args:
-        network: no missed stop crosses it; None where nothing is asked and answered.
+        link: a registration with that link; without a network nothing is asked and answered.
         members: returns those that are served there now.
-        publish: sends fields as an event of a name on that network.
         on_report: answers a stop, as for one that came directly.
-        codec: reads the stops of that network.
     """
 
     def __init__(
         self,
         of: SafetyPlane,
         rules: StopRules,
-        network: NetworkKey | None,
-        *,
-        members: Callable[[], Sequence[Member]],
-        publish: Callable[[str, str, Mapping[str, Any]], bool],
+        link: ListenerRegistration,
+        members: Callable[[], Sequence[ListenerRegistration]],
         on_report: Callable[[RobotReport], None],
-        codec: StopCodec = JSON_RPC,
     ) -> None:
-        self._plane, self._rules, self._network = of, rules, "" if network is None else network.text
-        self._codec = codec
-        self._members, self._publish, self._on_report = members, publish, on_report
-        self._keys = KnownKeys(DEFAULT_TENANT if network is None else network.tenant, rules.keys)
+        self._plane, self._rules, self._network = of, rules, _text(link.network)
+        self._link, self._codec = link.link, link.codec
+        self._members, self._on_report = members, on_report
+        self._keys = KnownKeys(DEFAULT_TENANT if link.network is None else link.network.tenant, rules.keys)
 
     def was_here(self) -> bool:
         robots = self._plane.robots
@@ -174,7 +169,7 @@ class RobotsPort(MissedStopsPort):
         return [each.name for each in self._members() if each.asks]
 
     def publish(self, event: str, source: str, fields: Mapping[str, Any]) -> bool:
-        return self._publish(event, source, fields)
+        return self._link.publish(source, event, self._codec.encode(event, fields))
 
     def signer(self) -> tuple[str, SigningIdentity | None]:
         members = self._members()
@@ -198,26 +193,17 @@ class RobotsPort(MissedStopsPort):
         epoch = codec.epoch(source, fields)
         if not epoch:
             return False
-        stop = StopEvent(ESTOP, source, payload, time.monotonic(), self._network, codec)
-        return self.lock(
-            epoch,
-            lambda: codec.order(self._rules, stop, fields, MISSED, age_s),
-            Stated(payload, age_s, answerer),
-        )
-
-    def lock(self, epoch: str, decide: Callable[[], StopOrder | StopRefused | None], stated: Stated) -> bool:
-        """Lock by a missed stop unless all know it; False when it does not count."""
         if all(each.latch.knows(epoch) for each in self._plane.robots.values()):
-            self._plane.stated_again(self._network, epoch, stated.payload, stated.age_s)
+            self._plane.stated_again(self._network, epoch, payload, age_s)
             return True
-        order = decide()
+        stop = StopEvent(ESTOP, source, payload, time.monotonic(), self._network, codec)
+        order = codec.order(self._rules, stop, fields, MISSED, age_s)
         if not isinstance(order, StopOrder):
             return False
         run = self._plane.begin(order, self._on_report)
         for robot_id in run.robot_ids if run is not None else ():
             logger.warning("%s is locked by emergency stop %s, which it had missed.", robot_id, epoch)
-            sender, answerer = order.source[:256], stated.answerer[:256]
-            facts = {"epoch": epoch, "source": sender, "answerer": answerer, "age_s": round(stated.age_s, 3)}
+            facts = {"epoch": epoch, "source": order.source[:256], "answerer": answerer[:256], "age_s": round(age_s, 3)}
             queue_safety_event("missed_stop_learnt", robot_id, facts)
         return True
 
@@ -226,29 +212,6 @@ class RobotsPort(MissedStopsPort):
 
     def hold(self, seconds: float) -> None:
         self._plane.hold(seconds)
-
-
-@dataclass(eq=False)
-class ListenerRegistration:
-    """Registration of a device with the listener; the last one closes the link."""
-
-    listener: EstopListener
-    robot_id: str
-    key: Hashable
-    link: StopLink
-    identity: Callable[[], SigningIdentity | None]
-    network: NetworkKey | None
-    was_here: bool
-    codec: StopCodec
-    asks: bool
-
-    def open(self) -> None:
-        """Open the link, unless it is open or this registration has ended."""
-        self.listener.open(self)
-
-    def close(self) -> None:
-        """Unregister. Safe to call twice."""
-        self.listener.unregister(self)
 
 
 class OpenLink(NamedTuple):
@@ -462,28 +425,12 @@ class EstopListener:
         queue_safety_event("estop_refused", "stop-lane", facts)
 
     def _missed_stops(self, registration: ListenerRegistration) -> MissedStops:
-        key, link, codec = registration.key, registration.link, registration.codec
+        def members() -> list[ListenerRegistration]:
+            there = (each for each in self._registrations if each.key == registration.key)
+            return [each for each in there if each.network is not None]
 
-        def members() -> list[Member]:
-            here = [each for each in self._registrations if each.key == key and each.network is not None]
-            return [
-                Member(each.robot_id, self._wire_id(each.robot_id), each.identity, each.was_here, each.asks)
-                for each in here
-            ]
-
-        def publish(event: str, source: str, fields: Mapping[str, Any]) -> bool:
-            return link.publish(source, event, codec.encode(event, fields))
-
-        port = RobotsPort(
-            self._plane,
-            self._rules,
-            registration.network,
-            members=members,
-            publish=publish,
-            on_report=self._answer,
-            codec=codec,
-        )
-        return MissedStops(port, codec.fields)
+        port = RobotsPort(self._plane, self._rules, registration, members, self._answer)
+        return MissedStops(port, registration.codec.fields)
 
     def _start(self) -> None:
         self._rules = self._make_rules()
@@ -532,13 +479,14 @@ class EstopListener:
         self._rules.compare_clock(source, params, received.at)
         # The robots of a process share one audit.
         for first in [each for each in self._registrations if each.codec.answers][:1]:
-            name = self._wire_id(first.robot_id)
+            name = self.wire_id(first.robot_id)
             answer = self._check_in_answers.answer(name, params.get("estop_id"), first.identity())
             if answer is not None:
                 first.link.publish(name, CHECK_IN_ANSWER, first.codec.encode(CHECK_IN_ANSWER, answer))
         return True
 
-    def _wire_id(self, robot_id: str) -> str:
+    def wire_id(self, robot_id: str) -> str:
+        """Return the name by which a robot answers on its network."""
         entry = self._plane.robots.get(robot_id)
         return entry.wire_id if entry else robot_id
 
@@ -565,7 +513,7 @@ class EstopListener:
         _bound(self._answered)
         for each in self._registrations:
             if each.robot_id == report.robot_id and each.codec.answers:
-                device_id = self._wire_id(report.robot_id)
+                device_id = self.wire_id(report.robot_id)
                 each.link.publish(device_id, VERDICT, self._verdict(report, device_id, each.identity()))
 
     def _verdict(self, report: RobotReport, device_id: str, identity: SigningIdentity | None) -> bytes:

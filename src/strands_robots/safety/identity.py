@@ -177,10 +177,10 @@ def robot_identity(name: str) -> SigningIdentity | None:
         return None
 
 
-def key_here(name: str) -> bytes | None:
+def key_here(name: str, directory: Path | None = None) -> bytes | None:
     """Return the public key of a robot of this machine, None without a usable one."""
     try:
-        identity = KeyFile(ROBOTS, name).load()
+        identity = KeyFile(ROBOTS, name, directory).load()
     except (StrandsRobotsError, OSError):
         return None
     return None if identity is None else identity.public

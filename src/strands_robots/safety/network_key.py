@@ -81,6 +81,10 @@ class NetworkKey:
         return self.meets(other) or not all(each.startswith("127.0.0.1:") for each in (*self.where, *other.where))
 
 
+NO_NETWORK = NetworkKey("", (NOWHERE,))
+"""Where a robot is of which that is not known."""
+
+
 def _plain(endpoint: str) -> str:
     """Return an endpoint as host and port, without credentials and scheme."""
     rest = endpoint.strip().lower().rsplit("@", 1)[-1]

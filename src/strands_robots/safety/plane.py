@@ -45,7 +45,7 @@ REPORTS_KEPT = 64
 HALT_AGAIN_S = 0.25
 """Seconds in which one halt answers for all stops of a robot that is locked by more than it tells apart."""
 
-YIELD_S = 0.0002
+YIELD_S = 0.00005
 """Seconds that the halts of a stop have to themselves as they begin."""
 
 KEEP_AGAIN_S = 1.0

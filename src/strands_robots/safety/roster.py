@@ -6,6 +6,7 @@ SERVED or SIGNED count; names that were only HEARD are told and do not alter the
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
@@ -17,7 +18,6 @@ from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety.identity import (
     EnrolledKeys,
     EnrolledRobot,
-    Exemption,
     KeyFileError,
     kept_consoles,
     of_tenant,
@@ -26,15 +26,14 @@ from strands_robots.safety.identity import (
 from strands_robots.safety.lockout import is_epoch
 from strands_robots.safety.network_key import MESH, NetworkKey
 from strands_robots.safety.orders import estop_keys, params_of
-from strands_robots.safety.scope import Scope
 from strands_robots.safety.sighting_file import CROWDED
-from strands_robots.safety.sightings import Known, Sighting, Sightings, sightings, this_moment
+from strands_robots.safety.sightings import Known, RosterRow, Sightings, sightings, this_moment
 from strands_robots.safety.statements import Purpose, own_key
 from strands_robots.safety.stop_link import STOP_ROSTER, FairQueue
 from strands_robots.state_files import uptime
 from strands_robots.stop_log import stop_logger
 from strands_robots.threads import WokenThread
-from strands_robots.utils import ValidationError, field_values, identifier
+from strands_robots.utils import ValidationError, identifier
 
 logger = stop_logger(__name__)
 
@@ -42,86 +41,19 @@ REPORTED_MAX = 64
 
 
 @dataclass(frozen=True, slots=True)
-class RosterRow:
-    """A robot that must answer.
-
-    Attributes:
-        name: its id on the network.
-        known: the surest way in which it is known.
-        age_s: seconds since it was last heard here; None where it was not within ten minutes, below 0 after the press.
-        order: lower for a robot that was heard first earlier.
-        cell: or "".
-        signed_only: it locks for signed stops alone (``--key``); None where that is unknown.
-        stoppable: False for a device without a stop: told, not counted. None where that is unknown.
-        departed: it said, unsigned, that it left.
-        alive: its process on this machine lives; None where it is not served from here.
-        pid: of that process.
-        processes: run id and pid of every living process of this machine that serves it; each must answer.
-        exemption: of rows of :attr:`Roster.exempt`.
-        reported_by: the controller that reported it, "" where this machine heard it.
-        enrolled_cell: of its enrolment, "" for none; None where that is unknown.
-        named: nothing is known of it but that the caller of a stop named it.
-    """
-
-    name: str
-    known: Known
-    age_s: float | None = None
-    order: int = 0
-    cell: str = ""
-    signed_only: bool | None = None
-    stoppable: bool | None = None
-    departed: bool = False
-    alive: bool | None = None
-    pid: int | None = None
-    processes: tuple[tuple[str, int], ...] = ()
-    exemption: Exemption | None = None
-    reported_by: str = ""
-    enrolled_cell: str | None = None
-    named: bool = False
-
-    @property
-    def last_cell(self) -> str:
-        """The cell in which it was heard last, else that of its enrolment; "" for none."""
-        return self.cell or self.enrolled_cell or ""
-
-    def within(self, scope: Scope, stated: str | None) -> bool:
-        """Return False for a robot of another cell than that of a scope.
-
-        Anyone may forge a presence. It takes no enrolled robot out of the count, and of one that has shown a key it
-        does not contradict what is remembered.
-
-        Args:
-            stated: the cell that it was heard in last, "" for none; None where it reads no scope.
-        """
-        if scope.everything or scope.only or stated is None:
-            return stated is None or scope.covers(self.name, ())
-        if self.processes:
-            cells = [self.cell]
-        elif self.known is Known.ENROLLED:
-            if self.enrolled_cell is None:
-                return True
-            cells = [self.enrolled_cell, stated, *([self.cell] if self.cell else [])]
-        elif stated and stated != self.cell and self.age_s is not None and self.known is not Known.HEARD:
-            cells = [""]
-        else:
-            cells = [stated]
-        return any(scope.covers(self.name, {cell} - {""}) for cell in cells)
-
-
-@dataclass(frozen=True, slots=True)
 class _Memory:
     """Memory of all networks, and the names of the one asked for."""
 
     networks: tuple[NetworkKey, ...]
-    found: tuple[Sighting, ...]
+    found: tuple[RosterRow, ...]
     enrolled: Mapping[str, EnrolledRobot]
     problems: tuple[str, ...]
 
     def at(self, networks: Iterable[NetworkKey]) -> bool:
         return any(own.meets(each) for each in networks for own in self.networks)
 
-    def here(self, sighting: Sighting) -> bool:
-        return self.at((sighting.network,))
+    def here(self, row: RosterRow) -> bool:
+        return self.at((row.network,))
 
     def further(self, proven: Mapping[str, Collection[str]]) -> tuple[NetworkKey, ...]:
         """Return networks that are the one asked for, as robots prove."""
@@ -194,8 +126,8 @@ class Roster:
     def _at(cls, memory: _Memory) -> Roster:
         rows: dict[str, RosterRow] = {}
         processes: dict[str, dict[str, int]] = {}
-        for each in sorted(filter(memory.here, memory.found), key=_surest_first):
-            rows.setdefault(each.name, _row_of(each))
+        for each in sorted(filter(memory.here, memory.found), key=lambda row: (row.known, row.age_s)):
+            rows.setdefault(each.name, each)
             processes.setdefault(each.name, {}).update(each.processes)
         rows = {name: replace(row, processes=tuple(processes[name].items())) for name, row in rows.items()}
         enrolled = memory.enrolled
@@ -236,7 +168,7 @@ class Roster:
         return frozenset(each.name for each in memory.found if each.alive and not memory.here(each))
 
     @property
-    def perhaps_here(self) -> dict[str, Sighting]:
+    def perhaps_here(self) -> dict[str, RosterRow]:
         """Robots served by this machine under an address that may be of this network."""
         memory = self._memory
         if memory is None:
@@ -304,16 +236,6 @@ class Roster:
         return replace(self, rows=in_order(united.values()))
 
 
-def _surest_first(sighting: Sighting) -> tuple[int, float]:
-    return sighting.known, sighting.age_s
-
-
-def _row_of(sighting: Sighting) -> RosterRow:
-    fields = field_values(sighting)
-    del fields["network"]
-    return RosterRow(**fields)
-
-
 def in_order(rows: Iterable[RosterRow]) -> tuple[RosterRow, ...]:
     """Return the rows, surest first, then longest heard first."""
     return tuple(sorted(rows, key=lambda row: (row.known, row.order, row.name)))
@@ -367,14 +289,14 @@ def reason_of(
         return "it acts on signed stops alone: estop --key FILE"
     if row.departed:
         return "it said that it leaves the network; that was not signed"
-    if found or (row.age_s is not None and row.age_s < 0):
+    if found or row.age_s < 0:
         return "it is on this network and does not answer"
     where, ago = elsewhere.get(row.name, (None, 0.0))
-    if where is not None and (row.age_s is None or ago < row.age_s):
+    if where is not None and ago < row.age_s:
         return f"it was heard {seconds(ago)} ago on another network: {described(where)}"
     if row.reported_by:
         return f"this machine has not heard it; {row.reported_by} has, and misses it too"
-    if row.age_s is None:
+    if row.age_s == math.inf:
         return "no route to it: it was not heard in the last ten minutes"
     return f"no route to it: it was last heard {seconds(row.age_s)} before"
 

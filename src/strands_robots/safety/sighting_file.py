@@ -8,17 +8,20 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import math
 import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from strands_robots.errors import StrandsRobotsError
-from strands_robots.safety.network_key import NetworkKey
+from strands_robots.safety.identity import Exemption
+from strands_robots.safety.network_key import NO_NETWORK, NetworkKey
+from strands_robots.safety.scope import Scope
 from strands_robots.state_files import StateFileError, adopt, boot, make_private, require_private_file, uptime
 from strands_robots.stop_log import stop_logger
 from strands_robots.utils import ValidationError
@@ -152,28 +155,32 @@ def this_moment() -> Moment:
 
 
 @dataclass(frozen=True, slots=True)
-class Sighting:
-    """One robot as this machine remembers it.
+class RosterRow:
+    """A robot as this machine remembers it, and as a row of a roster.
 
     Attributes:
-        network: where.
-        name: its id there.
-        known: SERVED, SIGNED or HEARD, by what happened in the last ten minutes.
-        age_s: seconds since it was heard, or since its process wrote last; below 0 after the press.
+        name: its id on the network.
+        known: the surest way in which it is known.
+        age_s: seconds since it was last heard here, or since its process wrote last; infinite where it was not within
+            ten minutes, below 0 after the press.
         order: lower for a robot that was heard first earlier.
-        cell: of the robot, or "".
-        signed_only: it locks for signed stops alone; None where that is unknown.
-        stoppable: it has a stop; None where that is unknown.
+        cell: or "".
+        signed_only: it locks for signed stops alone (``--key``); None where that is unknown.
+        stoppable: False for a device without a stop: told, not counted. None where that is unknown.
         departed: it said, unsigned, that it left.
-        alive: of a robot served from this machine: its process lives.
-        pid: of that process, else None.
-        processes: run id and pid of every living process that serves it.
+        alive: its process on this machine lives; None where it is not served from here.
+        pid: of that process.
+        processes: run id and pid of every living process of this machine that serves it; each must answer.
+        exemption: of rows of :attr:`Roster.exempt`.
+        reported_by: the controller that reported it, "" where this machine heard it.
+        enrolled_cell: of its enrolment, "" for none; None where that is unknown.
+        named: nothing is known of it but that the caller of a stop named it.
+        network: where it was heard, or is served.
     """
 
-    network: NetworkKey
     name: str
     known: Known
-    age_s: float
+    age_s: float = math.inf
     order: int = 0
     cell: str = ""
     signed_only: bool | None = None
@@ -182,6 +189,39 @@ class Sighting:
     alive: bool | None = None
     pid: int | None = None
     processes: tuple[tuple[str, int], ...] = ()
+    exemption: Exemption | None = None
+    reported_by: str = ""
+    enrolled_cell: str | None = None
+    named: bool = False
+    network: NetworkKey = field(default=NO_NETWORK, compare=False)
+
+    @property
+    def last_cell(self) -> str:
+        """The cell in which it was heard last, else that of its enrolment; "" for none."""
+        return self.cell or self.enrolled_cell or ""
+
+    def within(self, scope: Scope, stated: str | None) -> bool:
+        """Return False for a robot of another cell than that of a scope.
+
+        Anyone may forge a presence. It takes no enrolled robot out of the count, and of one that has shown a key it
+        does not contradict what is remembered.
+
+        Args:
+            stated: the cell that it was heard in last, "" for none; None where it reads no scope.
+        """
+        if scope.everything or scope.only or stated is None:
+            return stated is None or scope.covers(self.name, ())
+        if self.processes:
+            cells = [self.cell]
+        elif self.known is Known.ENROLLED:
+            if self.enrolled_cell is None:
+                return True
+            cells = [self.enrolled_cell, stated, *([self.cell] if self.cell else [])]
+        elif stated and stated != self.cell and self.age_s < math.inf and self.known is not Known.HEARD:
+            cells = [""]
+        else:
+            cells = [stated]
+        return any(scope.covers(self.name, {cell} - {""}) for cell in cells)
 
 
 @dataclass(frozen=True, slots=True)
@@ -295,7 +335,7 @@ class SightingFile:
                 self._forget_served(connection, now)
             connection.execute("COMMIT")
 
-    def read(self, now: Moment) -> tuple[list[Sighting], str]:
+    def read(self, now: Moment) -> tuple[list[RosterRow], str]:
         """Return the robots of the ten minutes before ``now``, and a problem or "".
 
         Raises:
@@ -479,7 +519,7 @@ def _moment_row(at: Moment) -> tuple[str, float, float]:
     return at.boot, at.uptime, at.wall
 
 
-def _united(heard: Sequence[tuple[object, ...]], served: Sequence[Served], now: Moment) -> list[Sighting]:
+def _united(heard: Sequence[tuple[object, ...]], served: Sequence[Served], now: Moment) -> list[RosterRow]:
     """Return the sightings of the ten minutes before ``now``, one a robot and key."""
     latest: dict[tuple[NetworkKey, str], Served] = {}
     living: dict[tuple[NetworkKey, str], dict[str, int]] = {}
@@ -492,7 +532,7 @@ def _united(heard: Sequence[tuple[object, ...]], served: Sequence[Served], now: 
     by_name: dict[str, list[Served]] = {}
     for row in latest.values():
         by_name.setdefault(row.name, []).append(row)
-    found: dict[tuple[NetworkKey, str], Sighting] = {}
+    found: dict[tuple[NetworkKey, str], RosterRow] = {}
     for each in heard:
         seen = _sighting(each, now)
         if seen is None or seen.age_s >= RECENT_S:
@@ -504,7 +544,7 @@ def _united(heard: Sequence[tuple[object, ...]], served: Sequence[Served], now: 
         alive, age = own.lives(now), own.at.age_s(now)
         if own.ended or not (alive or age < RECENT_S):
             continue
-        seen = found.get(key) or Sighting(own.network, own.name, Known.SERVED, age)
+        seen = found.get(key) or RosterRow(own.name, Known.SERVED, age, network=own.network)
         found[key] = replace(
             seen,
             known=Known.SERVED,
@@ -519,7 +559,7 @@ def _united(heard: Sequence[tuple[object, ...]], served: Sequence[Served], now: 
     return list(found.values())
 
 
-def _sighting(row: tuple[object, ...], now: Moment) -> Sighting | None:
+def _sighting(row: tuple[object, ...], now: Moment) -> RosterRow | None:
     network, name, *rest = row
     key = _network(str(network))
     if key is None:
@@ -528,8 +568,7 @@ def _sighting(row: tuple[object, ...], now: Moment) -> Sighting | None:
         rest
     )
     signed = signed_boot is not None and _moment(signed_boot, signed_since, signed_wall).age_s(now) < RECENT_S
-    return Sighting(
-        key,
+    return RosterRow(
         str(name),
         Known.SIGNED if signed else Known.HEARD,
         _moment(since_boot, since, wall).age_s(now),
@@ -538,6 +577,7 @@ def _sighting(row: tuple[object, ...], now: Moment) -> Sighting | None:
         None if signed_only is None else bool(signed_only),
         None if stoppable is None else bool(stoppable),
         bool(departed),
+        network=key,
     )
 
 

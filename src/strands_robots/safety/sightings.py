@@ -25,7 +25,7 @@ from weakref import WeakSet
 
 from strands_robots.audit import log_safety_event
 from strands_robots.errors import StrandsRobotsError
-from strands_robots.safety.identity import ROBOTS, EnrolledKeys, KeyFile, local_name, of_tenant
+from strands_robots.safety.identity import EnrolledKeys, key_here, local_name, of_tenant
 from strands_robots.safety.network_key import DEVICE_CONNECT, MESH, NetworkKey
 from strands_robots.safety.sighting_file import (
     RECENT_S,
@@ -33,8 +33,8 @@ from strands_robots.safety.sighting_file import (
     Known,
     Moment,
     Note,
+    RosterRow,
     Served,
-    Sighting,
     SightingFile,
     SightingFileError,
     process_start,
@@ -46,7 +46,7 @@ from strands_robots.stop_log import stop_logger
 
 logger = stop_logger(__name__)
 
-__all__ = ["RECENT_S", "Known", "Moment", "Sighting", "Sightings", "flush_sightings", "sightings", "this_moment"]
+__all__ = ["RECENT_S", "Known", "Moment", "RosterRow", "Sightings", "flush_sightings", "sightings", "this_moment"]
 
 
 T = TypeVar("T")
@@ -328,7 +328,7 @@ class Sightings:
         # The interpreter ends and gives no more threads.
         return self._write_batch() == ""
 
-    def read(self, now: Moment | None = None) -> tuple[list[Sighting], str]:
+    def read(self, now: Moment | None = None) -> tuple[list[RosterRow], str]:
         """Return the robots of the ten minutes before ``now``, and a problem or "".
 
         A robot that was heard since ``now`` is among them. It waits a second at most for the disk; never call it before
@@ -462,17 +462,10 @@ class Sightings:
             network = answer.network
             known = of_tenant(enrolled, network.tenant).values()
             here = (each for each in known if not each.networks or any(own.meets(network) for own in each.networks))
-            return key in keys or all(each.exemption for each in here) or key == self._key_here(network, answer.name)
+            own = key_here(local_name(network.tenant, answer.name), self.directory)
+            return key in keys or all(each.exemption for each in here) or key == own
 
         return [(answer, key) for answer, key in signed if counts(answer, key)]
-
-    def _key_here(self, network: NetworkKey, name: str) -> bytes | None:
-        """Return the key of a robot of this machine."""
-        try:
-            identity = KeyFile(ROBOTS, local_name(network.tenant, name), self.directory).load()
-        except (StrandsRobotsError, OSError):
-            return None
-        return None if identity is None else identity.public
 
     def _heard_signed(self, proven: Iterable[tuple[NetworkKey, str, bytes]]) -> None:
         """End the exemption of enrolled robots that were heard, and keep their network."""

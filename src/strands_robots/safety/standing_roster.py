@@ -16,9 +16,9 @@ from strands_robots.safety.answers import ANSWERS_MAX, Answers, Received
 from strands_robots.safety.estop_listener import FAILURES_IN_ALL_PER_S, FAILURES_PER_S
 from strands_robots.safety.identity import SigningIdentity, console_key
 from strands_robots.safety.orders import StopRules, params_of, stated_epoch
-from strands_robots.safety.roster import Roster, RosterRow, report_fields
+from strands_robots.safety.roster import Roster, report_fields
 from strands_robots.safety.scope import EVERY_ROBOT, SCOPE, Scope
-from strands_robots.safety.sightings import Known
+from strands_robots.safety.sightings import Known, RosterRow
 from strands_robots.safety.statements import Purpose, signed
 from strands_robots.safety.stop_link import ESTOP
 from strands_robots.stop_log import stop_logger

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from strands_robots.safety.lockout import Lockout
 from strands_robots.safety.network_key import MESH, NetworkKey
 from strands_robots.safety.persistence import StoredLockout
-from strands_robots.safety.roster import UNTOLD, Roster, RosterRow, cannot_answer, described
-from strands_robots.safety.sightings import sightings, this_moment
+from strands_robots.safety.roster import UNTOLD, Roster, cannot_answer, described
+from strands_robots.safety.sightings import RosterRow, sightings, this_moment
 from strands_robots.safety.stop_roster import NAMED_MAX, StopOutcome
 from strands_robots.state_files import uptime
 
@@ -174,4 +174,4 @@ def _without(lockout: Lockout, robots: Collection[str], acted: Mapping[str, Coll
 def _had(row: RosterRow, epoch: str, ago: float, acted: Mapping[str, Collection[str]]) -> bool:
     if epoch in acted.get(row.name, ()):
         return True
-    return row.alive is None and row.age_s is not None and row.age_s < ago
+    return row.alive is None and row.age_s < ago

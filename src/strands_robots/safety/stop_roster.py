@@ -12,9 +12,9 @@ from strands_robots.safety.answers import Answer, Progress, StopReport
 from strands_robots.safety.controller import SafetyController
 from strands_robots.safety.identity import key_here, local_name
 from strands_robots.safety.network_key import DEVICE_CONNECT, NetworkKey
-from strands_robots.safety.roster import Roster, RosterReport, RosterRow, Sending, reason_of
+from strands_robots.safety.roster import Roster, RosterReport, Sending, reason_of
 from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope
-from strands_robots.safety.sightings import Known, Sighting, sightings
+from strands_robots.safety.sightings import Known, RosterRow, sightings
 from strands_robots.safety.statements import Proof, Purpose, proof_of
 from strands_robots.state_files import uptime
 from strands_robots.stop_log import stop_logger
@@ -311,7 +311,7 @@ class StopRoster:
         self._divided = why
         return replace(report, stopped=stopped, claimed=claimed), why
 
-    def _unanswered(self, row: RosterRow | Sighting, answer: Answer) -> list[int]:
+    def _unanswered(self, row: RosterRow, answer: Answer) -> list[int]:
         """Return the processes of a robot that gave no answer of their own."""
         runs = self._proven_runs(row.name, answer)
         # An earlier release states no process: its answer is that of the only one.

@@ -288,7 +288,7 @@ class Simulation(PicturesMixin, ArmMixin, TeleopMixin):
         """
         snapshot = self.physics.snapshot
         robots = {name: snapshot.observation(parts) for name, parts in snapshot.compiled.robots.items()}
-        latest = self.tasks.latest_of_all()
+        latest = dict(self.tasks.by_body)
         return success(
             f"{_count(robots)} at {snapshot.time:.3f} s of simulated time.",
             sim_time=snapshot.time,
@@ -455,7 +455,7 @@ class Simulation(PicturesMixin, ArmMixin, TeleopMixin):
 
     def outcomes(self) -> dict[str, dict[str, Any]]:
         """Return how the last rollout of each robot ended, until its next one."""
-        ended = {name: self.outcome_of(each) for name, each in self.tasks.latest_of_all().items()}
+        ended = {name: self.outcome_of(each) for name, each in dict(self.tasks.by_body).items()}
         return {name: outcome for name, outcome in ended.items() if outcome is not None and name in self._bodies}
 
     def policy_facts(self, robot_name: str | None = None) -> RobotFacts:

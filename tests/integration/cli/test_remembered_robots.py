@@ -10,7 +10,7 @@ from fixtures.command_line import Machine
 from fixtures.waiting import eventually, free_port
 
 from strands_robots.safety.identity import EnrolledKeys
-from strands_robots.safety.sightings import Known, Sighting, Sightings
+from strands_robots.safety.sightings import Known, RosterRow, Sightings
 
 NETWORKS = [pytest.param((), id="device-connect"), pytest.param(("--mesh",), id="mesh")]
 
@@ -32,7 +32,7 @@ def another(tmp_path: Path, ports: dict[str, str]) -> Machine:
     return Machine(tmp_path / "robots", **ports)
 
 
-def remembered(directory: Path) -> dict[str, Sighting]:
+def remembered(directory: Path) -> dict[str, RosterRow]:
     rows, problem = Sightings(directory).read()
     assert problem == ""
     return {each.name: each for each in rows}

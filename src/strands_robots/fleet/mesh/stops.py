@@ -20,8 +20,9 @@ from strands_robots.safety.answers import Answer, OnProgress, Press, Presses, Pr
 from strands_robots.safety.controller import DEADLINE_S
 from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.orders import PARSED_MAX_BYTES, new_epoch
-from strands_robots.safety.roster import OnReport, Roster, RosterInbox, RosterRow, Sending
+from strands_robots.safety.roster import OnReport, Roster, RosterInbox, Sending
 from strands_robots.safety.scope import EVERY_ROBOT, Scope
+from strands_robots.safety.sightings import RosterRow
 from strands_robots.safety.standing_roster import StandingRoster, controllers_identity
 from strands_robots.safety.statements import ALARM, enrolled_peers, lockout_distrust, stop_distrust
 from strands_robots.safety.stop_link import ESTOP

@@ -34,7 +34,6 @@ class MemoryBus:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._declared: list[_Declared] = []
-        self._cut: set[MemoryTransport] = set()
 
     def join(self, declared: _Declared) -> None:
         """Add a subscriber, watcher or token; watchers learn of existing tokens."""
@@ -67,27 +66,19 @@ class MemoryBus:
         with self._lock:
             return [each for each in self._declared if each.owner is owner]
 
-    def partition(self, transport: MemoryTransport, cut: bool = True, *, stayed: bool = False) -> None:
-        """Lose every message from and to a session; ``cut=False`` heals it.
-
-        Args:
-            stayed: it is told that others of its links were up all the time.
-        """
-        with self._lock:
-            if not cut and transport in self._cut:
-                transport.stayed += stayed
-                transport.healed += 1
-            (self._cut.add if cut else self._cut.discard)(transport)
+    def parted(self, one: MemoryTransport, other: MemoryTransport) -> bool:
+        """Return True where nothing passes between two sessions; here all do."""
+        return False
 
     def deliver(self, sender: MemoryTransport, sample: Sample) -> None:
-        """Call every subscriber of a sample's key that is not cut off from its sender."""
+        """Call every subscriber of a sample's key."""
         with self._lock:
             callbacks = [
                 each.on_sample
                 for each in self._declared
                 if each.on_sample is not None
                 and topics.matches(each.key, sample.key)
-                and (each.owner is sender or not {sender, each.owner} & self._cut)
+                and not self.parted(sender, each.owner)
             ]
         for callback in callbacks:
             callback(sample)
@@ -124,8 +115,6 @@ class MemoryTransport(Transport):
         self._id = session or secrets.token_hex(16)
         self._sessionless = sessionless
         self._open = False
-        self.healed, self.stayed = 0, 0
-        """Number of times that its links came back, and of those at which others had stayed."""
 
     @property
     def session_id(self) -> str | None:
@@ -140,12 +129,6 @@ class MemoryTransport(Transport):
 
     def is_alive(self) -> bool:
         return self._open
-
-    def links_back(self) -> int:
-        return self.healed
-
-    def rejoined(self) -> int:
-        return self.healed - self.stayed
 
     def put(self, key: str, payload: bytes | Mapping[str, Any]) -> None:
         self._require_open()
