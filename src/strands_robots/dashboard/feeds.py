@@ -422,7 +422,8 @@ class Feeds:
 
     def add_button(self, network: str, sender: StopSender) -> None:
         """Send stops on a network, the one of its page's name, by ``sender``."""
-        self.senders = {**self.senders, network: sender}
+        with self._lock:  # each network has a thread that comes here
+            self.senders = {**self.senders, network: sender}
         self.buttons.add(network, sender, lambda scope: scope.only or self._model.expected(network, scope))
 
     @property
