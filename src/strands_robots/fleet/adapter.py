@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import secrets
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -180,6 +179,12 @@ OnEvent = Callable[[RobotEvent], None]
 """Takes an event on a thread of the network: it returns at once and does not raise."""
 
 
+def _new_epoch() -> str:
+    from strands_robots.safety.orders import new_epoch  # noqa: PLC0415 - a stop alone needs it
+
+    return new_epoch()
+
+
 @dataclass(frozen=True, slots=True)
 class StopRequest:
     """An emergency stop, as its caller asks for it.
@@ -198,7 +203,7 @@ class StopRequest:
     reason: str = ""
     scope: Scope = EVERY_ROBOT
     signing_key: Any = None
-    estop_id: str = field(default_factory=lambda: secrets.token_hex(16))
+    estop_id: str = field(default_factory=_new_epoch)
     named: Collection[str] = ()
     deadline_s: float | None = None
     remembers: Remembers | None = None
