@@ -21,7 +21,6 @@ from types import MappingProxyType
 from typing import Any, Literal, TypeAlias, TypeVar
 
 from strands_robots.errors import StrandsRobotsError
-from strands_robots.serving.verbs import LEASE_NAMES
 from strands_robots.utils import DURATION_MAX_S, ValidationError, number, plain_text, shown, whole
 from strands_robots.verb_parameters import JSON_TYPES, UNIT_MAX
 
@@ -223,6 +222,8 @@ class AdvertisedVerb:
 
     def unknown(self, names: Iterable[str]) -> str:
         """Return the refusal of arguments that it does not have, or nothing."""
+        from strands_robots.serving.verbs import LEASE_NAMES  # noqa: PLC0415 - who needs the names of our verbs loads no table
+
         known = [each.name for each in self.parameters]
         absent = [shown(each) for each in names if each not in known and (self.stated or each in LEASE_NAMES)]
         if not absent:
@@ -350,6 +351,8 @@ class _Reader:
         if not isinstance(function, Mapping) or not isinstance(name, str) or not _NAME.match(name):
             raise _OutOfBoundsError(f"a verb whose name is no identifier of at most {NAME_MAX} letters: {shown(name)}")
         self._take(len(name), name)
+        from strands_robots.serving.verbs import LEASE_NAMES  # noqa: PLC0415 - as above
+
         description, labels = self._text(function.get("description"), name), _object(function, "labels")
         schema = _object(function, "parameters")
         stated, required = schema.get("properties"), schema.get("required")
