@@ -27,7 +27,7 @@ from mcp.client.client import Client
 from benchmarks.table import Row
 from strands_robots.device_connect import FleetClient, loopback_config
 from strands_robots.fleet.adapter import FoundRobot
-from strands_robots.fleet.standing import StandingController
+from strands_robots.fleet.safety_console import StandingController
 from strands_robots.mcp.approval import Approvals
 from strands_robots.mcp.caller import SILENCE_S, Caller, ClientAccess
 from strands_robots.mcp.server import RobotResources, build

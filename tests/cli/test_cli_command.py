@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from strands_robots.cli.command import assignments, parse_ports
+from strands_robots.cli.app import assignments, parse_ports
 from strands_robots.utils import ValidationError
 
 

@@ -8,7 +8,7 @@ import pytest
 from tests.cli.conftest import Run
 
 from strands_robots import settings
-from strands_robots.cli.demo import example
+from strands_robots.cli.dashboard import example
 from strands_robots.cli.output import Exit, Screen
 
 

@@ -90,4 +90,4 @@ def test_stops_come_from_the_controller_of_the_network_which_knows_the_robots_of
     eventually(lambda: page.model.expected("dc") == ("arm-1",), what="its robot")
     assert page.feeds.senders["dc"] is page.device_connect.controller
     assert page.device_connect.standing_for[0]() == ("arm-1",)
-    assert page.feeds.senders.keys() == {"dc", "mesh"}
+    eventually(lambda: page.feeds.senders.keys() == {"dc", "mesh"}, what="the mesh's as well")

@@ -21,10 +21,10 @@ def open_files() -> set[str]:
 
 def test_shown_pictures_leave_no_file_open() -> None:
     pictures = PictureFiles()
-    shown = [Path(urlparse(pictures.show(b"jpeg %d" % number)).path) for number in range(3 * PictureFiles.KEPT)]
+    shown = [Path(urlparse(pictures.show(b"jpeg %d" % number)).path) for number in range(3 * PictureFiles.FILES_MAX)]
     folder = str(shown[0].parent)
     assert not [each for each in open_files() if each.startswith(folder)]
-    assert [each.exists() for each in shown] == [False] * 2 * PictureFiles.KEPT + [True] * PictureFiles.KEPT
+    assert [each.exists() for each in shown] == [False] * 2 * PictureFiles.FILES_MAX + [True] * PictureFiles.FILES_MAX
     assert shown[-1].read_bytes() == b"jpeg 23"
     pictures.close()
     assert not shown[-1].exists()

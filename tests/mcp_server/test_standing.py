@@ -12,11 +12,11 @@ from fixtures.waiting import eventually, free_port
 from tests.fleet.scripted import ScriptedNetwork
 
 from strands_robots.device_connect.backends import loopback_config
-from strands_robots.fleet import standing as module
+from strands_robots.fleet import safety_console as module
 from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
 from strands_robots.fleet.device_connect.network import DeviceConnectNetwork
 from strands_robots.fleet.networks import Networks
-from strands_robots.fleet.standing import DOWN, OPENING, StandingController
+from strands_robots.fleet.safety_console import DOWN, OPENING, StandingController
 
 
 class Sender:

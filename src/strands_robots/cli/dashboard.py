@@ -1,22 +1,24 @@
-"""``dashboard``: every robot in a browser, and a STOP for all of them."""
+"""``dashboard``: every robot in a browser, and a STOP for all of them. ``demo``: an example."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 import socket
+import sys
 import threading
 import webbrowser
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
+from importlib import import_module
+from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from strands_robots._mesh_switch import mesh_env_request
-from strands_robots.cli.demo import example
 from strands_robots.cli.keys import PassphraseFile, signing_key
 from strands_robots.cli.network import Network
 from strands_robots.cli.output import CliError, Exit, Screen
@@ -25,6 +27,35 @@ from strands_robots.utils import device_id, missing_extra
 if TYPE_CHECKING:
     from strands_robots.dashboard.access import RemoteAddress
     from strands_robots.dashboard.server import Dashboard
+
+EXAMPLE = "strands_robots._demo"
+"""Name of the example's package, which the wheel has, and a source tree keeps in ``examples/demo``."""
+
+
+def demo(
+    screen: Screen,
+    *,
+    output: Annotated[Path, typer.Option("--output", help="Folder for the pictures.")] = Path("demo-output"),
+    record: Annotated[Path | None, typer.Option("--record", help="Write the terminal output as SVG.")] = None,
+) -> None:
+    """An agent in another process looks at a table and has a simulated arm put the red cube on the plate. A stop halts
+    it; an emergency stop locks it until an operator's key frees it. Nothing leaves this machine.
+
+    Exits with 1 when any step did not happen, or the cube is not on the plate.
+    """
+    example().run(screen, output, record)
+
+
+def example(part: str = "") -> Any:
+    """Return the example's package, or the module ``part`` of it."""
+    if find_spec(EXAMPLE) is None:
+        file = Path(__file__).parents[3] / "examples" / "demo" / "__init__.py"
+        spec = spec_from_file_location(EXAMPLE, file)
+        if spec is None or spec.loader is None:
+            raise ModuleNotFoundError(f"{file} is no module.")
+        sys.modules[EXAMPLE] = package = module_from_spec(spec)
+        spec.loader.exec_module(package)
+    return import_module(f"{EXAMPLE}.{part}" if part else EXAMPLE)
 
 
 PORT = 8800

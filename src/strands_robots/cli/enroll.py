@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from strands_robots.cli.command import Timeout
+from strands_robots.cli.app import Timeout
 from strands_robots.cli.network import Network, say_missing
 from strands_robots.cli.output import CliError, Exit, Screen, label, plain, table
 from strands_robots.errors import NoSuchRobotError

@@ -13,7 +13,7 @@ import typer
 from rich.text import Text
 
 from strands_robots import settings
-from strands_robots.cli.command import Timeout, assignments
+from strands_robots.cli.app import Timeout, assignments
 from strands_robots.cli.network import Network, answering, say_missing
 from strands_robots.cli.output import LATE_S, CliError, Exit, Screen, label, plain, readable, table
 from strands_robots.envelope import RefusalReason, is_error, text_of

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from strands_robots import settings
-from strands_robots.cli.command import assignments
+from strands_robots.cli.app import assignments
 from strands_robots.cli.output import CliError, Screen, label, table
 from strands_robots.policies.base import PolicyError
 from strands_robots.policies.check import PolicyCheck, check_policy, statements_of

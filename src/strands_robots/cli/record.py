@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from strands_robots.cli.command import Seconds
+from strands_robots.cli.app import Seconds
 from strands_robots.cli.network import Network, say_missing
 from strands_robots.cli.output import CliError, Exit, Screen, progress_bar, table
 from strands_robots.errors import RefusalError

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from strands_robots.cli.command import Timeout
+from strands_robots.cli.app import Timeout
 from strands_robots.cli.keys import PassphraseFile, signing_key
 from strands_robots.cli.network import Network, answering, say_missing
 from strands_robots.cli.output import CliError, Exit, Screen, label, plain, table

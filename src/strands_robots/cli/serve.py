@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from strands_robots import settings
-from strands_robots.cli.command import assignments, parse_ports
+from strands_robots.cli.app import assignments, parse_ports
 from strands_robots.cli.network import Network, mesh_peer
 from strands_robots.cli.output import CliError, Screen
 from strands_robots.cli.readiness import mesh_port_problem, mesh_problems, shortcomings

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from strands_robots.cli.command import Timeout
+from strands_robots.cli.app import Timeout
 from strands_robots.cli.keys import PassphraseFile, operator_key, signing_key
 from strands_robots.cli.network import Network, near_robots, say_missing
 from strands_robots.cli.output import POLL_S, CliError, Exit, Screen, captured_log, label, plain, table

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.control import Control
 
-from strands_robots.cli.command import Seconds
+from strands_robots.cli.app import Seconds
 from strands_robots.cli.network import mesh_peer
 from strands_robots.cli.output import POLL_S, CliError, Exit, Screen, table, wait_until
 from strands_robots.cli.record import record_robot

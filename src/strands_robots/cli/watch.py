@@ -14,7 +14,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from strands_robots.cli.command import Seconds
+from strands_robots.cli.app import Seconds
 from strands_robots.cli.network import Network, answering
 from strands_robots.cli.output import LATE_S, CliError, Exit, Screen, label, plain
 from strands_robots.envelope import is_error

@@ -50,7 +50,7 @@ LINEAR_M_S, ANGULAR_RAD_S = 0.3, 0.8
 TIP_AXES = ("x", "y", "z")
 KINDS = ("joint", "tip", "gripper", "base")
 
-Told = Callable[[dict[str, Any]], None]
+SendToPage = Callable[[dict[str, Any]], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,7 +140,7 @@ class Jogging:
 
     axis: JogAxis
     units: Mapping[str, str] = field(default_factory=dict)
-    beat: float = field(default_factory=time.monotonic)
+    heartbeat: float = field(default_factory=time.monotonic)
     released: asyncio.Event = field(default_factory=asyncio.Event)
     why: str = ""
     task: asyncio.Task[None] | None = None
@@ -159,7 +159,7 @@ class HandControl:
         tell: sends a message to the page.
     """
 
-    def __init__(self, tell: Told) -> None:
+    def __init__(self, tell: SendToPage) -> None:
         self._tell = tell
         self._held: dict[str, HeldRobot] = {}
         self._taking: set[str] = set()
@@ -242,7 +242,7 @@ class HandControl:
         """Note that the button is still held down."""
         held = self._held.get(key)
         if held is not None and held.jog is not None:
-            held.jog.beat = time.monotonic()
+            held.jog.heartbeat = time.monotonic()
 
     def release(self, key: str, why: str = "released") -> None:
         """End the jog of a robot."""
@@ -423,7 +423,7 @@ def _taken(answer: Envelope) -> str:
 
 async def _watch(jog: Jogging) -> None:
     """Release a jog whose beats stay away."""
-    while (left := jog.beat + BEAT_S - time.monotonic()) > 0:  # noqa: ASYNC110 - each beat moves the end
+    while (left := jog.heartbeat + BEAT_S - time.monotonic()) > 0:  # noqa: ASYNC110 - each beat moves the end
         await asyncio.sleep(left)
     jog.release("no beat of the page for 200 ms")
 

@@ -29,8 +29,7 @@ from strands_robots.fleet.adapter import (
 from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.refusals import answered
 from strands_robots.fleet.reports import joint_limits, joint_units, task_of
-from strands_robots.fleet.safety_console import StopButtons
-from strands_robots.fleet.standing import StandingController
+from strands_robots.fleet.safety_console import StandingController, StopButtons
 from strands_robots.fleet.stops import not_left
 from strands_robots.fleet.verdicts import NetworkVerdict
 from strands_robots.safety.identity import KeyFileError
@@ -423,7 +422,8 @@ class Feeds:
 
     def add_button(self, network: str, sender: StopSender) -> None:
         """Send stops on a network, the one of its page's name, by ``sender``."""
-        self.senders = {**self.senders, network: sender}
+        with self._lock:  # each network has a thread that comes here
+            self.senders = {**self.senders, network: sender}
         self.buttons.add(network, sender, lambda scope: scope.only or self._model.expected(network, scope))
 
     @property

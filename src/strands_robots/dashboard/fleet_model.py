@@ -32,7 +32,7 @@ LOCKS_WITHIN_S = 3.0
 
 JOINTS_MAX = 64
 CONTROL_EVENTS = frozenset({"controlTaken", "controlExpired", "control taken here"})
-CONTROL_TOLD_S = 3.0
+CONTROL_ANNOUNCED_S = 3.0
 """Seconds after such an event in which a status with another holder tells nothing new."""
 
 UNSETTLED = frozenset({"not_stopped", "alarm", "refused", "unknown", "claimed"})
@@ -166,7 +166,7 @@ class FleetModel:
         """Add a change of the holder that the robot has not just told by an event."""
         with self._lock:
             row = self._rows.get(key_of(network, name))
-            announced = row is not None and self.clock() - row.control_told_at < CONTROL_TOLD_S
+            announced = row is not None and self.clock() - row.control_announced_at < CONTROL_ANNOUNCED_S
             before = row.control if row is not None else {}
         holder, had = control.get("holder"), before.get("holder")
         # What held it before the page came is no change.
@@ -224,7 +224,7 @@ class FleetModel:
         with self._lock:
             row = self._rows.get(entry["key"])
             if row is not None and event in CONTROL_EVENTS:
-                row.control_told_at = self.clock()
+                row.control_announced_at = self.clock()
             if row is not None and row.hidden:
                 # The row that is shown tells the same.
                 return

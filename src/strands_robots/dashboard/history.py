@@ -92,7 +92,7 @@ class RobotRow:
     stop_at: float = 0.0
     locked_by: str = ""
     control: dict[str, Any] = field(default_factory=dict)
-    control_told_at: float = float("-inf")
+    control_announced_at: float = float("-inf")
     check_in: dict[str, Any] | None = None
     forms: tuple[Mapping[str, Any], ...] = ()
     holdable: bool = False

@@ -39,7 +39,7 @@ SPEED = 0.5
 HZ = 50.0
 """Control rate of an episode, unless another is asked for."""
 
-KEPT_STEPS = 10
+SUCCESS_STEPS = 10
 """Control steps for which the goal must be reached without a break."""
 
 Z95 = 1.959964
@@ -196,12 +196,12 @@ class EpisodeJudge:
         self.stop: Callable[[], None] = lambda: None
         self._task = task
         self._world = world
-        self._kept = 0
+        self._steps_at_goal = 0
 
     def look(self) -> None:
         """Look once, after every control step."""
-        self._kept = self._kept + 1 if self._task.achieved(self._world) else 0
-        if self._kept >= KEPT_STEPS and not self.success:
+        self._steps_at_goal = self._steps_at_goal + 1 if self._task.achieved(self._world) else 0
+        if self._steps_at_goal >= SUCCESS_STEPS and not self.success:
             self.success = True
             self.stop()
 
@@ -280,7 +280,7 @@ def run_episode(
 def _settle(world: Simulation, judge: EpisodeJudge, hz: float) -> None:
     """Look on for a moment where the policy ended by itself."""
     steps = round(1 / (hz * world.physics.compiled.scene.timestep))
-    for _ in range(2 * KEPT_STEPS):
+    for _ in range(2 * SUCCESS_STEPS):
         if judge.success:
             return
         world.step(steps)

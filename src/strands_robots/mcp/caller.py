@@ -149,7 +149,7 @@ AccessOf = Callable[[Any], ClientAccess]
 class PictureFiles:
     """Pictures for a user on this machine, as files; the newest ones are kept."""
 
-    KEPT = 8
+    FILES_MAX = 8
 
     def __init__(self) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="strands-robots-mcp-")
@@ -162,7 +162,7 @@ class PictureFiles:
             file.write(jpeg)
         path = Path(name)
         self._files.append(path)
-        while len(self._files) > self.KEPT:
+        while len(self._files) > self.FILES_MAX:
             self._files.pop(0).unlink(missing_ok=True)
         return path.as_uri()
 

@@ -25,7 +25,7 @@ from starlette.types import Message, Receive, Scope, Send
 
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.fleet.networks import Networks
-from strands_robots.fleet.standing import StandingController
+from strands_robots.fleet.safety_console import StandingController
 from strands_robots.http_access import Guard, HttpRules, Token, TokenFile, bracketed
 from strands_robots.mcp.approval import Approvals
 from strands_robots.mcp.caller import Caller, ClientAccess

@@ -35,7 +35,7 @@ from strands_robots import __version__
 from strands_robots.envelope import error
 from strands_robots.errors import RefusalError
 from strands_robots.fleet.networks import Networks
-from strands_robots.fleet.standing import StandingController
+from strands_robots.fleet.safety_console import StandingController
 from strands_robots.mcp._compat import lowlevel
 from strands_robots.mcp.approval import Approvals
 from strands_robots.mcp.caller import AccessOf, Caller, ClientAccess, PictureFiles

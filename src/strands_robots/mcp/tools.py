@@ -20,7 +20,7 @@ from pydantic import Field
 
 from strands_robots.envelope import Envelope, error, is_error, success
 from strands_robots.fleet.lockouts import ask_lockouts, by_robot
-from strands_robots.fleet.standing import StandingController
+from strands_robots.fleet.safety_console import StandingController
 from strands_robots.mcp.approval import Approvals, Wish
 from strands_robots.mcp.caller import AccessOf, acquire_arguments
 from strands_robots.mcp.results import INSTEAD, Result, described, facts, picture, quoted, result, row, wanted

@@ -294,26 +294,24 @@ class MotionGate:
         """
         return MotionRequest(self, self.generation)
 
-    @contextmanager
-    def within(self, request: MotionRequest) -> Iterator[None]:
+    def within(self, request: MotionRequest) -> AbstractContextManager[None]:
         """Make permits that a stranger's code asks for on this thread part of a request.
 
         A robot of ours is given its request as an argument. A stranger's robot, and the verbs that its author declares,
         call gate and robot without one, so this thread has to remember it. Of two requests around one another the
         outer one counts, which is the older.
         """
-        before = self._outer()
-        self._of_thread.request = before or request
-        try:
-            yield
-        finally:
-            self._of_thread.request = before
+        return self._asked_by(self._outer() or request)
+
+    def reading(self, verb: str) -> AbstractContextManager[None]:
+        """Refuse permits on this thread, for the time of a verb that is a read."""
+        return self._asked_by(MotionRequest(self, self.generation, read=verb))
 
     @contextmanager
-    def reading(self, verb: str) -> Iterator[None]:
-        """Refuse permits on this thread, for the time of a verb that is a read."""
+    def _asked_by(self, request: MotionRequest) -> Iterator[None]:
+        """Make permits that are asked for on this thread part of a request."""
         before = self._outer()
-        self._of_thread.request = MotionRequest(self, self.generation, read=verb)
+        self._of_thread.request = request
         try:
             yield
         finally:

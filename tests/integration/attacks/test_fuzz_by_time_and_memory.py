@@ -31,7 +31,7 @@ PARSERS = {
     "audit/head.py": OWN_FILE,
     "audit/journal.py": OWN_FILE,
     "bounded_json.py": BOUNDED,
-    "cli/command.py": OWN_FILE,
+    "cli/app.py": OWN_FILE,
     "dashboard/page_session.py": BOUNDED,
     "dashboard/pose_process.py": OWN_FILE,
     "dashboard/pictures.py": OWN_FILE,
@@ -98,7 +98,6 @@ RECEIVERS = {
     "mesh/transport/zenoh.py": "the topic's own bound, by Zenoh and before it is copied",
     "ros/dds.py": "by ros/dds_types.py, before a sample is decoded",
     "ros/rclpy.py": "decoded by rclpy itself",
-    "serving/pipeline.py": "a question of this process",
     "zenoh_session.py": "the sinks of its users",
 }
 """Each module that receives foreign messages, and their bound."""

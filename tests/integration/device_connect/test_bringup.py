@@ -285,15 +285,18 @@ def test_twenty_failed_bring_ups_leave_nothing(world: ToyWorld) -> None:
     no_device_thread_is_left()
 
 
-def test_bring_up_that_fails_before_its_runtime_leaves_no_robot_registered(link: LinkConfig, world: ToyWorld) -> None:
-    class Unreadable(SimulationDeviceDriver):
-        async def read_activity(self) -> None:
-            await asyncio.to_thread(eventually, lambda: "unread-1" in plane().robot_ids())
-            raise OSError("no such bus")
+def test_bring_up_that_fails_before_its_runtime_leaves_no_robot_registered(
+    link: LinkConfig, world: ToyWorld, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def unreadable() -> None:
+        await asyncio.to_thread(eventually, lambda: "unread-1" in plane().robots)
+        raise OSError("no such bus")
 
+    driver = SimulationDeviceDriver(world)
+    monkeypatch.setattr(driver.reports, "read", unreadable)
     with pytest.raises(OSError, match="no such bus"):
-        init_device_connect_sync(Unreadable(world), peer_id="unread-1", link=link)
-    assert "unread-1" not in plane().robot_ids()
+        init_device_connect_sync(driver, peer_id="unread-1", link=link)
+    assert "unread-1" not in plane().robots
 
 
 def test_bring_up_that_timed_out_never_comes_online_later(world: ToyWorld) -> None:
