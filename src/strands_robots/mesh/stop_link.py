@@ -26,7 +26,6 @@ from strands_robots.safety.estop_listener import EstopListener, ListenerRegistra
 from strands_robots.safety.lockout import is_epoch
 from strands_robots.safety.missed_stops import ANSWER_MAX_BYTES
 from strands_robots.safety.orders import (
-    LISTENER,
     MISSED,
     NO_REASON,
     StopOrder,
@@ -341,16 +340,10 @@ class PeerStops:
         return self._transport.stops_up
 
     def on_estop(self, sample: Sample) -> None:
-        """Receive a stop on the presence session.
-
-        Without a connection of their own for stops, all robots are locked and halting on return.
-        """
-        peers, link = self.peers, self._link
+        """Receive a stop on the presence session; on return all robots are locked and halting."""
+        peers = self.peers
         if not sample.payload or not peers:
             return  # a broker's stored stop was cleared
-        if link is not None and link.up and not sample.retained:
-            link.on_stop(sample.session or "", sample.payload)
-            return
         fields = self.codec.fields(sample.payload)
         if sample.retained:
             issuer = str(fields.get("peer_id"))
@@ -376,7 +369,7 @@ class PeerStops:
 
     def begun(self, order: StopOrder, fields: Mapping[str, Any], run: StopRun | None) -> None:
         """Note a stop whose halts are ordered; the listener's thread does not wait."""
-        if order.path == LISTENER:
+        if self.has_link:
             # Its halts are being carried out at this moment, on other threads.
             self._notes.submit(partial(self._note, order, fields, repeated=run is None))
         else:

@@ -390,8 +390,9 @@ class MissedStops:
 
     def started(self) -> None:
         """Ask because a robot is served from now on, unless it is a newcomer."""
-        self._reasons.append(STARTED)
-        self._worker.wake()
+        if self._port.was_here():  # a newcomer needs no thread for this
+            self._reasons.append(STARTED)
+            self._worker.wake()
 
     def receive(self, event: str, source: str, payload: bytes | int) -> None:
         """Take a question or an answer from a link's thread; return at once."""
@@ -427,8 +428,6 @@ class MissedStops:
         while self._reasons:
             reason = self._reasons.popleft()
             if reason == STARTED:
-                if not self._port.was_here():
-                    continue
                 self._port.hold(UNITE_S)
             self._back = self._back or reason == BACK
             logger.info("Asking for the stops missed: %s.", reason)
