@@ -64,14 +64,14 @@ class DeclaredVerb:
         name: on the wire.
         motion: False for a read.
         lasts: seconds that it may take to return.
-        made: the method that ``@verb`` made of the function.
+        wrapper: the method that ``@verb`` made of the function.
     """
 
     function: Callable[..., Any]
     name: str
     motion: bool
     lasts: float
-    made: Callable[..., Any]
+    wrapper: Callable[..., Any]
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -250,7 +250,7 @@ def declared_verbs(robot: object) -> dict[str, DeclaredVerb]:
         declared = _declared(method)
         if declared is None:
             raise ValidationError(f"{kind}.{attribute} overrides a verb; declare it with @verb, too.")
-        if declared.made is not method:
+        if declared.wrapper is not method:
             # What stands above @verb would be left out when the verb is called over a network.
             raise ValidationError(f"{kind}.{attribute} has a decorator above @verb; put @verb above it.")
         other = next((each for name, each in found.items() if name.lower() == declared.name.lower()), None)
@@ -281,8 +281,8 @@ def _methods(kind: type) -> Iterator[tuple[str, object]]:
 
 def _wire_name(stated: object, method: str) -> str:
     head, *rest = method.split("_")
-    made = head + "".join(part[:1].upper() + part[1:] for part in rest)
-    name = text("name", stated, longest=NAME_MAX) if stated != "" else made
+    camel = head + "".join(part[:1].upper() + part[1:] for part in rest)
+    name = text("name", stated, longest=NAME_MAX) if stated != "" else camel
     if not _NAME.match(name) or len(name) > NAME_MAX:
         source = f"name of {method}" if stated != "" else f"name made of {method}"
         raise ValidationError(

@@ -140,7 +140,7 @@ def parameter_of(where: str, parameter: inspect.Parameter, hint: Any, meaning: s
     """
     if hint is None or hint is inspect.Parameter.empty:
         raise ValidationError(f"{where} needs a type hint: a caller has to know what to give.")
-    told = [each for each in get_args(hint)[1:] if isinstance(each, str)] if get_origin(hint) is Annotated else []
+    stated = [each for each in get_args(hint)[1:] if isinstance(each, str)] if get_origin(hint) is Annotated else []
     kind = _kind(where, hint, None, DEPTH_MAX)
     required = parameter.default is inspect.Parameter.empty
     schema, default = dict(kind.schema), REQUIRED
@@ -153,7 +153,7 @@ def parameter_of(where: str, parameter: inspect.Parameter, hint: Any, meaning: s
             except (ValidationError, TypeError, ValueError, RecursionError) as exc:
                 raise ValidationError(f"The default of {where} is outside its domain: {exc}") from None
             schema["default"] = default
-    words = plain_text(meaning or " ".join(told), MEANING_MAX)
+    words = plain_text(meaning or " ".join(stated), MEANING_MAX)
     described = {**schema, "description": words} if words else schema
     check = kind.check if required or parameter.default is not None else _or_none(kind.check)
     return Parameter(parameter.name, kind.type, words, check, default, described)

@@ -58,7 +58,7 @@ def world() -> Iterator[Growing]:
 @pytest.fixture
 def driver(world: Growing) -> SimulationDeviceDriver:
     made = SimulationDeviceDriver(world)
-    made.offers = Offers(world, made.made, every_s=0.0)
+    made.offers = Offers(world, made.built_verbs, every_s=0.0)
     return made
 
 
@@ -146,7 +146,7 @@ def test_devices_of_one_class_share_what_describes_them(world: Growing) -> None:
     assert first.described() is second.described()
     world.add("left")
     assert first.described() is second.described()
-    first.offers = Offers(world, first.made)
+    first.offers = Offers(world, first.built_verbs)
     assert first.described() is not second.described()
     assert first.described() is first.described()
 

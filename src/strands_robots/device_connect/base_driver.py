@@ -125,17 +125,17 @@ class RobotDriver(CollectedOnce):
     own_verbs: Mapping[str, Verb] = {}
     """The verbs that the robot itself declares, by name."""
 
-    made: ClassVar[Mapping[str, Verb]] = {}
+    built_verbs: ClassVar[Mapping[str, Verb]] = {}
     """Those of :attr:`verbs` whose RPC method was made from them and not overridden."""
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
-        made = {name: verb for name, verb in cls.made.items() if name not in vars(cls)}
+        built = {name: verb for name, verb in cls.built_verbs.items() if name not in vars(cls)}
         for name, verb in cls.verbs.items():
-            if not hasattr(cls, name) or made.get(name, verb) is not verb:
+            if not hasattr(cls, name) or built.get(name, verb) is not verb:
                 setattr(cls, name, rpc_method(verb))
-                made[name] = verb
-        cls.made = made
+                built[name] = verb
+        cls.built_verbs = built
 
     def __init__(
         self,
@@ -149,7 +149,7 @@ class RobotDriver(CollectedOnce):
         self.robot = robot
         self.own_verbs = own_verbs(robot)
         self._described: dict[tuple[str, frozenset[str]], str] = {}
-        self.offers = Offers(robot, self.made)
+        self.offers = Offers(robot, self.built_verbs)
         self.hardware = hardware
         self.authorization = authorization or Authorization(hardware=hardware, robot=robot.tool_name_str)
         self.registration: SafetyRegistration | None = None
@@ -183,11 +183,11 @@ class RobotDriver(CollectedOnce):
         """
         own = self.own_verbs.get(function_name)
         verb = own or self.verbs.get(function_name)
-        if verb is not None and verb.kind is Kind.STOP and function_name in self.made:
+        if verb is not None and verb.kind is Kind.STOP and function_name in self.built_verbs:
             params.pop("source_device", None)
             return await self._stop(verb, params)
-        made = own is not None or (function_name in self.made and not (observable and observed(self)))
-        if verb is None or not made:
+        ours = own is not None or (function_name in self.built_verbs and not (observable and observed(self)))
+        if verb is None or not ours:
             problem = verb and verb.unfit(params.keys() - {"source_device"})
             return error(problem) if problem else await super().invoke(function_name, **params)
         caller = params.pop("source_device", None)
@@ -362,7 +362,7 @@ class RobotDriver(CollectedOnce):
         """Return what the robot can be called for now, read once for each class."""
         if type(self) not in _FUNCTIONS:
             _FUNCTIONS[type(self)] = tuple(super().functions)
-        missing = self.made.keys() - self.offers.names
+        missing = self.built_verbs.keys() - self.offers.names
         own = [FunctionDef(**described(verb)) for verb in self.own_verbs.values()]
         return [*(each for each in _FUNCTIONS[type(self)] if each.name not in missing), *own]
 

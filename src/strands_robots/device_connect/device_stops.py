@@ -141,8 +141,8 @@ class DeviceStops:
         await self.leave()
         device = self._device
         if device.registration is None and isinstance(device.runtime, DeviceRuntime):
-            made = partial(register_served, device, device.runtime)
-            self._registered_here = await called(REGISTRATIONS, made, REGISTER_S)
+            register = partial(register_served, device, device.runtime)
+            self._registered_here = await called(REGISTRATIONS, register, REGISTER_S)
 
     async def leave(self) -> None:
         """Take back the registration that was made here."""

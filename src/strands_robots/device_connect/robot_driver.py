@@ -101,12 +101,12 @@ class RobotDeviceDriver(RobotDriver):
         """The task's state."""
         facts = fields_of(self.task_robot.get_task_status())
         state = str(facts.get("task_status", "")).lower()
-        told = {
+        reported = {
             "task_status": state,
             "instruction": str(facts.get("instruction", "")),
             "step_count": int(plain_numbers(facts).get("step_count", 0)),
         }
-        return Activity(state in RUNNING, told)
+        return Activity(state in RUNNING, reported)
 
     async def tell(self, activity: Activity) -> None:
         """Emit ``stateUpdate``, and start and end of a foreign robot's task."""

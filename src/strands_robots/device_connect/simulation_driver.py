@@ -145,10 +145,10 @@ class SimulationDeviceDriver(RobotDriver):
         joints = {
             str(name): plain_numbers(each) for name, each in (robots.items() if isinstance(robots, Mapping) else ())
         }
-        told = plain_numbers({key: facts.get(key) for key in ("sim_time", "step_count")})
+        clock = plain_numbers({key: facts.get(key) for key in ("sim_time", "step_count")})
         state = {
-            "sim_time": told.get("sim_time", 0.0),
-            "step_count": int(told.get("step_count", 0)),
+            "sim_time": clock.get("sim_time", 0.0),
+            "step_count": int(clock.get("step_count", 0)),
             "running_policies": running,
         }
         return Activity(bool(running), state, joints=joints)

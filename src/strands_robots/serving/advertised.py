@@ -291,13 +291,13 @@ def verb_names(functions: object) -> list[str]:
 
 def fitting(rows: Iterable[T], most: int) -> list[T]:
     """Return the rows whose JSON is within so many bytes together, the first ones first."""
-    kept, left = list[T](), most
+    within, left = list[T](), most
     for each in rows:
         size = len(json.dumps(each)) + 2
         if size <= left:
             left -= size
-            kept.append(each)
-    return kept
+            within.append(each)
+    return within
 
 
 def typed(parameter: AdvertisedParameter, value: object, text: str) -> Any:

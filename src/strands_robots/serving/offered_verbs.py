@@ -241,8 +241,8 @@ def answer_of(verb: str, result: object, ended: str = "", why: str = "") -> Enve
     plain = jsonable(result)
     if why and not is_error(plain):
         given = plain if isinstance(plain, dict) else {} if plain is None else {"result": plain}
-        kept = {key: each for key, each in fields_of(given).items() if key not in (*_OF_ENVELOPE, "reason")}
-        return error(f"{said} {text_of(given)}".rstrip(), **{"why": why, **kept, **status})
+        facts = {key: each for key, each in fields_of(given).items() if key not in (*_OF_ENVELOPE, "reason")}
+        return error(f"{said} {text_of(given)}".rstrip(), **{"why": why, **facts, **status})
     if not isinstance(plain, Mapping):
         return success(said, **status, **({} if plain is None else {"result": plain}))
     if plain.get("status") in ("success", "error"):

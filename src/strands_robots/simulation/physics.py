@@ -3,7 +3,8 @@
 This is the only place that documents it. A world has three locks, always taken in this order, and one published value:
 
 1. The *starting lock* (``Simulation.starting``, re-entrant) is held while the world is rebuilt or reset, and while a
-   rollout or a teleoperation starts. A stop never takes it, so nothing that is built or loaded delays a stop.
+   rollout or a teleoperation starts; a start takes the lock of its robot's line before it (``TaskEngine.line``). A stop
+   takes neither, so nothing that is built or loaded delays a stop.
 2. The *step lock* protects the model and the data. The stepping thread holds it for one chunk of steps.
 3. The *command lock* protects the setpoints. A writer holds it for the few microseconds of a write, and checks its
    permit under it; the stepping thread holds it just as briefly, to copy the setpoints, before each chunk. So a
