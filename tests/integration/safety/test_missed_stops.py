@@ -93,7 +93,7 @@ def met(site: Stage, *ids: str) -> None:
     site.meet(hand, *ids)
     hand.close()
     remembered = SightingFile(site.folder).served
-    eventually(lambda: {row.name for row in remembered()} >= set(ids), what="the memory of who is served")
+    eventually(lambda: all(remembered(each) for each in ids), what="the memory of who is served")
 
 
 @pytest.mark.parametrize("frozen_s", [NOTICED_S, BEYOND_THE_LEASE_S], ids=["shortly", "beyond the lease"])
