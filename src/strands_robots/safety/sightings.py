@@ -380,9 +380,11 @@ class Sightings:
                 if not self._waiting or failed > RETRIES:
                     self._thread = None
                     self._lock.notify_all()
-                    return
+                    break
             problem = self._write_batch()
             failed, pause = (failed + 1, RETRY_S) if problem else (0, BATCH_S)
+        # Where the disk takes no row, the next start is not refused for it.
+        self._free_starts(tuple(self._changed))
 
     def _write_batch(self) -> str:
         """Write what is queued, and queue it again where that fails; return the problem."""
@@ -394,11 +396,15 @@ class Sightings:
         problem = "it failed"
         try:
             problem = self._write(notes, answers, served)
+            if not problem:
+                self._free_starts(served)
         finally:
-            for network, name in served:
-                self._starts.free(network, name)
             self._written(notes, answers, served, problem)
         return problem
+
+    def _free_starts(self, served: Iterable[tuple[NetworkKey, str]]) -> None:
+        for network, name in served:
+            self._starts.free(network, name)
 
     def _written(
         self,
