@@ -284,7 +284,8 @@ class Sightings:
             if taken and other is None:
                 return rows
             if time.monotonic() >= until:
-                self._starts.free(network, name)
+                if begins:
+                    self._starts.free(network, name)
                 who = "another process of this machine, which is just starting it"
                 if other is not None:
                     where = f"{KINDS[other.network.kind]} ({', '.join(other.network.where)})"
@@ -378,13 +379,15 @@ class Sightings:
                 self._lock.wait_for(lambda: self._hurry, pause)
                 self._hurry = False
                 if not self._waiting or failed > RETRIES:
+                    # One that begins from here on is written by the next thread.
+                    unwritten = tuple(self._changed)
                     self._thread = None
                     self._lock.notify_all()
                     break
             problem = self._write_batch()
             failed, pause = (failed + 1, RETRY_S) if problem else (0, BATCH_S)
         # Where the disk takes no row, the next start is not refused for it.
-        self._free_starts(tuple(self._changed))
+        self._free_starts(unwritten)
 
     def _write_batch(self) -> str:
         """Write what is queued, and queue it again where that fails; return the problem."""
