@@ -11,14 +11,15 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from fixtures.moments import MomentClock
-from fixtures.waiting import said, signalled
+from fixtures.waiting import eventually, said, signalled
 
 from strands_robots.safety import sighting_file, sightings
 from strands_robots.safety.network_key import DEVICE_CONNECT, MESH, NetworkKey
-from strands_robots.safety.sighting_file import Served, process_start
+from strands_robots.safety.sighting_file import Served, SightingFileError, process_start
 from strands_robots.safety.sightings import DuplicateDeviceError, Sightings
 
 HERE = NetworkKey.of(DEVICE_CONNECT, ["tcp/127.0.0.1:7447"])
@@ -194,6 +195,31 @@ def _open_files() -> list[Path]:
         with contextlib.suppress(OSError):  # closed meanwhile
             files.append(each.readlink())
     return files
+
+
+def test_a_start_holds_its_lock_until_its_row_is_written_or_given_up(
+    store: Sightings, clock: MomentClock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sightings, "RETRY_S", 0.01)
+    lock, busy = store.directory / "starting.lock", threading.Event()
+    write = store.file.write
+
+    def refuse(*rows: Any, **facts: Any) -> None:
+        if busy.is_set():
+            raise SightingFileError("the file is busy")
+        write(*rows, **facts)
+
+    monkeypatch.setattr(store.file, "write", refuse)
+    busy.set()
+    store.serve(HERE, "arm-1")
+    assert not store.flush(5.0)
+    assert lock in _open_files()
+    busy.clear()
+    assert store.flush(5.0)
+    assert lock not in _open_files()
+    busy.set()
+    store.serve(HERE, "arm-2")
+    eventually(lambda: lock not in _open_files())
 
 
 def test_a_file_that_cannot_be_locked_refuses_no_start(store: Sightings, caplog: pytest.LogCaptureFixture) -> None:

@@ -286,7 +286,8 @@ class Sightings:
             if taken and other is None:
                 return rows
             if time.monotonic() >= until:
-                self._starts.free(network, name)
+                if begins:
+                    self._starts.free(network, name)
                 who = "another process of this machine, which is just starting it"
                 if other is not None:
                     where = f"{KINDS[other.network.kind]} ({', '.join(other.network.where)})"
@@ -380,11 +381,15 @@ class Sightings:
                 self._lock.wait_for(lambda: self._hurry, pause)
                 self._hurry = False
                 if not self._waiting or failed > RETRIES:
+                    # One that begins from here on is written by the next thread.
+                    unwritten = tuple(self._changed)
                     self._thread = None
                     self._lock.notify_all()
-                    return
+                    break
             problem = self._write_batch()
             failed, pause = (failed + 1, RETRY_S) if problem else (0, BATCH_S)
+        # Where the disk takes no row, the next start is not refused for it.
+        self._free_starts(unwritten)
 
     def _write_batch(self) -> str:
         """Write what is queued, and queue it again where that fails; return the problem."""
@@ -397,11 +402,15 @@ class Sightings:
         problem = "it failed"
         try:
             problem = self._write(notes, answers, served)
+            if not problem:
+                self._free_starts(served)
         finally:
-            for network, name in served:
-                self._starts.free(network, name)
             self._written(notes, answers, served, problem)
         return problem
+
+    def _free_starts(self, served: Iterable[tuple[NetworkKey, str]]) -> None:
+        for network, name in served:
+            self._starts.free(network, name)
 
     def _written(
         self,
