@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, ParamSpec
 
 from strands_robots.contract import RUNNING, for_request
 from strands_robots.envelope import Envelope, error, success
-from strands_robots.kinematics.arm_parts import ArmParts, StatedJoint
+from strands_robots.kinematics import ArmParts, StatedJoint, load_places, save_places
 from strands_robots.policies.base import Action
 from strands_robots.policies.rollout import Body, Rollout
 from strands_robots.policies.task_engine import NewTask, TaskEngine
@@ -386,8 +386,6 @@ class ArmMixin:
 
         ``kept`` is false where that cannot be written: the place is then lost with this process.
         """
-        from strands_robots.kinematics.arm_parts import save_places  # noqa: PLC0415 - with the first place
-
         name, body, arm = identifier("place", place), self.body(robot_name), self.arm(robot_name).whole()
         if name == HOME:
             raise ValidationError(f"place must not be {HOME}, which is that of the model.")
@@ -408,8 +406,6 @@ class ArmMixin:
         return own if name == self.tool_name_str else f"{own}:{name}"
 
     def _saved_places(self, name: str) -> dict[str, dict[str, float]]:
-        from strands_robots.kinematics.arm_parts import load_places  # noqa: PLC0415 - with the first place
-
         if name not in self._places:
             self._places[name] = load_places(self._place_key(name))
         return self._places[name]

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from strands_robots.kinematics import StatedJoint
 from strands_robots.kinematics.arm import (
     ACCELERATION_RAD_S2,
     SLIDE_SPEED_M_S,
@@ -30,7 +31,6 @@ from strands_robots.kinematics.arm import (
     JointMap,
     timed,
 )
-from strands_robots.kinematics.arm_parts import StatedJoint
 from strands_robots.policies.base import JOINT_SPEED_RAD_S, PolicyError, Ranges, numbers
 from strands_robots.policies.rollout import Body, Rollout, RolloutObservers
 from strands_robots.safety.gate import Permit

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from strands_robots.kinematics import ArmParts
 from strands_robots.kinematics.arm import Arm
-from strands_robots.kinematics.arm_parts import ArmParts
 from strands_robots.kinematics.chain import Chain, Floats
 from strands_robots.kinematics.objects import SeenObject
 from strands_robots.policies.base import Observation, checked_speeds

@@ -11,8 +11,8 @@ from strands_robots import settings
 from strands_robots.arm_mixin import ArmMixin
 from strands_robots.contract import Observer, Unsubscribe
 from strands_robots.envelope import Envelope, error, success
+from strands_robots.kinematics import ArmParts
 from strands_robots.kinematics.arm import Arm
-from strands_robots.kinematics.arm_parts import ArmParts
 from strands_robots.kinematics.objects import SeenObject
 from strands_robots.policies.base import SPEED_MAX
 from strands_robots.policies.check import RobotFacts
