@@ -134,12 +134,22 @@ class ArmMixin:
 
         The plan's search ends when its permit is void. A halt since the request was made refuses the motion.
         """
-        from strands_robots.kinematics.motion import motion_rollout  # noqa: PLC0415 - numpy, with the first motion
 
         def make(body: Body, permit: Permit, _: object) -> Rollout:
             hz = self.tasks.rate()
             motion = plan(hz, permit)
-            return motion_rollout(body, motion, permit, hz, self.tasks.observers)
+            # What it grips in the end it keeps.
+            return Rollout(
+                body,
+                motion,
+                permit=permit,
+                instruction=motion.instruction,
+                policy_name="motion",
+                duration=motion.duration,
+                hz=hz,
+                observers=self.tasks.observers,
+                ends_at_rest=True,
+            )
 
         return self.tasks.start(verb, robot_name, NewTask(make), request)
 
@@ -638,17 +648,14 @@ class ArmMixin:
         Args:
             state: what was observed last; read anew without it.
         """
-        task = next((each for each in reversed(self._recent) if self._gripped(each, name)), None)
+        of_body = (each for each in reversed(self._recent) if each.rollout.robot == name)
+        task = next((each for each in of_body if each.motion.opening is not None), None)
         if task is None or task.motion.opening is None or arm.jaw is None or task.rollout.running:
             return None
         command = self.targets(name).get(arm.jaw.commanded)
         if command is None or not arm.jaw.says(command, task.motion.opening):
             return None
         return arm.holding(state or arm.state(_observed(self.body(name))[1]), task.motion.opening)
-
-    @staticmethod
-    def _gripped(task: ArmTask, name: str) -> bool:
-        return task.rollout.robot == name and task.motion.opening is not None
 
 
 def _observed(body: Body) -> tuple[float, Mapping[str, float]]:

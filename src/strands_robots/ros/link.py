@@ -1,4 +1,4 @@
-"""ROS graphs: names and interface types, the contract of a link, and its messages from fields, and back.
+"""ROS graphs: names, interface types and messages, and the contract of a link.
 
 A message class describes its fields by ``get_fields_and_field_types``, in the terms of the ROS 2 interface definition:
 ``double``, ``string<10>``, ``sequence<uint8>``, ``double[36]``, ``geometry_msgs/Vector3``. Those of bare DDS say

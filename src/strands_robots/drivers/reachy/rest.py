@@ -1,4 +1,6 @@
-"""Client of the daemon's REST interface, with an error for each kind of failure, and stops that wait for no answer.
+"""Client of the daemon's REST interface, and stops that wait for no answer.
+
+Each kind of failure has an error of its own.
 
 Importable with the standard library alone; ``httpx`` is loaded by the first request. The daemon has no
 authentication: every client that reaches its port controls the motors.
