@@ -405,7 +405,7 @@ class Networks:
                 robot, verb, lambda network: network.call_async(robot, verb, arguments, within), moves=moves
             )
 
-        from strands_robots.fleet.refusals import answered  # noqa: PLC0415 - a stop need not load it
+        from strands_robots.fleet.reports import answered  # noqa: PLC0415 - a stop need not load it
 
         return await answered(called())
 

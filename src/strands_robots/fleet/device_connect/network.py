@@ -174,7 +174,7 @@ class DeviceConnectNetwork:
 
     def enrolled_key(self, robot: str) -> bytes | None:
         """Return the device's enrolled key."""
-        from strands_robots.fleet.device_connect.lockouts import enrolled_keys  # noqa: PLC0415 - a call need not load it
+        from strands_robots.fleet.device_connect.stops import enrolled_keys  # noqa: PLC0415 - a call need not load it
         from strands_robots.safety.identity import KeyFileError  # noqa: PLC0415 - as above
 
         try:
@@ -322,7 +322,7 @@ class DeviceConnectNetwork:
 
     def lockouts(self, robots: Iterable[str], timeout: float, *, signed: bool = False) -> list[LockoutReport]:
         """Ask each device for its status."""
-        from strands_robots.fleet.device_connect.lockouts import ask_robots  # noqa: PLC0415 - a call need not load it
+        from strands_robots.fleet.device_connect.stops import ask_robots  # noqa: PLC0415 - a call need not load it
 
         with _carried():
             return ask_robots(self._connected, dict.fromkeys(robots), timeout, signed=signed)
@@ -330,7 +330,7 @@ class DeviceConnectNetwork:
     async def lockout_async(self, robot: str, within: float) -> LockoutReport:
         """Ask the device for its status."""
         from strands_robots.fleet.adapter import LockoutReport  # noqa: PLC0415 - as above
-        from strands_robots.fleet.device_connect.lockouts import ask_robot, usable_keys  # noqa: PLC0415 - as above
+        from strands_robots.fleet.device_connect.stops import ask_robot, usable_keys  # noqa: PLC0415 - as above
         from strands_robots.fleet.shared_id import CachedKeys  # noqa: PLC0415 - a call need not load it
 
         if self._keys is None:
@@ -342,7 +342,7 @@ class DeviceConnectNetwork:
 
     def resume(self, reports: Sequence[LockoutReport], signer: Any, timeout: float) -> dict[str, Resumed]:
         """Send each device a resume of each of its lockouts."""
-        from strands_robots.fleet.device_connect.lockouts import resume_robots  # noqa: PLC0415 - a call need not load it
+        from strands_robots.fleet.device_connect.stops import resume_robots  # noqa: PLC0415 - a call need not load it
 
         with _carried():
             return resume_robots(self._connected, reports, signer, timeout)

@@ -43,14 +43,13 @@ from strands_robots.fleet.adapter import (
     StopSender,
 )
 from strands_robots.fleet.mesh.config import MeshSettings, no_hub
-from strands_robots.fleet.mesh.events import follow
-from strands_robots.fleet.mesh.lockouts import ask_peer, ask_peers, lockable_peers, resume_peers
 from strands_robots.fleet.mesh.peers import (
     CALLER,
     CONSOLE,
     LOOK_S,
     awaited,
     discover,
+    follow,
     functions_of,
     functions_of_each,
     functions_of_kind,
@@ -60,13 +59,17 @@ from strands_robots.fleet.mesh.peers import (
 )
 from strands_robots.fleet.mesh.stops import (
     MeshController,
+    ask_peer,
+    ask_peers,
     lock_peers,
+    lockable_peers,
     mesh_network,
+    resume_peers,
     stand_on_mesh,
     stop_peer,
     stop_peers,
 )
-from strands_robots.fleet.refusals import refusal_of, refusal_of_text, with_meaning
+from strands_robots.fleet.reports import refusal_of, refusal_of_text, with_meaning
 from strands_robots.fleet.shared_id import CachedKeys
 from strands_robots.fleet.verdicts import roster_verdict
 from strands_robots.safety.network_key import NetworkKey
