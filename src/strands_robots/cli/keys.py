@@ -6,7 +6,6 @@ import getpass
 import shlex
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -214,58 +213,48 @@ Listed = Annotated[bool, typer.Option("--list", help="Show the enrolled robots w
 UNDONE = "It must answer again as soon as it is heard with its enrolled key."
 
 
-@dataclass(frozen=True, slots=True)
-class Change:
-    """Change of one enrolled robot: ``retired``, ``off`` or ``forget``."""
-
-    action: str
-    name: str
-    reason: str
-
-
-def change_of(*, retire: str, off: str, forget: str, reason: str) -> Change | None:
-    """Return the change that the options ask for, or None.
+def _change_of(*, retire: str, off: str, forget: str, reason: str) -> tuple[str, str] | None:
+    """Return the change that the options ask for, and the robot's name; or None.
 
     Raises:
         CliError: two of them, or a reason for none.
         ValidationError: a name or a reason out of its domain.
     """
     stated = [
-        Change(action, text(flag, name, longest=256), reason)
+        (action, text(flag, name, longest=256))
         for action, flag, name in ((RETIRED, "--retire", retire), (OFF, "--off", off), (FORGET, "--forget", forget))
         if name
     ]
     if len(stated) > 1:
         raise CliError("--retire, --off and --forget are one at a time.", Exit.USAGE)
     text("--reason", reason, longest=REASON_MAX, empty=True)
-    if reason and (not stated or stated[0].action == FORGET):
+    if reason and (not stated or stated[0][0] == FORGET):
         raise CliError("--reason goes with --retire or --off.", Exit.USAGE)
     return stated[0] if stated else None
 
 
-def apply(screen: Screen, change: Change, tenant: str) -> None:
+def _apply(screen: Screen, action: str, robot: str, reason: str, tenant: str) -> None:
     """Carry out a change of an enrolled robot, and record it in the audit.
 
     Raises:
         CliError: it is not enrolled, or the file cannot be used.
     """
-    who = operator()
     try:
-        name = change_enrolment(change.name, change.action, change.reason, tenant=tenant)
+        name = change_enrolment(robot, action, reason, tenant=tenant)
     except NoSuchRobotError as exc:
         raise CliError(plain(str(exc), 2000), robots={}) from exc
     except (KeyFileError, OSError) as exc:
         raise CliError(f"Nothing was changed: {exc}") from exc
-    screen.data({"status": "success", "robot": name, "action": change.action, "by": who, "reason": change.reason})
-    if change.action == FORGET:
+    screen.data({"status": "success", "robot": name, "action": action, "by": operator(), "reason": reason})
+    if action == FORGET:
         screen.say(f"{name} is not enrolled any more: its answers are not checked, and no stop waits for it by name.")
     else:
-        screen.say(f"{name} is {change.action}: every stop prints that, and waits for it no more. {UNDONE}")
+        screen.say(f"{name} is {action}: every stop prints that, and waits for it no more. {UNDONE}")
         if served_here(name):
             screen.say(f"A process of this machine serves {name} now: until that ends, it must answer.", "yellow")
 
 
-def show_enrolled(screen: Screen) -> None:
+def _show_enrolled(screen: Screen) -> None:
     """Show the enrolled robots.
 
     Raises:
@@ -324,14 +313,14 @@ def enroll(
     timeout: Timeout = 2.0,
 ) -> None:
     """Keep the public keys of robots: from then on only a signed answer counts."""
-    change = change_of(retire=retire, off=off, forget=forget, reason=reason)
+    change = _change_of(retire=retire, off=off, forget=forget, reason=reason)
     if change is not None or listed:
         if devices or console or replace or (change is not None and listed):
             raise CliError("--list, --retire, --off and --forget go with no other.", Exit.USAGE)
         if change is None:
-            show_enrolled(screen)
+            _show_enrolled(screen)
         else:
-            apply(screen, change, DEFAULT_TENANT if network.mesh else network.stated.stated_tenant)
+            _apply(screen, *change, reason, DEFAULT_TENANT if network.mesh else network.stated.stated_tenant)
         return
     if console:
         _enroll_console(screen, console)

@@ -7,7 +7,7 @@ import sys
 import threading
 from collections import deque
 from collections.abc import Awaitable, Callable, Mapping
-from typing import Any, Protocol, Self
+from typing import Any, Protocol, Self, TypeGuard
 
 from strands_robots.contract import RUNNING
 from strands_robots.envelope import Envelope, RefusalReason, error, text_of
@@ -85,7 +85,7 @@ def joint_limits(features: Mapping[str, Any]) -> dict[str, Range]:
     for key in ("joints", "ranges"):
         joints = chosen.get(key)
         for name, limits in joints.items() if isinstance(joints, Mapping) else ():
-            pair = [value for value in limits if _finite(value)] if isinstance(limits, list | tuple) else []
+            pair = [value for value in limits if is_finite(value)] if isinstance(limits, list | tuple) else []
             if len(pair) == 2 and pair[0] < pair[1]:
                 # A real robot names the range of an action, such as pan.pos, and the position of the joint, pan.
                 found[str(name)] = found[str(name).removesuffix(".pos")] = (float(pair[0]), float(pair[1]))
@@ -111,7 +111,8 @@ def _first(features: Mapping[str, Any]) -> Mapping[str, Any]:
     return chosen if isinstance(chosen, Mapping) else {}
 
 
-def _finite(value: object) -> bool:
+def is_finite(value: object) -> TypeGuard[int | float]:
+    """Return whether a value is a finite number, and no boolean."""
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 

@@ -256,7 +256,7 @@ class DeviceConnectNetwork:
         try:
             return await self._connected.stop_async(robot, within, robot_name)
         except Exception as exc:  # noqa: BLE001 - a stop that fails is a verdict, whatever it raised
-            return error(_why(exc), stopped=None)
+            return error(plain_text(str(exc.args[0]) if exc.args else "") or type(exc).__name__, stopped=None)
 
     @property
     def key(self) -> NetworkKey:
@@ -441,10 +441,6 @@ def _found(peer: Peer) -> FoundRobot:
         },
         functions=peer.functions,
     )
-
-
-def _why(exc: Exception) -> str:
-    return plain_text(str(exc.args[0]) if exc.args else "") or type(exc).__name__
 
 
 def _refusal(exc: Exception, robot: str, verb: str) -> RefusalError | None:
