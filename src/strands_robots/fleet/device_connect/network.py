@@ -32,7 +32,7 @@ from strands_robots.fleet.adapter import (
     RobotEvent,
     StopRequest,
 )
-from strands_robots.fleet.device_connect.config import described
+from strands_robots.fleet.device_connect.config import described, enrolled_keys
 from strands_robots.fleet.reports import task_of
 from strands_robots.utils import ValidationError, device_id, plain_text
 
@@ -174,8 +174,7 @@ class DeviceConnectNetwork:
 
     def enrolled_key(self, robot: str) -> bytes | None:
         """Return the device's enrolled key."""
-        from strands_robots.fleet.device_connect.stops import enrolled_keys  # noqa: PLC0415 - a call need not load it
-        from strands_robots.safety.identity import KeyFileError  # noqa: PLC0415 - as above
+        from strands_robots.safety.identity import KeyFileError  # noqa: PLC0415 - a call need not load it
 
         try:
             return enrolled_keys(self._link).get(robot)

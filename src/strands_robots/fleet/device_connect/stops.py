@@ -12,7 +12,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from strands_robots.envelope import Envelope, text_of
-from strands_robots.fleet.adapter import FIND_S, STOP_S, LockoutReport, Resumed, StopRequest, before_resume
+from strands_robots.fleet.adapter import FIND_S, STOP_S, TOO_MANY, LockoutReport, Resumed, StopRequest
+from strands_robots.fleet.device_connect.config import enrolled_keys
 from strands_robots.fleet.shared_id import Keys
 from strands_robots.fleet.verdicts import measured, with_plain_stops, with_reasons
 from strands_robots.safety.answers import Progress, StopReport
@@ -317,7 +318,7 @@ def resume_robots(
         for assertion in sign(signer, epoch, names):
             for name in assertion["targets"]:
                 assertions.setdefault(name, []).append(assertion)
-    outcomes = {robot.name: before_resume(robot) for robot in found}
+    outcomes = {robot.name: _before_resume(robot) for robot in found}
     # All robots at once, and the lockouts of each one after the other, until it refuses.
     left = {each.name: assertions.get(each.name, []) for each in found if each.lockouts and not each.problem}
     while sent := {name: waiting[0] for name, waiting in left.items() if waiting}:
@@ -326,6 +327,15 @@ def resume_robots(
             goes_on, outcomes[name] = _resumed(name, answer, sent[name], keys.get(name))
             left[name] = left[name][1:] if goes_on else []
     return outcomes
+
+
+def _before_resume(robot: LockoutReport) -> Resumed:
+    """Return the outcome of a resume where none can be sent to a robot."""
+    if robot.problem:
+        return False, robot.problem
+    if not robot.lockouts:
+        return True, "was not locked"
+    return False, TOO_MANY
 
 
 def _resumed(
@@ -342,20 +352,6 @@ def _resumed(
     if answer.get("status") != "success":
         return False, (False, f"{text_of(answer)}: its own audit says why")
     return True, (answer.get("locked") is False, text_of(answer))
-
-
-def enrolled_keys(link: LinkConfig) -> dict[str, bytes]:
-    """Return the enrolled keys of the robots on this network.
-
-    Raises:
-        KeyFileError: the keys cannot be used.
-    """
-    from strands_robots.device_connect.backends.config import enrolled_robots  # noqa: PLC0415 - the network is loaded when it is used
-
-    try:
-        return enrolled_robots(link)
-    except (KeyFileError, OSError) as exc:
-        raise KeyFileError(f"The enrolled keys cannot be used: {exc}") from exc
 
 
 def usable_keys(link: LinkConfig) -> Keys:
