@@ -7,6 +7,7 @@ when the work is done. A job that is late or still running skips its missed dead
 
 from __future__ import annotations
 
+import contextlib
 import heapq
 import logging
 import math
@@ -450,7 +451,7 @@ Work = Callable[[], None]
 class BoundedExecutor:
     """One thread, and at most ``depth`` jobs that wait for it.
 
-    The thread starts with the first job. A full executor forgets its oldest job for a new one.
+    The thread starts with the first job, or by :meth:`prepare`. A full executor forgets its oldest job for a new one.
     """
 
     def __init__(self, name: str, depth: int) -> None:
@@ -473,7 +474,19 @@ class BoundedExecutor:
                 return
             thread = self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
         # Without the lock, so that the thread takes its first job before a close can drop it.
-        thread.start()
+        self._begin(thread)
+
+    def prepare(self) -> None:
+        """Start the thread now, so that the first job waits for no system call.
+
+        Where the system has none, the first job tries again.
+        """
+        with self._changed:
+            if not self._open or self._thread is not None:
+                return
+            thread = self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
+        with contextlib.suppress(RuntimeError):
+            self._begin(thread)
 
     def close(self) -> None:
         """Take no more jobs, drop waiting ones, and let the thread end."""
@@ -496,6 +509,13 @@ class BoundedExecutor:
         if thread is not threading.current_thread():
             thread.join(timeout)
         return [thread.name] if thread.is_alive() else []
+
+    def _begin(self, thread: threading.Thread) -> None:
+        try:
+            thread.start()
+        except RuntimeError:
+            self._thread = None
+            raise
 
     def _run(self) -> None:
         while True:

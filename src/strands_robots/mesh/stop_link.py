@@ -280,6 +280,9 @@ class PeerStops:
         if before is not None:
             undeclare([before])
         if peer.adapter.moves:
+            if transport.stops_apart:
+                # The thread that takes stops must start none of its own.
+                stops._notes.prepare()
             try:
                 stops.connect(peer)
             except TransportError:

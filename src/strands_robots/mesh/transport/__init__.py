@@ -101,11 +101,13 @@ class Transport(ABC):
         confirms: :meth:`put_confirmed` reports whether a topic has subscribers.
         pins_topics: the broker's policy lets a peer publish on topics of its own name alone.
         dials_only: it connects to a hub of others and never becomes one.
+        stops_apart: :meth:`open_stops` opens a connection of their own.
     """
 
     confirms = False
     pins_topics = False
     dials_only = False
+    stops_apart = False
 
     def take_part(self) -> None:
         """Let a robot of this process be found: from now on this may become the hub."""

@@ -122,6 +122,7 @@ class BridgeTransport(Transport):
     """
 
     pins_topics = True
+    stops_apart = True
 
     def __init__(self, local: Transport | None = None, cloud: Transport | None = None) -> None:
         self._local = local or make_transport("zenoh")
