@@ -12,10 +12,10 @@ from strands_robots.contract import Haltable, Robot, holds_robots
 from strands_robots.envelope import Envelope, RefusalReason, Refused, is_error
 from strands_robots.mesh import topics, wire
 from strands_robots.mesh.estop_retry import ESTOP
-from strands_robots.mesh.scheduler import RecentKeys
 from strands_robots.mesh.session import Context
 from strands_robots.mesh.transport import Sample, TransportError
 from strands_robots.mesh.wire_identity import MOTION, IdentityError
+from strands_robots.rate_limits import RecentKeys
 from strands_robots.safety.identity import SigningIdentity
 from strands_robots.safety.statements import with_stop_statement
 from strands_robots.safety.stopping import Outcome, StopVerdict, explain, grade
