@@ -1,7 +1,7 @@
 """Transports of the mesh: protocol, backends and a user's subscriptions.
 
-A backend is loaded when it is named: ``zenoh`` is the default, ``iot`` is MQTT 5, ``bridge`` is both at once, ``memory``
-stays inside one process.
+A backend is loaded when it is named: ``zenoh`` is the default, ``iot`` is MQTT 5, ``bridge`` is both at once,
+``memory`` stays inside one process.
 """
 
 from __future__ import annotations
