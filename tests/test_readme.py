@@ -19,7 +19,7 @@ from strands_robots.cli.app import build
 ROOT = Path(__file__).resolve().parent.parent
 SOURCES = ROOT / "src" / "strands_robots"
 NAMED_FROM = (ROOT, SOURCES, ROOT / "tests" / "integration" / "safety")
-"""Folders that the pages name files from: safety.md has a table of its integration tests by name alone."""
+"""Folders that the pages name files from: safety-proofs.md has a table of its integration tests by name alone."""
 
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md"))]
 

@@ -49,7 +49,7 @@ PARSERS = {
     "fleet/mesh/stops.py": BOUNDED,
     "hardware/lerobot_device.py": OWN_FILE,
     "http_access.py": OWN_FILE,
-    "kinematics/arm_parts.py": OWN_FILE,
+    "kinematics/__init__.py": OWN_FILE,
     "mesh/commands.py": BOUNDED,
     "mesh/input_receiver.py": BOUNDED,
     "mesh/presence.py": BOUNDED,
