@@ -24,7 +24,7 @@ from fixtures.feetech_bus.twin import ArmTwin
 from strands_robots.device_connect import init_device_connect_sync, stop_device_connect
 from strands_robots.device_connect.backends.config import usual_link
 from strands_robots.robot import Robot
-from strands_robots.simulation.pictures import Recording
+from strands_robots.simulation.rendering import Recording
 
 PICTURE = Path(os.environ.get("PICTURE", "demo-output/real-arm.png"))
 AGENT = Path(__file__).with_name("drive_from_agent.py")

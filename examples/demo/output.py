@@ -125,7 +125,7 @@ def draw_motion(
         CliError: nothing to draw, or the folder cannot be written.
     """
     from strands_robots.simulation import Simulation, furnish  # noqa: PLC0415 - MuJoCo is loaded after the live part
-    from strands_robots.simulation.pictures import Recording  # noqa: PLC0415 - as above
+    from strands_robots.simulation.rendering import Recording  # noqa: PLC0415 - as above
 
     moves = replayed(setpoints)
     if len(moves) < 2:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, ParamSpec
 
 from strands_robots.contract import RUNNING, for_request
 from strands_robots.envelope import Envelope, error, success
-from strands_robots.kinematics.arm_parts import ArmParts, StatedJoint
+from strands_robots.kinematics import ArmParts, StatedJoint, load_places, save_places
 from strands_robots.policies.base import Action
 from strands_robots.policies.rollout import Body, Rollout
 from strands_robots.policies.task_engine import NewTask, TaskEngine
@@ -134,12 +134,22 @@ class ArmMixin:
 
         The plan's search ends when its permit is void. A halt since the request was made refuses the motion.
         """
-        from strands_robots.kinematics.motion import motion_rollout  # noqa: PLC0415 - numpy, with the first motion
 
         def make(body: Body, permit: Permit, _: object) -> Rollout:
             hz = self.tasks.rate()
             motion = plan(hz, permit)
-            return motion_rollout(body, motion, permit, hz, self.tasks.observers)
+            # What it grips in the end it keeps.
+            return Rollout(
+                body,
+                motion,
+                permit=permit,
+                instruction=motion.instruction,
+                policy_name="motion",
+                duration=motion.duration,
+                hz=hz,
+                observers=self.tasks.observers,
+                ends_at_rest=True,
+            )
 
         return self.tasks.start(verb, robot_name, NewTask(make), request)
 
@@ -386,8 +396,6 @@ class ArmMixin:
 
         ``kept`` is false where that cannot be written: the place is then lost with this process.
         """
-        from strands_robots.kinematics.arm_parts import save_places  # noqa: PLC0415 - with the first place
-
         name, body, arm = identifier("place", place), self.body(robot_name), self.arm(robot_name).whole()
         if name == HOME:
             raise ValidationError(f"place must not be {HOME}, which is that of the model.")
@@ -408,8 +416,6 @@ class ArmMixin:
         return own if name == self.tool_name_str else f"{own}:{name}"
 
     def _saved_places(self, name: str) -> dict[str, dict[str, float]]:
-        from strands_robots.kinematics.arm_parts import load_places  # noqa: PLC0415 - with the first place
-
         if name not in self._places:
             self._places[name] = load_places(self._place_key(name))
         return self._places[name]
@@ -642,17 +648,14 @@ class ArmMixin:
         Args:
             state: what was observed last; read anew without it.
         """
-        task = next((each for each in reversed(self._recent) if self._gripped(each, name)), None)
+        of_body = (each for each in reversed(self._recent) if each.rollout.robot == name)
+        task = next((each for each in of_body if each.motion.opening is not None), None)
         if task is None or task.motion.opening is None or arm.jaw is None or task.rollout.running:
             return None
         command = self.targets(name).get(arm.jaw.commanded)
         if command is None or not arm.jaw.says(command, task.motion.opening):
             return None
         return arm.holding(state or arm.state(_observed(self.body(name))[1]), task.motion.opening)
-
-    @staticmethod
-    def _gripped(task: ArmTask, name: str) -> bool:
-        return task.rollout.robot == name and task.motion.opening is not None
 
 
 def _observed(body: Body) -> tuple[float, Mapping[str, float]]:

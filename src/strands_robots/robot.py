@@ -8,7 +8,7 @@ import sys
 import threading
 from collections.abc import Callable, Collection, Mapping
 from contextlib import nullcontext
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -152,7 +152,7 @@ def run(
     body: Any = robot if callable(getattr(robot, "halt", None)) else adapt(robot)
     verdict: StopVerdict = StopVerdict()
     # A user who waits for Ctrl-C reads the terminal, whatever the program does about logging.
-    report: Callable[[str], None] = _print_to_terminal if until is None else logger.info
+    report: Callable[[str], None] = partial(print, file=sys.stderr, flush=True) if until is None else logger.info
     joins = getattr(robot, "mesh", None) is None and (mesh or (mesh is None and mesh_env_request() is True))
     with device_connect.StopSignal() if until is None else nullcontext(until) as stop:
         try:
@@ -181,10 +181,6 @@ def run(
             device_connect.stop_device_connect(runtime)
             free()
     return verdict
-
-
-def _print_to_terminal(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
 
 
 def _simulated(name: str, tool_name: str | None, options: dict[str, Any]) -> Any:

@@ -93,8 +93,9 @@ class TeleopMixin:
         """
         seconds = None if duration is None else number("duration", duration, above=0, high=3600)
         rate = number("hz", hz, low=1, high=1000)
-        sink = self._teleop_sink(flag("publish", publish))
-        session = self._lead(identifier("name", name), seconds, rate, sink)
+        if flag("publish", publish) and self.input_sink is None:
+            raise ValidationError("publish must be false: no network that carries input streams is attached.")
+        session = self._lead(identifier("name", name), seconds, rate, self.input_sink if publish else None)
         return success(f"{name} leads {session.robot}.", name=name, robot=session.robot, hz=rate)
 
     def stop_teleoperate(self, name: str | None = None, timeout: float = STOP_JOIN_S) -> Envelope:
@@ -141,11 +142,6 @@ class TeleopMixin:
     @cached_property
     def _teleop_policies(self) -> dict[str, LeaderPolicy]:
         return {}
-
-    def _teleop_sink(self, publish: bool) -> InputSink | None:
-        if publish and self.input_sink is None:
-            raise ValidationError("publish must be false: no network that carries input streams is attached.")
-        return self.input_sink if publish else None
 
     def _lead(self, name: str, seconds: float | None, rate: float, sink: InputSink | None) -> Rollout:
         if name not in self._teleop_leaders:

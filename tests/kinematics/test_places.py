@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from strands_robots.kinematics.arm_parts import PLACES_MAX, load_places, place_file, save_places
+from strands_robots.kinematics import PLACES_MAX, load_places, place_file, save_places
 from strands_robots.simulation import Simulation
 from strands_robots.state_files import state_dir
 from strands_robots.utils import ValidationError

@@ -11,10 +11,9 @@ import pytest
 from cyclonedds.idl._machinery import BytesMachine
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from strands_robots.ros import messages
+from strands_robots.ros import link
 from strands_robots.ros.dds_types import KINDS
-from strands_robots.ros.link import RosError
-from strands_robots.ros.messages import plain
+from strands_robots.ros.link import RosError, plain
 
 Image, JointState, Odometry, Twist = (
     KINDS["sensor_msgs/Image"],
@@ -31,7 +30,7 @@ OLD = importlib.metadata.version("cyclonedds").startswith("0.10.")
 
 
 def filled(struct: type[Any], fields: dict[str, Any]) -> Any:
-    return messages.filled(struct(), fields, lambda kind: KINDS[kind]())
+    return link.filled(struct(), fields, lambda kind: KINDS[kind]())
 
 
 def sample(struct: type[Any], rng: random.Random) -> Any:

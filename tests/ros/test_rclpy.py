@@ -9,10 +9,9 @@ from fixtures import rclpy_stand_in
 from fixtures.rclpy_stand_in.idl import MESSAGES
 from fixtures.rclpy_stand_in.interfaces import message_class, to_idl
 
-from strands_robots.ros import messages
+from strands_robots.ros import link
 from strands_robots.ros.dds_types import KINDS
-from strands_robots.ros.link import RosError
-from strands_robots.ros.messages import plain
+from strands_robots.ros.link import RosError, plain
 from strands_robots.ros.rclpy import interface_class
 from strands_robots.utils import ValidationError
 
@@ -22,7 +21,7 @@ def made(kind: str) -> Any:
 
 
 def filled(message: Any, fields: dict[str, Any]) -> Any:
-    return messages.filled(message, fields, lambda kind: interface_class(kind, "msg")())
+    return link.filled(message, fields, lambda kind: interface_class(kind, "msg")())
 
 
 @pytest.fixture(autouse=True)
@@ -50,10 +49,8 @@ FILLED: dict[str, dict[str, Any]] = {
 def test_filled_message_is_the_same_over_rclpy_and_bare_dds(kind: str) -> None:
     fields = FILLED[kind]
     message = filled(made(kind), fields)
-    assert plain(message) == plain(messages.filled(KINDS[kind](), fields, lambda inner: KINDS[inner]()))
-    assert (
-        to_idl(message).serialize() == messages.filled(KINDS[kind](), fields, lambda inner: KINDS[inner]()).serialize()
-    )
+    assert plain(message) == plain(link.filled(KINDS[kind](), fields, lambda inner: KINDS[inner]()))
+    assert to_idl(message).serialize() == link.filled(KINDS[kind](), fields, lambda inner: KINDS[inner]()).serialize()
 
 
 def test_numpy_arrays_and_lists_of_bytes_are_accepted() -> None:

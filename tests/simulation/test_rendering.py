@@ -14,8 +14,7 @@ import pytest
 from PIL import Image
 
 from strands_robots.simulation import Simulation, engine
-from strands_robots.simulation.pictures import Recording, save_animation
-from strands_robots.simulation.rendering import RenderingError, draw_path
+from strands_robots.simulation.rendering import Recording, RenderingError, draw_path, save_animation
 from strands_robots.utils import ValidationError
 
 OPENGL = any(engine.loads(backend) for backend in ("egl", "osmesa"))

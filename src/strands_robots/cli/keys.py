@@ -102,11 +102,12 @@ def mcp(
 
 def init(screen: Screen, folder: Folder = DEFAULT_FOLDER) -> None:
     """Make the fleet's own certificate authority."""
-    from strands_robots.mesh import keys  # noqa: PLC0415 - loaded when it is used
+    from strands_robots.certificates import CA_KEY  # noqa: PLC0415 - loaded when it is used
+    from strands_robots.mesh.transport import config  # noqa: PLC0415 - loaded when it is used
 
-    path = _refusable(lambda: keys.init(folder))
+    path = _refusable(lambda: config.make_authority(folder))
     screen.data({"status": "success", "ca": str(path)})
-    screen.say(f"The authority is {path}. Keep {folder / keys.CA_KEY} to yourself; it makes the certificates.", "green")
+    screen.say(f"The authority is {path}. Keep {folder / CA_KEY} to yourself; it makes the certificates.", "green")
 
 
 def issue(
@@ -117,9 +118,9 @@ def issue(
     folder: Folder = DEFAULT_FOLDER,
 ) -> None:
     """Make the certificate of one peer, and print its settings."""
-    from strands_robots.mesh import keys  # noqa: PLC0415 - loaded when it is used
+    from strands_robots.mesh.transport import config  # noqa: PLC0415 - loaded when it is used
 
-    issued = _refusable(lambda: keys.issue(folder.resolve(), peer_id, hosts or [])).settings()
+    issued = _refusable(lambda: config.issue_certificate(folder.resolve(), peer_id, hosts or [])).settings()
     screen.data({"status": "success", **issued})
     for name, value in issued.items():
         screen.copyable(f"export {name}={shlex.quote(str(value))}")
@@ -136,9 +137,9 @@ def acl(
     file: Annotated[Path, typer.Option("--file", help="Where the rules are written.")] = Path("mesh-acl.json5"),
 ) -> None:
     """Write access rules: deny by default, a robot sends as itself, an operator also commands."""
-    from strands_robots.mesh import keys  # noqa: PLC0415 - loaded when it is used
+    from strands_robots.mesh.transport import config  # noqa: PLC0415 - loaded when it is used
 
-    rules = _refusable(lambda: keys.acl(robots or [], operators or [], relays))
+    rules = _refusable(lambda: config.named_rules(robots or [], operators or [], relays))
     file.write_text(rules, encoding="utf-8")
     screen.data({"status": "success", "STRANDS_MESH_ACL_FILE": str(file.resolve())})
     screen.copyable(f"export STRANDS_MESH_ACL_FILE={shlex.quote(str(file.resolve()))}")

@@ -17,7 +17,7 @@ from typing import Any
 
 from strands_robots.bus_access import joint_read_source
 from strands_robots.hardware._compat import forget_input
-from strands_robots.kinematics.arm_parts import ArmParts, StatedJoint
+from strands_robots.kinematics import ArmParts, StatedJoint
 from strands_robots.policies.base import JOINT_SPEED_RAD_S, Action, Ranges, is_velocity
 from strands_robots.utils import ValidationError, shown
 

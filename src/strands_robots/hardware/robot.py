@@ -27,7 +27,7 @@ from strands_robots.hardware.device_facts import (
     still_action,
     temperatures,
 )
-from strands_robots.kinematics.arm_parts import ArmParts, StatedJoint
+from strands_robots.kinematics import ArmParts, StatedJoint
 from strands_robots.policies.base import Action, checked_action, is_velocity, numbers
 from strands_robots.policies.check import RobotFacts
 from strands_robots.policies.rollout import Rollout, unfollowed

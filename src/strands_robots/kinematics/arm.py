@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from strands_robots.kinematics.arm_parts import ArmParts
+from strands_robots.kinematics import ArmParts
 from strands_robots.policies.base import JOINT_SPEED_RAD_S
 from strands_robots.utils import DURATION_MAX_S, ValidationError
 

@@ -102,7 +102,7 @@ def held_body(model: Any) -> int:
 
 @dataclass(frozen=True, slots=True)
 class ObstacleShape:
-    """ObstacleShape and place of an obstacle.
+    """Shape and place of an obstacle.
 
     Attributes:
         kind: :data:`BOX`, :data:`CYLINDER` or :data:`BALL`.

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from strands_robots.kinematics import StatedJoint
 from strands_robots.kinematics.arm import (
     ACCELERATION_RAD_S2,
     SLIDE_SPEED_M_S,
@@ -30,10 +31,8 @@ from strands_robots.kinematics.arm import (
     JointMap,
     timed,
 )
-from strands_robots.kinematics.arm_parts import StatedJoint
 from strands_robots.policies.base import JOINT_SPEED_RAD_S, PolicyError, Ranges, numbers
-from strands_robots.policies.rollout import Body, Rollout, RolloutObservers
-from strands_robots.safety.gate import Permit
+from strands_robots.policies.rollout import Rollout
 from strands_robots.utils import ValidationError, shown
 
 if TYPE_CHECKING:  # MuJoCo is not needed to watch joints
@@ -368,17 +367,18 @@ class Motion:
             return
         setpoints = np.where(np.isnan(self._setpoints), state.joints, self._setpoints)
         currents = self.currents
-        read = None if currents is None else lambda: self._by_joint(currents())
-        index = self._watch.stalled(self.clock(), setpoints, state.joints, read)
+
+        def read() -> Floats:
+            """Return currents in the order of the joints, NaN where one is not known."""
+            known = {} if currents is None else currents()
+            return np.array([known.get(each.observed, np.nan) for each in self.arm.maps])
+
+        index = self._watch.stalled(self.clock(), setpoints, state.joints, None if currents is None else read)
         if index is not None:
             joint = self.arm.joints[index]
             at = f"{np.degrees(state.joints[index]):.0f} degrees" if joint.turns else f"{state.joints[index]:.3f} m"
             self.contact = f"{joint.name} was blocked at {at}: it met something, or its servo is too weak"
             raise PolicyError(self.contact)
-
-    def _by_joint(self, currents: Mapping[str, float]) -> Floats:
-        """Return currents in the order of the joints, NaN where one is not known."""
-        return np.array([currents.get(each.observed, np.nan) for each in self.arm.maps])
 
     def interrupt(self) -> None:
         """Do nothing: this policy never waits."""
@@ -524,10 +524,6 @@ def move_joints(
     )
 
 
-POLICY_NAME = "motion"
-"""What a planned motion is called where a policy's name stands."""
-
-
 @dataclass
 class ArmTask:
     """One motion, running or ended.
@@ -561,18 +557,3 @@ class ArmTask:
         self.rollout.join(seconds)
         if self.unseen:
             self.looked.wait(max(0.0, until - time.monotonic()))
-
-
-def motion_rollout(body: Body, motion: Motion, permit: Permit, hz: float, observers: RolloutObservers) -> Rollout:
-    """Return the rollout that plays a motion; what it grips in the end it keeps."""
-    return Rollout(
-        body,
-        motion,
-        permit=permit,
-        instruction=motion.instruction,
-        policy_name=POLICY_NAME,
-        duration=motion.duration,
-        hz=hz,
-        observers=observers,
-        ends_at_rest=True,
-    )

@@ -466,7 +466,8 @@ class ProfiledPolicy:
 
     def reset(self, instruction: str, ranges: Ranges) -> None:
         profile = self.profile
-        inner = {key: _scaled_range(ranges[key], self._scale[key]) for key in profile.action}
+        scales = {key: self._scale[key] for key in profile.action}
+        inner = {key: (ranges[key][0] * scale, ranges[key][1] * scale) for key, scale in scales.items()}
         fastest = profile.max_speed
         self._speeds = {} if fastest is None else speeds_across(ranges, fastest, UNBOUNDED_PER_S)
         self._last = {}
@@ -589,9 +590,8 @@ class ProfiledPolicy:
     def _limited(self, target: Action) -> Action:
         bounded = limited(target, self._last, self._speeds, 1 / self._hz)
         self._counts.speed_limited_steps += bounded != target
-        target = bounded
-        self._last = target
-        return target
+        self._last = bounded
+        return bounded
 
 
 def picture(camera: CameraMap, given: object) -> Any:
@@ -629,7 +629,3 @@ def _scale(robot: str | None, policy: str | None) -> float:
     if robot == policy or robot is None or policy is None or not {robot, policy} <= CONVERTIBLE:
         return 1.0
     return math.degrees(1.0) if policy == "degrees" else math.radians(1.0)
-
-
-def _scaled_range(pair: tuple[float, float], scale: float) -> tuple[float, float]:
-    return pair[0] * scale, pair[1] * scale

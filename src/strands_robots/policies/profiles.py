@@ -278,10 +278,6 @@ def _text(longest: int) -> Callable[[str, object], str]:
     return lambda name, value: text(name, value, longest=longest)
 
 
-def _seconds(name: str, value: object) -> float:
-    return duration(name, value)
-
-
 _ENTRIES: dict[str, Callable[[str, object], Any]] = {
     "provider": _provider,
     "checkpoint": _text(4096),
@@ -302,8 +298,8 @@ _ENTRIES: dict[str, Callable[[str, object], Any]] = {
     "parts": lambda name, value: {part: _order(f"{name}.{part}", keys) for part, keys in mapping(name, value).items()},
     "task": _text(2000),
     "device": _text(64),
-    "first_deadline_s": _seconds,
-    "deadline_s": _seconds,
+    "first_deadline_s": duration,
+    "deadline_s": duration,
     "max_speed": lambda name, value: number(name, value, above=0, high=10),
     "state_margin": lambda name, value: number(name, value, low=0, high=10),
     "confirmed": _confirmed,

@@ -209,7 +209,8 @@ def ros_action(
         if wanted == "info":
             return _info(link, target)
         if wanted == "echo":
-            return _echo(link, target, kind, messages, seconds)
+            found = [_jsonable(link.read(target, kind, seconds)) for _ in range(messages)]
+            return success(f"{messages} messages of {target}.", topic=target, messages=found)
         assert kind is not None
         body = mapping("fields", {} if fields is None else fields)
         hertz = number("rate", rate, low=RATE_MIN_HZ, high=RATE_MAX_HZ)
@@ -241,11 +242,6 @@ def _info(link: GraphLink, topic: str) -> Envelope:
     if row is None:
         return error(f"{wanted} is not on the graph.", topic=wanted)
     return success(f"{wanted} carries {row['type']}.", **row)
-
-
-def _echo(link: RosLink, topic: str, kind: str | None, count: int, within_s: float) -> Envelope:
-    messages = [_jsonable(link.read(topic, kind, within_s)) for _ in range(count)]
-    return success(f"{len(messages)} messages of {topic}.", topic=topic, messages=messages)
 
 
 def _publish(link: RosLink, topic: str, kind: str, fields: Message, count: int, *, rate_hz: float) -> Envelope:

@@ -28,10 +28,11 @@ from strands_robots.ros.link import (
     bare_kind,
     deliver,
     domain,
+    filled,
     is_latched,
     next_message,
+    plain,
 )
-from strands_robots.ros.messages import filled, plain
 from strands_robots.utils import ValidationError, number, optional_module
 
 logger = logging.getLogger(__name__)

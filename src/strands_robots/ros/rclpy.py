@@ -23,13 +23,14 @@ from strands_robots.ros.link import (
     absolute,
     bare_kind,
     domain,
+    filled,
     interface,
     is_latched,
     never,
     next_message,
     node_name,
+    plain,
 )
-from strands_robots.ros.messages import filled, plain
 from strands_robots.utils import number, whole
 
 logger = logging.getLogger(__name__)

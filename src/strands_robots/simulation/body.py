@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from strands_robots.kinematics import ArmParts
 from strands_robots.kinematics.arm import Arm
-from strands_robots.kinematics.arm_parts import ArmParts
 from strands_robots.kinematics.chain import Chain, Floats
 from strands_robots.kinematics.objects import SeenObject
 from strands_robots.policies.base import Observation, checked_speeds
@@ -21,7 +21,7 @@ from strands_robots.policies.task_engine import TaskEngine
 from strands_robots.safety.gate import Permit
 from strands_robots.safety.stopping import checked_level
 from strands_robots.simulation.engine import mujoco
-from strands_robots.simulation.model import Actuator, RobotParts, load_named
+from strands_robots.simulation.model import PICTURE, Actuator, RobotParts, load_named
 from strands_robots.simulation.physics import Physics, Snapshot, WorldClock
 from strands_robots.simulation.scene import ModelSource, SceneObject
 from strands_robots.utils import ValidationError, mapping, number, w_positive, yaw_of
@@ -54,9 +54,6 @@ def _extents(item: SceneObject) -> Floats:
 
 WORLD_CAMERAS = ("front", "table")
 """Cameras of the world that every robot observes with, besides its own."""
-
-PICTURE = (480, 640, 3)
-"""Shape of a picture in an observation."""
 
 Draw = Callable[[Snapshot, str], Any]
 """Draws the picture of a camera, by its full name."""

@@ -87,16 +87,10 @@ BACKEND: str = prepare()
 
 import mujoco  # noqa: E402 - MuJoCo reads MUJOCO_GL while it is imported
 
-
-def _set_context_class() -> None:
-    """Correct the context class of a MuJoCo that was imported before the choice."""
-    contexts = sys.modules.get("mujoco.rendering.classic.gl_context") or sys.modules.get("mujoco.gl_context")
-    if contexts is not None:
-        vars(contexts)["GLContext"] = importlib.import_module(f"mujoco.{BACKEND}").GLContext
-
-
-if _LATE and BACKEND in LIBRARIES:
-    _set_context_class()
+_contexts = sys.modules.get("mujoco.rendering.classic.gl_context") or sys.modules.get("mujoco.gl_context")
+if _LATE and BACKEND in LIBRARIES and _contexts is not None:
+    # The context class of a MuJoCo that was imported before the choice.
+    vars(_contexts)["GLContext"] = importlib.import_module(f"mujoco.{BACKEND}").GLContext
 
 if mujoco.get_mju_user_warning() is None:
     # By default MuJoCo writes warnings to a file in the current folder.

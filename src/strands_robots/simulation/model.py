@@ -238,6 +238,9 @@ FURNISHED = Path(__file__).with_name("world.xml")
 MAX_WIDTH, MAX_HEIGHT = 1920, 1440
 """Largest picture, in pixels: the size of the off-screen buffer."""
 
+PICTURE = (480, 640, 3)
+"""Shape of a picture in an observation."""
+
 UNBOUNDED = float("inf")
 
 SUNK_M = 0.003

@@ -67,31 +67,23 @@ def _find_file(model: str) -> ModelSource:
 
 
 def _find_description(model: str) -> ModelSource:
-    names = _description_names()
+    names = []
+    if importlib.util.find_spec("robot_descriptions") is not None:
+        names = sorted(importlib.import_module("robot_descriptions").DESCRIPTIONS)
     for candidate in (model, f"{model}_mj_description", f"{model}_description"):
         if candidate in names:
             # Importing one of these modules fetches the description unless its cache has it.
             try:
                 module = importlib.import_module(f"robot_descriptions.{candidate}")
             except Exception as exc:  # that package clones with git, whose failures have no common type
-                raise ValidationError(f"model {shown(model)} cannot be fetched: {_first_line(exc)}") from exc
+                why = " ".join(str(exc).split())[:300] or type(exc).__name__
+                raise ValidationError(f"model {shown(model)} cannot be fetched: {why}") from exc
             path = getattr(module, "MJCF_PATH", None) or getattr(module, "URDF_PATH", None)
             if isinstance(path, str):
                 return ModelSource(model, Path(path))
     similar = alike(model.lower(), [*BUILT_IN, *ALIASES, *names], most=5)
     hint = f"near it: {', '.join(similar)}" if similar else f"known: {', '.join(BUILT_IN)}"
     raise ValidationError(f"model {shown(model)} is not known; {hint}. A path to an MJCF or URDF file works too.")
-
-
-def _description_names() -> list[str]:
-    if importlib.util.find_spec("robot_descriptions") is None:
-        return []
-    return sorted(importlib.import_module("robot_descriptions").DESCRIPTIONS)
-
-
-def _first_line(exc: BaseException) -> str:
-    text = " ".join(str(exc).split())
-    return text[:300] or type(exc).__name__
 
 
 Triple = tuple[float, float, float]

@@ -11,8 +11,8 @@ from strands_robots import settings
 from strands_robots.arm_mixin import ArmMixin
 from strands_robots.contract import Observer, Unsubscribe
 from strands_robots.envelope import Envelope, error, success
+from strands_robots.kinematics import ArmParts
 from strands_robots.kinematics.arm import Arm
-from strands_robots.kinematics.arm_parts import ArmParts
 from strands_robots.kinematics.objects import SeenObject
 from strands_robots.policies.base import SPEED_MAX
 from strands_robots.policies.check import RobotFacts
@@ -25,11 +25,10 @@ from strands_robots.policies.task_engine import TaskEngine
 from strands_robots.safety.gate import MotionRequest, answered
 from strands_robots.safety.stop_targets import halted_with_verbs
 from strands_robots.safety.stopping import PendingVerdict, StopLevel, StopVerdict, halts_in_parts, read_verdict
-from strands_robots.simulation.body import PICTURE, RobotBody, StopTorque, targets_of
-from strands_robots.simulation.model import compile_scene, in_floor, sunk_sentence
+from strands_robots.simulation.body import RobotBody, StopTorque, targets_of
+from strands_robots.simulation.model import PICTURE, compile_scene, in_floor, sunk_sentence
 from strands_robots.simulation.physics import CHUNK, Physics, WorldClock
-from strands_robots.simulation.pictures import PicturesMixin
-from strands_robots.simulation.rendering import Renderer, camera_names
+from strands_robots.simulation.rendering import PicturesMixin, Renderer, camera_names
 from strands_robots.simulation.scene import Scene, SceneObject, SceneRobot
 from strands_robots.stop_log import stop_logger
 from strands_robots.teleop_mixin import TeleopMixin

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 
-from strands_robots.drivers.reachy.stop_rounds import StopRounds
+from strands_robots.drivers.reachy.rest import StopRounds
 
 
 def test_a_round_from_before_a_motion_does_not_stand_for_the_motions_stop() -> None:

@@ -16,7 +16,7 @@ from fixtures.waiting import eventually, free_port
 from strands_robots import settings
 from strands_robots.device_connect import ReachyMiniDriver
 from strands_robots.drivers.reachy import ReachyDriver, rest
-from strands_robots.drivers.reachy.stop_rounds import ROUNDS_MAX
+from strands_robots.drivers.reachy.rest import ROUNDS_MAX
 from strands_robots.hardware import HardwareRobot
 from strands_robots.safety.orders import StopOrder, new_epoch
 from strands_robots.safety.stop_executor import stop_executor

@@ -21,8 +21,7 @@ from tests.integration.ros.conftest import obeyed, x_of
 from strands_robots.drivers.ros.rtps_robot import RtpsRobot
 from strands_robots.ros.dds import DdsLink
 from strands_robots.ros.dds_types import KINDS
-from strands_robots.ros.link import RosError, bare_kind
-from strands_robots.ros.messages import filled, plain
+from strands_robots.ros.link import RosError, bare_kind, filled, plain
 from strands_robots.utils import ValidationError
 
 DOMAIN = 91

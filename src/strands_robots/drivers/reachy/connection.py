@@ -24,8 +24,13 @@ from strands_robots.drivers.reachy.links import (
     key_prefix,
     make_link,
 )
-from strands_robots.drivers.reachy.rest import DaemonError, DaemonNotFoundError, DaemonUnreachableError, RestClient
-from strands_robots.drivers.reachy.stop_rounds import prepare
+from strands_robots.drivers.reachy.rest import (
+    DaemonError,
+    DaemonNotFoundError,
+    DaemonUnreachableError,
+    RestClient,
+    prepare_stops,
+)
 from strands_robots.drivers.reachy.target import HeadPose
 from strands_robots.stop_log import stop_logger
 from strands_robots.utils import ValidationError, choice, port
@@ -245,7 +250,7 @@ class Connection:
         if self._thread is not None:
             return
         self._stopping.clear()
-        prepare()
+        prepare_stops()
         self._thread = threading.Thread(target=self._run, name="reachy-watch", daemon=True)
         self._thread.start()
 

@@ -18,8 +18,13 @@ from strands_robots.drivers.reachy.links import (
     PubSub,
 )
 from strands_robots.drivers.reachy.motion import MotionController
-from strands_robots.drivers.reachy.rest import DaemonError, DaemonFaultError, DaemonUnreachableError, RestClient
-from strands_robots.drivers.reachy.stop_rounds import StopRounds
+from strands_robots.drivers.reachy.rest import (
+    DaemonError,
+    DaemonFaultError,
+    DaemonUnreachableError,
+    RestClient,
+    StopRounds,
+)
 from strands_robots.drivers.reachy.target import (
     ACTION_KEYS,
     BOUNDS,

@@ -20,8 +20,13 @@ from strands_robots.bounded_json import SMALL_BYTES, json_object
 from strands_robots.contract import RolloutEvent
 from strands_robots.drivers.reachy.connection import RUNNING_PATH, Connection, running_moves
 from strands_robots.drivers.reachy.links import open_socket
-from strands_robots.drivers.reachy.rest import DaemonError, DaemonFaultError, DaemonUnreachableError
-from strands_robots.drivers.reachy.stop_rounds import StopRound, StopRounds
+from strands_robots.drivers.reachy.rest import (
+    DaemonError,
+    DaemonFaultError,
+    DaemonUnreachableError,
+    StopRound,
+    StopRounds,
+)
 from strands_robots.drivers.reachy.target import STREAM_HZ, Frames, Gesture, HeadPose, Target, ramp
 from strands_robots.envelope import error, success
 from strands_robots.policies.rollout import RolloutObservers

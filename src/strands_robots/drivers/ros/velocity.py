@@ -254,9 +254,6 @@ class CurrentHold:
         self._current: ZeroVelocityHold | None = None
         self._ended_for: Permit | None = None
 
-    def _start(self) -> ZeroVelocityHold:
-        return self._start_one(self._on_end)
-
     def _on_end(self, hold: ZeroVelocityHold) -> None:
         with self._lock:
             idle = self._current in (hold, None)
@@ -274,7 +271,7 @@ class CurrentHold:
         with self._lock:
             if self._current is not None:
                 self._current.cancel()
-            self._current = self._start()
+            self._current = self._start_one(self._on_end)
             return self._current
 
     def end_for(self, permit: Permit) -> None:
@@ -290,7 +287,7 @@ class CurrentHold:
         """Begin again the hold that was ended for a motion which did not begin."""
         with self._lock:
             if self._ended_for is not None and self._ended_for.valid and self._current is None:
-                self._current = self._start()
+                self._current = self._start_one(self._on_end)
 
     def close(self, within_s: float = 1.0) -> None:
         """End the hold and wait for its thread."""
