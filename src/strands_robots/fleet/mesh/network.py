@@ -111,7 +111,7 @@ T = TypeVar("T")
 
 
 class PeerRequests:
-    """Threads of the calls, stops and questions of one peer; none waits for one of another kind."""
+    """Threads of one peer's requests; none waits for one of another kind."""
 
     def __init__(self) -> None:
         self.calls = ThreadPoolExecutor(IN_FLIGHT, "mesh call")
