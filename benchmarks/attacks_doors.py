@@ -21,8 +21,7 @@ from fixtures.waiting import eventually
 from benchmarks.attacks_robots import state_folder
 from benchmarks.table import Row
 from strands_robots.device_connect.backends import LinkConfig
-from strands_robots.mesh import keys
-from strands_robots.mesh.transport import TransportError
+from strands_robots.mesh.transport import TransportError, config
 from strands_robots.mesh.transport.config import Posture
 
 STOPS, STOPS_QUICK = 100, 5
@@ -59,9 +58,9 @@ def access_row() -> Row:
         patch = stack.enter_context(pytest.MonkeyPatch.context())
         log.addHandler(lines)
         stack.callback(log.removeHandler, lines)
-        keys.init(folder / "keys")
+        config.make_authority(folder / "keys")
         path = folder / "acl.json5"
-        issued = keys.issue(folder / "keys", "arm-1").settings()
+        issued = config.issue_certificate(folder / "keys", "arm-1").settings()
         for name, value in {**issued, "STRANDS_MESH_ACL_FILE": str(path)}.items():
             patch.setenv(name, value)
         for accepted in ("false", "true"):
@@ -115,11 +114,11 @@ def stored_row(count: int) -> Row:
     moved = refused = 0
     with ExitStack() as stack:
         folder = state_folder(stack)
-        keys.init(folder)
-        keys.issue(folder, "broker")
+        config.make_authority(folder)
+        config.issue_certificate(folder, "broker")
         files = (folder / "ca.pem", folder / "broker.pem", folder / "broker.key")
         broker = stack.enter_context(MqttBroker(folder, *files))
-        retainer = stack.enter_context(Retainer(broker.port, keys.issue(folder, "retainer")))
+        retainer = stack.enter_context(Retainer(broker.port, config.issue_certificate(folder, "retainer")))
         for number in range(count):
             name = f"sim-{number}"
             retainer.store(f"strands/{name}/cmd", command(WAVE))
@@ -141,7 +140,7 @@ def stored_row(count: int) -> Row:
 
 
 def _account(folder: Path, port: int, name: str) -> dict[str, str]:
-    keys.issue(folder, name)
+    config.issue_certificate(folder, name)
     state = folder / f"state-{name}"
     state.mkdir(mode=0o700)
     return {

@@ -1,4 +1,4 @@
-"""Limits on events: a number in a window of time, or a steady rate.
+"""Limits on events: a number in a window of time, a steady rate, or once.
 
 No lock is shared between two limits.
 """
@@ -6,8 +6,9 @@ No lock is shared between two limits.
 from __future__ import annotations
 
 import math
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 
 KEYS_MAX = 256
 """Keys remembered, so that invented names take no memory."""
@@ -100,3 +101,34 @@ class RateLimiter:
     def forget(self, key: str = "") -> None:
         """Start over with ``key``."""
         self._tokens.pop(key, None)
+
+
+class RecentKeys:
+    """Recently used keys, bounded by age in seconds and by number; thread-safe.
+
+    Args:
+        displace: when it is full the oldest is forgotten; otherwise no new one is first.
+    """
+
+    def __init__(
+        self, seconds: float, most: int, clock: Callable[[], float] = time.monotonic, *, displace: bool = True
+    ) -> None:
+        self._seconds = seconds
+        self._most = most
+        self._clock = clock
+        self._displace = displace
+        self._used: dict[Hashable, float] = {}
+        self._lock = threading.Lock()
+
+    def first(self, key: Hashable) -> bool:
+        """Note the use of a key; False when it was used before."""
+        now = self._clock()
+        with self._lock:
+            while self._used and now - next(iter(self._used.values())) > self._seconds:
+                del self._used[next(iter(self._used))]
+            if key in self._used or (len(self._used) >= self._most and not self._displace):
+                return False
+            while len(self._used) >= self._most:
+                del self._used[next(iter(self._used))]
+            self._used[key] = now
+            return True

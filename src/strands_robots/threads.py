@@ -1,16 +1,20 @@
-"""Threads that stand ready, threads that sleep until woken, and event loops."""
+"""Threads that stand ready, are woken or do jobs in order, and event loops."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 import itertools
+import logging
 import math
 import queue
 import threading
+from collections import deque
 from collections.abc import Callable, Coroutine
 from concurrent.futures import Future
 from typing import Any, Generic, TypeVar
+
+logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
@@ -145,6 +149,89 @@ class WokenThread:
             self._woken.clear()
             if not self._closed:
                 self._step()
+
+
+class BoundedExecutor:
+    """One thread, and at most ``depth`` jobs that wait for it.
+
+    The thread starts with the first job, or by :meth:`prepare`. A full executor forgets its oldest job for a new one.
+    """
+
+    def __init__(self, name: str, depth: int) -> None:
+        self._name = name
+        self._jobs: deque[Callable[[], None]] = deque(maxlen=depth)
+        self._changed = threading.Condition()
+        self._thread: threading.Thread | None = None
+        self._open = True
+        self.dropped = 0
+
+    def submit(self, work: Callable[[], None]) -> None:
+        """Queue a job; a closed executor drops it."""
+        with self._changed:
+            if not self._open:
+                return
+            self.dropped += len(self._jobs) == self._jobs.maxlen
+            self._jobs.append(work)
+            self._changed.notify()
+            if self._thread is not None:
+                return
+            thread = self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
+        # Without the lock, so that the thread takes its first job before a close can drop it.
+        self._begin(thread)
+
+    def prepare(self) -> None:
+        """Start the thread now, so that the first job waits for no system call.
+
+        Where the system has none, the first job tries again.
+        """
+        with self._changed:
+            if not self._open or self._thread is not None:
+                return
+            thread = self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
+        with contextlib.suppress(RuntimeError):
+            self._begin(thread)
+
+    def close(self) -> None:
+        """Take no more jobs, drop waiting ones, and let the thread end."""
+        with self._changed:
+            self._open = False
+            self.dropped += len(self._jobs)
+            self._jobs.clear()
+            self._changed.notify()
+
+    def stop(self, timeout: float) -> list[str]:
+        """Close and wait; return the name of a thread that still runs."""
+        self.close()
+        return self.join(timeout)
+
+    def join(self, timeout: float) -> list[str]:
+        """Wait for the thread of a closed executor; its name while it still runs."""
+        thread = self._thread
+        if thread is None or thread.ident is None:
+            return []
+        if thread is not threading.current_thread():
+            thread.join(timeout)
+        return [thread.name] if thread.is_alive() else []
+
+    def _begin(self, thread: threading.Thread) -> None:
+        try:
+            thread.start()
+        except RuntimeError:
+            self._thread = None
+            raise
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                while not self._jobs:
+                    if not self._open:
+                        return
+                    self._changed.wait()
+                work = self._jobs.popleft()
+            try:
+                work()
+            except Exception:
+                logger.exception("%s: a job failed.", self._name)
 
 
 class LoopThread:

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from fixtures.access_rules import CMD, DENY, NO_COMMANDS, NOBODY, OPEN, rules
 
-from strands_robots.mesh import keys, topics
+from strands_robots.mesh import topics
 from strands_robots.mesh.transport import TransportError, config
 from strands_robots.mesh.transport.config import Posture
 
@@ -18,8 +18,8 @@ from strands_robots.mesh.transport.config import Posture
 @pytest.fixture
 def start(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
     """Make the posture of a certified peer with these rules."""
-    keys.init(tmp_path / "keys")
-    for name, value in keys.issue(tmp_path / "keys", "arm-1").settings().items():
+    config.make_authority(tmp_path / "keys")
+    for name, value in config.issue_certificate(tmp_path / "keys", "arm-1").settings().items():
         monkeypatch.setenv(name, value)
     path = tmp_path / "acl.json5"
     monkeypatch.setenv("STRANDS_MESH_ACL_FILE", str(path))
@@ -81,7 +81,7 @@ def test_rules_of_the_key_command_start_without_a_word(
     start: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, namespace: str
 ) -> None:
     monkeypatch.setenv("STRANDS_MESH_NAMESPACE", namespace)
-    start(keys.acl(["arm-1", "arm-2"], ["console"], namespace=namespace))
+    start(config.named_rules(["arm-1", "arm-2"], ["console"], namespace=namespace))
     assert [each.getMessage() for each in caplog.records if each.levelno >= logging.WARNING] == []
 
 

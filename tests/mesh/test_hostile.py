@@ -19,9 +19,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.mesh.peers import Fleet
 
-from strands_robots.mesh import keys, session, topics, wire
+from strands_robots.mesh import session, topics, wire
 from strands_robots.mesh.input import InputReceiver
 from strands_robots.mesh.security import ValidationError, validate_command, validate_input_frame
+from strands_robots.mesh.transport import config
 from strands_robots.mesh.transport.bridge import SeenCommands
 from strands_robots.mesh.wire_identity import Identity, IdentityError, Signer, Verifier
 
@@ -196,8 +197,8 @@ def seeds(peers: Fleet, signer: Signer) -> dict[str, dict[str, Any]]:
 def certified(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A fleet's authority and the certificate of arm-9."""
     folder = tmp_path_factory.mktemp("keys")
-    keys.init(folder)
-    keys.issue(folder, "arm-9")
+    config.make_authority(folder)
+    config.issue_certificate(folder, "arm-9")
     return folder
 
 

@@ -8,7 +8,7 @@ import pytest
 from fixtures.mesh_robots import Arm
 from tests.mesh.peers import Fleet
 
-from strands_robots.mesh import keys
+from strands_robots.mesh.transport import config
 from strands_robots.mesh.wire_identity import Identity, Signer, Verifier
 from strands_robots.safety.authorization import Grants
 from strands_robots.state_files import state_dir
@@ -19,9 +19,9 @@ WAVE = {"action": "start", "instruction": "wave", "policy_provider": "mock", "du
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = tmp_path_factory.mktemp("keys")
-    keys.init(made)
+    config.make_authority(made)
     for name in ("desk", "second", "arm-1"):
-        keys.issue(made, name)
+        config.issue_certificate(made, name)
     return made
 
 

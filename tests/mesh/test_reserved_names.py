@@ -14,7 +14,8 @@ from tests.mesh.peers import Fleet, received
 from strands_robots import Robot
 from strands_robots.device_connect import init_device_connect_sync
 from strands_robots.device_connect.backends import loopback_config
-from strands_robots.mesh import init_mesh, keys
+from strands_robots.mesh import init_mesh
+from strands_robots.mesh.transport import config
 from strands_robots.utils import RESERVED_DEVICE_IDS, RESERVED_IDS, own_device_id, peer_id
 
 WAVE = {"action": "start", "instruction": "wave", "policy_provider": "mock", "duration": 60}
@@ -27,11 +28,11 @@ def test_no_peer_takes_a_level_of_the_topics_on_either_network(tmp_path: Path, n
         init_mesh(ToyRobot(), name)
     with pytest.raises(ValueError, match=domain):
         Robot("so100", peer_id=name)
-    keys.init(tmp_path)
+    config.make_authority(tmp_path)
     with pytest.raises(ValueError, match=domain):
-        keys.issue(tmp_path, name)
+        config.issue_certificate(tmp_path, name)
     with pytest.raises(ValueError, match=domain):
-        keys.acl([name])
+        config.named_rules([name])
 
 
 @pytest.mark.parametrize("name", RESERVED_DEVICE_IDS)

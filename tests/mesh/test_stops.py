@@ -14,6 +14,7 @@ from tests.mesh.peers import Fleet
 from strands_robots.envelope import Envelope, success
 from strands_robots.mesh import input_receiver, rpc
 from strands_robots.mesh.input_receiver import InputReceiver
+from strands_robots.mesh.transport import MemoryTransport
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.stops import CALLER_MAX
 from strands_robots.serving.workers import shares_of
@@ -247,3 +248,12 @@ def test_a_frame_that_waits_for_the_bus_is_refused_after_a_stop(peers: Fleet, mo
     arm.let_go.set()
     asking.join(20)
     eventually(lambda: refused == [True])
+
+
+def test_thread_of_the_records_of_a_stop_stands_ready_before_the_first_one(
+    peers: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(MemoryTransport, "stops_apart", True)
+    before = [thread.name for thread in threading.enumerate()].count("mesh-stops")
+    peers.join(Arm(), "arm-1")
+    assert [thread.name for thread in threading.enumerate()].count("mesh-stops") == before + 1

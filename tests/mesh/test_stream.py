@@ -10,7 +10,7 @@ from fixtures.mesh_robots import Arm
 from fixtures.waiting import eventually
 from tests.mesh.peers import Fleet
 
-from strands_robots.mesh.stream import numbers
+from strands_robots.mesh.state import numbers
 
 
 def test_policy_steps_carry_numbers_and_are_thinned_out(peers: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,7 +16,8 @@ from fixtures.mesh_robots import Arm, World
 from fixtures.waiting import eventually
 from tests.mesh.peers import Clock, Fleet
 
-from strands_robots.mesh import keys, wire_identity
+from strands_robots.mesh import wire_identity
+from strands_robots.mesh.transport import config
 from strands_robots.mesh.transport.memory import MemoryBus, MemoryTransport
 from strands_robots.mesh.wire_identity import Identity, IdentityError, Signer, Verifier, identity_of
 
@@ -26,9 +27,9 @@ BODY = {"robot_id": "arm-1", "timestamp": 1.5, "nested": {"b": [1, "é"], "a": N
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = tmp_path_factory.mktemp("keys")
-    keys.init(made)
+    config.make_authority(made)
     for name in ("arm-1", "arm-2"):
-        keys.issue(made, name)
+        config.issue_certificate(made, name)
     return made
 
 
@@ -102,8 +103,8 @@ def test_a_signature_counts_only_near_its_time_and_its_certificates(folder: Path
 
 def signed_elsewhere(tmp_path: Path, clock: Clock) -> dict[str, Any]:
     """A message of an ``arm-1`` of another authority."""
-    keys.init(tmp_path)
-    keys.issue(tmp_path, "arm-1")
+    config.make_authority(tmp_path)
+    config.issue_certificate(tmp_path, "arm-1")
     return signer(tmp_path, "arm-1", clock).sign(BODY)
 
 
@@ -149,8 +150,8 @@ def test_unknown_policy_demands_signatures_on_every_transport_with_one_warning(
 @pytest.mark.parametrize("kind", ["rsa", "ed25519", "ecdsa"])
 def test_every_algorithm_of_the_wire_signs_and_verifies(tmp_path: Path, kind: str) -> None:
     clock = Clock()
-    keys.init(tmp_path)
-    keys.issue(tmp_path, "arm-1")
+    config.make_authority(tmp_path)
+    config.issue_certificate(tmp_path, "arm-1")
     if kind != "ecdsa":
         reissue(tmp_path, "arm-1", rsa.generate_private_key(65537, 2048) if kind == "rsa" else None)
     message = json.loads(json.dumps(signer(tmp_path, "arm-1", clock).sign(BODY)))

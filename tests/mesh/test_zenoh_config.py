@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from strands_robots.mesh import keys, topics
+from strands_robots.mesh import topics
 from strands_robots.mesh.transport import TransportError, config
 from strands_robots.mesh.transport.config import Posture
 
@@ -82,8 +82,8 @@ def use(monkeypatch: pytest.MonkeyPatch, issued: config.TlsCredentials) -> None:
 
 
 def test_certificates_bring_mutual_tls_and_access_control(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    keys.init(tmp_path)
-    use(monkeypatch, keys.issue(tmp_path, "arm-1", ["192.168.1.2", "arm.example"]))
+    config.make_authority(tmp_path)
+    use(monkeypatch, config.issue_certificate(tmp_path, "arm-1", ["192.168.1.2", "arm.example"]))
     posture = Posture.from_settings()
     assert posture.hub == "tls/127.0.0.1:7447"
     stated = config.hub(posture)
@@ -96,8 +96,8 @@ def test_certificates_bring_mutual_tls_and_access_control(monkeypatch: pytest.Mo
 def test_files_that_others_may_read_or_that_are_links_are_refused(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    keys.init(tmp_path)
-    issued = keys.issue(tmp_path, "arm-1")
+    config.make_authority(tmp_path)
+    issued = config.issue_certificate(tmp_path, "arm-1")
     use(monkeypatch, issued)
     issued.key.chmod(0o640)
     with pytest.raises(TransportError, match="chmod 600"):
@@ -114,8 +114,8 @@ def test_files_that_others_may_read_or_that_are_links_are_refused(
 
 
 def test_access_rules_that_allow_by_default_need_the_opt_in(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    keys.init(tmp_path)
-    use(monkeypatch, keys.issue(tmp_path, "arm-1"))
+    config.make_authority(tmp_path)
+    use(monkeypatch, config.issue_certificate(tmp_path, "arm-1"))
     rules = tmp_path / "acl.json5"
     monkeypatch.setenv("STRANDS_MESH_ACL_FILE", str(rules))
     rules.write_text("{enabled: true, /* hm */ default_permission: 'allow', rules: [], subjects: [], policies: []}")
@@ -132,26 +132,26 @@ def test_access_rules_that_allow_by_default_need_the_opt_in(monkeypatch: pytest.
 
 
 def test_an_authority_and_a_certificate_are_made_once(tmp_path: Path) -> None:
-    keys.init(tmp_path)
-    issued = keys.issue(tmp_path, "arm-1")
+    config.make_authority(tmp_path)
+    issued = config.issue_certificate(tmp_path, "arm-1")
     assert issued.key.stat().st_mode & 0o777 == 0o600
     with pytest.raises(FileExistsError):
-        keys.init(tmp_path)
+        config.make_authority(tmp_path)
     with pytest.raises(FileExistsError):
-        keys.issue(tmp_path, "arm-1")
+        config.issue_certificate(tmp_path, "arm-1")
     with pytest.raises(ValueError, match="peer_id"):
-        keys.issue(tmp_path, "../arm")
+        config.issue_certificate(tmp_path, "../arm")
     with pytest.raises(FileNotFoundError):
-        keys.issue(tmp_path / "nowhere", "arm-2")
+        config.issue_certificate(tmp_path / "nowhere", "arm-2")
 
 
 def test_access_rules_name_every_peer_and_nothing_else() -> None:
-    rules = json.loads(keys.acl(["arm-1"], ["console"]))
+    rules = json.loads(config.named_rules(["arm-1"], ["console"]))
     granted = {policy["subjects"][0]: policy["rules"] for policy in rules["policies"]}
     assert "command" not in granted["arm-1"]
     assert "command" in granted["console"]
     with pytest.raises(ValueError, match="at least one"):
-        keys.acl([])
+        config.named_rules([])
 
 
 def test_every_topic_has_a_size_and_only_telemetry_is_downsampled() -> None:

@@ -263,8 +263,7 @@ COMMANDS = {
     "record": ("record",),
     "policy": ("policy", "eval"),
     "audit": ("audit",),
-    "keys": ("keys", "mesh"),
-    "enroll": ("enroll",),
+    "keys": ("keys", "mesh", "enroll"),
     "doctor": ("doctor",),
     "mcp": ("mcp",),
 }

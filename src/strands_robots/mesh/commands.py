@@ -12,10 +12,10 @@ from strands_robots.contract import Haltable, Robot, holds_robots
 from strands_robots.envelope import Envelope, RefusalReason, Refused, is_error
 from strands_robots.mesh import topics, wire
 from strands_robots.mesh.estop_retry import ESTOP
-from strands_robots.mesh.scheduler import RecentKeys
 from strands_robots.mesh.session import Context
 from strands_robots.mesh.transport import Sample, TransportError
 from strands_robots.mesh.wire_identity import MOTION, IdentityError
+from strands_robots.rate_limits import RecentKeys
 from strands_robots.safety.identity import SigningIdentity
 from strands_robots.safety.statements import with_stop_statement
 from strands_robots.safety.stopping import Outcome, StopVerdict, explain, grade
@@ -83,15 +83,13 @@ class SenderCheck:
         if not self._hardware or command.verb.kind is not Kind.MOTION:
             return ()
         try:
-            names = self._proven_names(request)
-            self._require_first(request)
+            return self._proven_names(request)
         except IdentityError as why:
             text = (
                 f"{command.verb.name} moves real hardware, and its sender cannot be attributed: {why}. A console "
                 f"on another machine is enrolled at this one, besides operator approval."
             )
             raise Refused(RefusalReason.APPROVAL, text, reason=f"the sender is not attributed: {why}") from None
-        return names
 
     def _proven_names(self, request: wire.Request) -> tuple[str, ...]:
         """Return the names that the sender's proof is good for.
@@ -100,27 +98,28 @@ class SenderCheck:
         bears counts where no certificates are in use. The session on a sample is no proof: its publisher chooses it.
 
         Raises:
-            IdentityError: nothing proves the sender.
+            IdentityError: nothing proves the sender, or it is another's command, or one sent before.
         """
-        context = self._context
-        try:
-            return request.sender_id, context.identity.verify(request.body, request.sender_id).common_name
-        except IdentityError:
-            if context.identity.required:
-                raise
-        refusal = context.consoles.refusal(request.body, MOTION)
+        context, sender, identity = self._context, request.sender_id, self._context.identity
+        names: tuple[str, ...] = () if identity.checks else (sender,)
+        certified = False
+        if identity.checks or identity.required:
+            try:
+                names = (sender, identity.verify(request.body, sender).common_name)
+                certified = True
+            except IdentityError:
+                if identity.required:
+                    raise
+        refusal = None if certified else context.consoles.refusal(request.body, MOTION)
         if refusal is not None:
             raise IdentityError(refusal)
-        return () if context.identity.checks else (request.sender_id,)
-
-    def _require_first(self, request: wire.Request) -> None:
-        """Raise :class:`IdentityError` for another's command, or one sent before."""
-        if request.body.get("target_id") not in (self._context.peer_id, wire.BROADCAST_TARGET):
+        if request.body.get("target_id") not in (context.peer_id, wire.BROADCAST_TARGET):
             raise IdentityError("it was signed for another peer")
-        if request.timestamp is None or self._context.predates(request.timestamp):
+        if request.timestamp is None or context.predates(request.timestamp):
             raise IdentityError("it was issued before this peer started, by its sender's clock; send it again")
-        if not self._proven.first((request.sender_id, request.turn_id)):
+        if not self._proven.first((sender, request.turn_id)):
             raise IdentityError("it was carried out before, or too many signed commands came in a minute")
+        return names
 
 
 def stop_target(robot: Robot | None, name: str = "") -> Haltable | None:
@@ -198,8 +197,10 @@ class CommandReceiver:
         if request.command == PING:
             self._reply(request.sender_id, request.turn_id, result=pong(context))
             return
-        verb = self._verb_of(request)
+        action = request.command.get("action") if isinstance(request.command, dict) else None
+        verb = self._verbs.get(action) if isinstance(action, str) else None
         if verb is None:
+            self._refuse_unknown(request, action)
             return
         if verb.kind is Kind.STOP:
             self._lock_first(request, sample)
@@ -233,20 +234,12 @@ class CommandReceiver:
             name = self._context.peer_id
             logger.warning("%s: %s of %s on %s is refused: %s.", name, shown(action), request.sender_id, key, RETAINED)
 
-    def _verb_of(self, request: wire.Request) -> Verb | None:
+    def _refuse_unknown(self, request: wire.Request, action: object) -> None:
         if not isinstance(request.command, dict):
             self._refuse(request, "", MISSING_COMMAND)
-            return None
-        action = request.command.get("action")
-        verb = self._verbs.get(action) if isinstance(action, str) else None
-        if verb is None:
-            known = ", ".join(self._verbs)
-            self._refuse(
-                request,
-                action if isinstance(action, str) else "",
-                f"validation: action must be one of {known}, not {shown(action)}.",
-            )
-        return verb
+            return
+        why = f"validation: action must be one of {', '.join(self._verbs)}, not {shown(action)}."
+        self._refuse(request, action if isinstance(action, str) else "", why)
 
     def _answer(self, request: wire.Request, verb: Verb, answer: Result) -> None:
         refusal, audit = answer.refusal, self._context.audit

@@ -22,14 +22,20 @@ from strands_robots.mesh.presence import DESCRIBE_S, PresencePublisher
 from strands_robots.mesh.rpc import Requester
 from strands_robots.mesh.safety import FleetSafety, OnAnswers, status_of
 from strands_robots.mesh.safety_adapter import SafetyAdapter
-from strands_robots.mesh.scheduler import AuditSink, AuditThrottle, BoundedExecutor, Scheduler
+from strands_robots.mesh.scheduler import AuditSink, AuditThrottle, Scheduler
 from strands_robots.mesh.security import validate_peer_id
 from strands_robots.mesh.sensors import CameraPublisher, SensorLoopsMixin, SensorPublisher
 from strands_robots.mesh.session import Context, Pacer, PeerRegistry
-from strands_robots.mesh.state import IDLE_HZ, STATE_RATES, Description, StateRate, StateReader
+from strands_robots.mesh.state import IDLE_HZ, STATE_RATES, Description, StateRate, StateReader, StepPublisher
 from strands_robots.mesh.stop_link import Hearing
-from strands_robots.mesh.stream import DataCallback, SampleCallback, StepPublisher, Subscriptions
-from strands_robots.mesh.transport import Declaration, Sample, Transport
+from strands_robots.mesh.transport import (
+    DataCallback,
+    Declaration,
+    Sample,
+    SampleCallback,
+    Subscriptions,
+    Transport,
+)
 from strands_robots.mesh.wire_identity import ConsoleSigner, ConsoleTrust, Identity, identity_of
 from strands_robots.recording.cameras import frames_of
 from strands_robots.safety.gate import MotionGate
@@ -41,6 +47,7 @@ from strands_robots.serving.peer_verbs import description_of
 from strands_robots.serving.pipeline import Own, Pipeline
 from strands_robots.serving.robot_verbs import served
 from strands_robots.tags import tags_of
+from strands_robots.threads import BoundedExecutor
 from strands_robots.utils import DURATION_MAX_S, number, text
 
 logger = logging.getLogger(__name__)

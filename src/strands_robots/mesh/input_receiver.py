@@ -15,7 +15,6 @@ from strands_robots.bus_access import read_joints
 from strands_robots.contract import Haltable, for_request
 from strands_robots.envelope import Envelope, error, is_error, success
 from strands_robots.mesh import topics, wire
-from strands_robots.mesh.scheduler import BoundedExecutor
 from strands_robots.mesh.security import INPUT_VALUE_ABS, validate_input_frame, validate_mesh_identifier
 from strands_robots.mesh.session import Context
 from strands_robots.mesh.transport import Sample
@@ -26,6 +25,7 @@ from strands_robots.safety.stop_executor import stop_executor
 from strands_robots.serving.verbs import Arguments
 from strands_robots.serving.workers import UNBOUNDED
 from strands_robots.stop_log import stop_logger
+from strands_robots.threads import BoundedExecutor
 from strands_robots.utils import ValidationError
 
 logger = stop_logger(__name__)

@@ -21,10 +21,10 @@ from strands_robots.mesh import session, topics, wire
 from strands_robots.mesh.estop_retry import KNOWN_S, Closings, EstopRetry, LatePeers, ScopedStop
 from strands_robots.mesh.rpc import Requester, stop_outcome
 from strands_robots.mesh.safety_adapter import SafetyAdapter
-from strands_robots.mesh.scheduler import RecentKeys
 from strands_robots.mesh.session import SAFETY, SAFETY_S, Context
 from strands_robots.mesh.stop_link import COMMANDED, PeerStops
 from strands_robots.mesh.transport import Sample, TransportError
+from strands_robots.rate_limits import RecentKeys
 from strands_robots.safety import ed25519
 from strands_robots.safety.checkin import CheckInAnswers, HeadWitness
 from strands_robots.safety.gate import MotionRequest

@@ -1,4 +1,4 @@
-"""Periodic jobs of a process's peers, threads, and bounds on repetition.
+"""Periodic jobs of a process's peers, and bounds on what they record and log.
 
 One timer thread runs the quick jobs of all peers: a heartbeat waits for no motor bus. What may block, such as a read
 of hardware, runs on workers. One is enough while nothing blocks; where work waits another one relieves it, and ends
@@ -13,7 +13,7 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from itertools import count
 from typing import Any
@@ -106,37 +106,6 @@ class TroubleLog:
         if kind and kind != self._kinds.get(subject):
             self._logger.log(level, message, *args)
         self._kinds[subject] = kind
-
-
-class RecentKeys:
-    """Recently used keys, bounded by age in seconds and by number; thread-safe.
-
-    Args:
-        displace: when it is full the oldest is forgotten; otherwise no new one is first.
-    """
-
-    def __init__(
-        self, seconds: float, most: int, clock: Callable[[], float] = time.monotonic, *, displace: bool = True
-    ) -> None:
-        self._seconds = seconds
-        self._most = most
-        self._clock = clock
-        self._displace = displace
-        self._used: dict[Hashable, float] = {}
-        self._lock = threading.Lock()
-
-    def first(self, key: Hashable) -> bool:
-        """Note the use of a key; False when it was used before."""
-        now = self._clock()
-        with self._lock:
-            while self._used and now - next(iter(self._used.values())) > self._seconds:
-                del self._used[next(iter(self._used))]
-            if key in self._used or (len(self._used) >= self._most and not self._displace):
-                return False
-            while len(self._used) >= self._most:
-                del self._used[next(iter(self._used))]
-            self._used[key] = now
-            return True
 
 
 logger = logging.getLogger(__name__)
@@ -442,70 +411,3 @@ def repeat(name: str, hz: float, run: Callable[[], None]) -> Callable[[], None]:
         scheduler.stop(0.0)
 
     return end
-
-
-Work = Callable[[], None]
-
-
-class BoundedExecutor:
-    """One thread, and at most ``depth`` jobs that wait for it.
-
-    The thread starts with the first job. A full executor forgets its oldest job for a new one.
-    """
-
-    def __init__(self, name: str, depth: int) -> None:
-        self._name = name
-        self._jobs: deque[Work] = deque(maxlen=depth)
-        self._changed = threading.Condition()
-        self._thread: threading.Thread | None = None
-        self._open = True
-        self.dropped = 0
-
-    def submit(self, work: Work) -> None:
-        """Queue a job; a closed executor drops it."""
-        with self._changed:
-            if not self._open:
-                return
-            self.dropped += len(self._jobs) == self._jobs.maxlen
-            self._jobs.append(work)
-            self._changed.notify()
-            if self._thread is not None:
-                return
-            thread = self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
-        # Without the lock, so that the thread takes its first job before a close can drop it.
-        thread.start()
-
-    def close(self) -> None:
-        """Take no more jobs, drop waiting ones, and let the thread end."""
-        with self._changed:
-            self._open = False
-            self.dropped += len(self._jobs)
-            self._jobs.clear()
-            self._changed.notify()
-
-    def stop(self, timeout: float) -> list[str]:
-        """Close and wait; return the name of a thread that still runs."""
-        self.close()
-        return self.join(timeout)
-
-    def join(self, timeout: float) -> list[str]:
-        """Wait for the thread of a closed executor; its name while it still runs."""
-        thread = self._thread
-        if thread is None or thread.ident is None:
-            return []
-        if thread is not threading.current_thread():
-            thread.join(timeout)
-        return [thread.name] if thread.is_alive() else []
-
-    def _run(self) -> None:
-        while True:
-            with self._changed:
-                while not self._jobs:
-                    if not self._open:
-                        return
-                    self._changed.wait()
-                work = self._jobs.popleft()
-            try:
-                work()
-            except Exception:
-                logger.exception("%s: a job failed.", self._name)

@@ -19,9 +19,10 @@ from typing import Any, ClassVar, Protocol
 from strands_robots.envelope import Envelope, error
 from strands_robots.mesh import session, topics, wire
 from strands_robots.mesh.safety_adapter import SafetyAdapter
-from strands_robots.mesh.scheduler import BoundedExecutor, RecentKeys, repeat
+from strands_robots.mesh.scheduler import repeat
 from strands_robots.mesh.session import Context
 from strands_robots.mesh.transport import Declaration, Sample, Transport, TransportError, undeclare
+from strands_robots.rate_limits import RecentKeys
 from strands_robots.safety.estop_listener import EstopListener, ListenerRegistration, estop_listener
 from strands_robots.safety.lockout import is_epoch
 from strands_robots.safety.missed_stops import ANSWER_MAX_BYTES
@@ -39,6 +40,7 @@ from strands_robots.safety.reporting import StopRun
 from strands_robots.safety.scope import EVERY_ROBOT, SCOPE
 from strands_robots.safety.statements import Purpose
 from strands_robots.safety.stop_link import ANSWER, ESTOP, QUESTION, OnEvent, OnState, StopCodec, StopEvent
+from strands_robots.threads import BoundedExecutor
 
 logger = logging.getLogger(__name__)
 
@@ -280,6 +282,9 @@ class PeerStops:
         if before is not None:
             undeclare([before])
         if peer.adapter.moves:
+            if transport.stops_apart:
+                # The thread that takes stops must start none of its own.
+                stops._notes.prepare()
             try:
                 stops.connect(peer)
             except TransportError:

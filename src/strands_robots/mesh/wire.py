@@ -61,7 +61,7 @@ def decode(data: bytes, limit: int) -> dict[str, Any]:
     if len(data) > limit:
         raise TooLargeError(f"a message of {len(data)} bytes is above the topic's {limit}.")
     try:
-        value = parsed(data, limit, _parse)
+        value = parsed(data, limit, lambda data: _DECODER.decode(data.decode()))
     except OutOfBoundsError as exc:
         raise WireError(f"cannot be read: {exc}") from None
     except ValueError as exc:
@@ -106,10 +106,6 @@ def _scrubbed(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_scrubbed(entry) for entry in value]
     return value
-
-
-def _parse(data: bytes) -> Any:
-    return _DECODER.decode(data.decode())
 
 
 # Made once: a coder with options is otherwise made anew for every message.

@@ -29,8 +29,8 @@ from strands_robots import settings
 from strands_robots.certificates import cryptography
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.mesh import wire
-from strands_robots.mesh.scheduler import RecentKeys
 from strands_robots.mesh.transport.config import Posture, TlsCredentials
+from strands_robots.rate_limits import RecentKeys
 from strands_robots.safety import ed25519
 from strands_robots.safety.identity import (
     PUBLIC_KEYS,

@@ -21,8 +21,9 @@ pytest.importorskip("mcp.server.mcpserver", reason="needs the extra mcp", exc_ty
 
 import httpx2
 
+from strands_robots.certificates import CA_CERT
 from strands_robots.mcp import connections, http
-from strands_robots.mesh.keys import CA_CERT, init, issue
+from strands_robots.mesh.transport.config import issue_certificate, make_authority
 from strands_robots.serving.control_leases import leases_of
 
 BOTH = pytest.mark.parametrize("mode", ["legacy", "2026-07-28"])
@@ -193,8 +194,8 @@ def holder(site: McpSite) -> str | None:
 
 
 async def test_half_done_handshakes_of_tls_delay_no_stop(site: McpSite, tokens: dict[str, str], tmp_path: Path) -> None:
-    init(tmp_path)
-    files = issue(tmp_path, "server", ["127.0.0.1"])
+    make_authority(tmp_path)
+    files = issue_certificate(tmp_path, "server", ["127.0.0.1"])
     with site.http("--http-cert", str(files.cert), "--http-key", str(files.key), scheme="https") as url:
         resource.prlimit(site.server.pid, resource.RLIMIT_NOFILE, (DESCRIPTORS, DESCRIPTORS))
         trust = ssl.create_default_context(cafile=str(tmp_path / CA_CERT))

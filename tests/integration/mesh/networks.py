@@ -16,7 +16,6 @@ from fixtures.mqtt_broker import PROGRAM, MqttBroker
 from fixtures.waiting import eventually, free_port
 from tests.mesh.peers import Fleet, RealClock
 
-from strands_robots.mesh import keys
 from strands_robots.mesh.transport import Transport, config
 from strands_robots.mesh.transport.config import Posture
 from strands_robots.mesh.transport.iot import Account, IotMqttTransport
@@ -143,14 +142,14 @@ class OverTls(OverZenoh):
 
     def __init__(self, folder: Path, settings: dict[str, str]) -> None:
         super().__init__(folder, settings)
-        keys.init(folder / "keys")
+        config.make_authority(folder / "keys")
 
     def _join(self, peer_id: str, robot: str) -> Peer:
-        issued = keys.issue(self.folder / "keys", peer_id)
+        issued = config.issue_certificate(self.folder / "keys", peer_id)
         return self._start(peer_id, robot, {"STRANDS_MESH_PORT": str(self.port), **issued.settings()})
 
     def _stranger(self, name: str) -> Transport:
-        own = keys.issue(self.folder / "keys", name)
+        own = config.issue_certificate(self.folder / "keys", name)
         return ZenohTransport(
             Posture(
                 "strands", (f"tls/127.0.0.1:{self.port}",), (), None, own, config.certified_peers("strands/"), False, 16
@@ -169,8 +168,8 @@ class OverMqtt(Network):
             reason = "mosquitto is not installed (Debian package mosquitto)"
             (pytest.fail if os.environ.get("CI") else pytest.skip)(reason)
         self._keys = folder / "keys"
-        keys.init(self._keys)
-        own = keys.issue(self._keys, "broker")
+        config.make_authority(self._keys)
+        own = config.issue_certificate(self._keys, "broker")
         self._broker = self.stack.enter_context(MqttBroker(folder, own.ca, own.cert, own.key))
 
     def _join(self, peer_id: str, robot: str) -> Peer:
@@ -178,7 +177,7 @@ class OverMqtt(Network):
 
     def _account(self, peer_id: str) -> dict[str, str]:
         return {
-            **keys.issue(self._keys, peer_id).settings(),
+            **config.issue_certificate(self._keys, peer_id).settings(),
             "STRANDS_MESH_REQUIRE_SIGNED_IDENTITY": "1",
             "STRANDS_MESH_BACKEND": "iot",
             "STRANDS_IOT_ENDPOINT": f"localhost:{self._broker.port}",
@@ -188,7 +187,7 @@ class OverMqtt(Network):
         }
 
     def _stranger(self, name: str) -> Transport:
-        own = keys.issue(self._keys, name)
+        own = config.issue_certificate(self._keys, name)
         return IotMqttTransport(Account("localhost", self._broker.port, name, own.cert, own.key, own.ca))
 
 
@@ -205,7 +204,7 @@ class OverBoth(OverMqtt):
         return {**super()._account(peer_id), "STRANDS_MESH_BACKEND": "bridge"}
 
     def _stranger(self, name: str) -> Transport:
-        own = keys.issue(self._keys, name)
+        own = config.issue_certificate(self._keys, name)
         return ZenohTransport(
             Posture(
                 "strands", (f"tls/127.0.0.1:{self.port}",), (), None, own, config.certified_peers("strands/"), False, 16

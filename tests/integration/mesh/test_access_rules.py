@@ -17,7 +17,6 @@ from fixtures.zenoh_router import ZenohRouter
 from tests.integration.mesh.conftest import Join
 
 from strands_robots.device_connect.backends import LinkConfig
-from strands_robots.mesh import keys
 from strands_robots.mesh.transport import config
 
 CMD = "strands/strands/*/cmd"
@@ -25,7 +24,7 @@ CMD = "strands/strands/*/cmd"
 
 def with_open_rule(folder: Path, subject: dict[str, Any], key: str) -> Path:
     """Rules by which only the console commands, and ``subject`` by one rule more."""
-    rules = json.loads(keys.acl(["sim-1", "sim-2"], ["console"]))
+    rules = json.loads(config.named_rules(["sim-1", "sim-2"], ["console"]))
     rules["rules"].append(
         {"id": "open", "permission": "allow", "messages": ["put"], "flows": ["ingress"], "key_exprs": [key]}
     )
@@ -39,8 +38,8 @@ def with_open_rule(folder: Path, subject: dict[str, Any], key: str) -> Path:
 @pytest.fixture
 def fleet(tmp_path: Path) -> dict[str, dict[str, str]]:
     folder = tmp_path / "keys"
-    keys.init(folder)
-    return {name: keys.issue(folder, name).settings() for name in ("console", "sim-1", "sim-2")}
+    config.make_authority(folder)
+    return {name: config.issue_certificate(folder, name).settings() for name in ("console", "sim-1", "sim-2")}
 
 
 OPEN = [({}, CMD), ({}, "**/cmd"), ({}, "**"), ({"interfaces": ["lo"]}, CMD)]

@@ -19,7 +19,7 @@ from fixtures.waiting import accepts, eventually, eventually_async, free_port, u
 from tests.integration.mesh.conftest import Join
 
 from strands_robots.device_connect.backends import loopback_config, open_client
-from strands_robots.mesh import keys
+from strands_robots.mesh.transport import config
 
 
 async def answered(caller: Caller, value: str) -> None:
@@ -98,8 +98,8 @@ async def test_one_process_serves_its_robot_on_both(join: Join, port: int, serve
 def test_a_mesh_with_certificates_needs_another_port_and_says_so(
     join: Join, port: int, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    keys.init(tmp_path / "keys")
-    certified = keys.issue(tmp_path / "keys", "sim-1").settings()
+    config.make_authority(tmp_path / "keys")
+    certified = config.issue_certificate(tmp_path / "keys", "sim-1").settings()
     with EchoDevice("dev-1", loopback_config(port)):
         assert join("sim-1", **certified).ask("alive") is False
         assert "set STRANDS_MESH_PORT" in capfd.readouterr().err

@@ -12,7 +12,7 @@ from fixtures.mesh_peer import MeshPeer
 from fixtures.network_lab import NetworkLab, Side, Weather, missing
 from fixtures.waiting import eventually
 
-from strands_robots.mesh import keys
+from strands_robots.mesh.transport import config
 
 pytestmark = pytest.mark.system
 
@@ -32,7 +32,7 @@ class Site:
 
     def __init__(self, lab: NetworkLab, folder: Path, stack: ExitStack) -> None:
         self._folder, self._stack = folder, stack
-        keys.init(folder / "keys")
+        config.make_authority(folder / "keys")
         here = f"tls/{lab.here.address}:{PORT}"
         self.arm = self._join("arm-1", "arm", lab.here, ZENOH_LISTEN=here)
         self.sim = self._join("sim-1", "world", lab.here, ZENOH_CONNECT=here)
@@ -42,7 +42,7 @@ class Site:
         self.sim.sees("console", "arm-1")
 
     def _join(self, peer_id: str, robot: str, side: Side, **settings: str) -> MeshPeer:
-        issued = keys.issue(self._folder / "keys", peer_id, (side.address,))
+        issued = config.issue_certificate(self._folder / "keys", peer_id, (side.address,))
         state = self._folder / peer_id
         state.mkdir(mode=0o700)
         approved = {"STRANDS_ROBOT_COMMAND_ALLOW": "start@arm-1,teleop_receive@arm-1"}

@@ -20,7 +20,7 @@ from fixtures.mesh_peer import MeshPeer
 from fixtures.waiting import eventually
 from tests.integration.mesh.networks import Network, OverZenoh, network
 
-from strands_robots.mesh import keys, topics
+from strands_robots.mesh import topics
 
 WAVE = {"action": "start", "instruction": "wave", "policy_provider": "mock", "duration": 60}
 APPROVED = "start@arm-1,teleop_receive@arm-1"
@@ -35,7 +35,7 @@ class Attacker:
         config: dict[str, Any] = {"mode": "client", "namespace": "strands"}
         config["connect"] = {"endpoints": [f"tcp/127.0.0.1:{net.port}"]}
         if net.kind == "zenoh-tls":
-            own = keys.issue(net.folder / "keys", f"mallory-{uuid.uuid4().hex[:6]}")
+            own = config.issue_certificate(net.folder / "keys", f"mallory-{uuid.uuid4().hex[:6]}")
             config["connect"] = {"endpoints": [f"tls/127.0.0.1:{net.port}"]}
             tls = {
                 "root_ca_certificate": str(own.ca),

@@ -13,9 +13,8 @@ from fixtures.mqtt_broker import PROGRAM, MqttBroker
 from fixtures.mqtt_retainer import Retainer, command
 from fixtures.waiting import eventually, free_port
 
-from strands_robots.mesh import keys
 from strands_robots.mesh.resume_authority import keygen
-from strands_robots.mesh.transport import TransportError
+from strands_robots.mesh.transport import TransportError, config
 from strands_robots.mesh.transport.iot import Account, IotMqttTransport, filter_of
 from strands_robots.mesh.wire_identity import MOTION, ConsoleSigner
 
@@ -39,8 +38,8 @@ def folder(tmp_path: Path) -> Path:
         reason = "mosquitto is not installed (Debian package mosquitto)"
         (pytest.fail if os.environ.get("CI") else pytest.skip)(reason)
     made = tmp_path / "keys"
-    keys.init(made)
-    keys.issue(made, "broker")
+    config.make_authority(made)
+    config.issue_certificate(made, "broker")
     return made
 
 
@@ -56,7 +55,7 @@ def join(broker: MqttBroker, folder: Path, tmp_path: Path) -> Iterator[Join]:
 
         def start(peer_id: str, robot: str = "world", **settings: str) -> MeshPeer:
             if not (folder / f"{peer_id}.pem").exists():
-                keys.issue(folder, peer_id)
+                config.issue_certificate(folder, peer_id)
             state = tmp_path / peer_id
             state.mkdir(mode=0o700, exist_ok=True)
             account = {
@@ -103,7 +102,7 @@ def test_real_hardware_cannot_be_moved_by_a_sender_that_no_session_proves(join: 
 def test_a_signed_command_moves_approved_hardware_over_mqtt(join: Join, folder: Path) -> None:
     def signed(peer_id: str) -> dict[str, str]:
         demanded = {"STRANDS_MESH_REQUIRE_SIGNED_IDENTITY": "1", "BYPASS_TOOL_CONSENT": "true"}
-        return {**keys.issue(folder, peer_id).settings(), **demanded}
+        return {**config.issue_certificate(folder, peer_id).settings(), **demanded}
 
     arm = join("arm-1", "arm", **signed("arm-1"))
     console = join("console", "none", **signed("console"))
@@ -142,7 +141,7 @@ def test_resumed_stop_locks_no_newcomer_and_leaves_the_broker(
     first, console = join("sim-1", **trusted), join("console", "none", **trusted)
     console.sees("sim-1")
     console.ask("estop")
-    own = keys.issue(folder, "reader")
+    own = config.issue_certificate(folder, "reader")
     reader = IotMqttTransport(Account("localhost", broker.port, "reader", own.cert, own.key, own.ca))
     reader.connect()
     stored: list[bytes] = []
@@ -159,7 +158,7 @@ def test_resumed_stop_locks_no_newcomer_and_leaves_the_broker(
 
 @pytest.fixture
 def retainer(broker: MqttBroker, folder: Path) -> Iterator[Retainer]:
-    with Retainer(broker.port, keys.issue(folder, "retainer")) as client:
+    with Retainer(broker.port, config.issue_certificate(folder, "retainer")) as client:
         yield client
 
 
@@ -255,8 +254,8 @@ def test_a_certificate_of_another_authority_gets_no_connection(
     broker: MqttBroker, tmp_path: Path, folder: Path
 ) -> None:
     foreign = tmp_path / "foreign"
-    keys.init(foreign)
-    issued = keys.issue(foreign, "sim-1")
+    config.make_authority(foreign)
+    issued = config.issue_certificate(foreign, "sim-1")
     transport = IotMqttTransport(Account("localhost", broker.port, "sim-1", issued.cert, issued.key, folder / "ca.pem"))
     with pytest.raises(TransportError, match="no MQTT connection"):
         transport.connect()

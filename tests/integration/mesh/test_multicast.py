@@ -13,7 +13,7 @@ import pytest
 from fixtures.mesh_peer import MeshPeer
 from fixtures.network_lab import NetworkLab, Side, missing
 
-from strands_robots.mesh import keys
+from strands_robots.mesh.transport import config
 
 pytestmark = pytest.mark.system
 
@@ -29,7 +29,7 @@ with connect() as fleet:
 def lab(tmp_path: Path) -> Iterator[NetworkLab]:
     if why := missing():
         (pytest.fail if os.environ.get("CI") else pytest.skip)(why)
-    keys.init(tmp_path / "keys")
+    config.make_authority(tmp_path / "keys")
     with NetworkLab() as lab:
         for side in (lab.here, lab.there):
             route = ["ip", "-n", side.namespace, "route", "add", "default", "dev", side.device]
@@ -38,7 +38,7 @@ def lab(tmp_path: Path) -> Iterator[NetworkLab]:
 
 
 def settings_of(peer_id: str, side: Side, folder: Path) -> dict[str, str]:
-    issued = keys.issue(folder / "keys", peer_id, (side.address,))
+    issued = config.issue_certificate(folder / "keys", peer_id, (side.address,))
     state = folder / peer_id
     state.mkdir(mode=0o700)
     return {"STRANDS_STATE_DIR": str(state), "STRANDS_MESH_MULTICAST": "true", **issued.settings()}

@@ -11,7 +11,7 @@ from fixtures.mesh_peer import MeshPeer
 from fixtures.waiting import eventually, free_port
 from tests.integration.mesh.conftest import Join
 
-from strands_robots.mesh import keys
+from strands_robots.mesh.transport import config
 
 Fleet = dict[str, dict[str, str]]
 
@@ -20,11 +20,14 @@ Fleet = dict[str, dict[str, str]]
 def fleet(tmp_path: Path) -> Fleet:
     """Certificates and access rules by which only the console commands."""
     folder = tmp_path / "keys"
-    keys.init(folder)
+    config.make_authority(folder)
     names = ("console", "sim-1", "sim-2")
     rules = folder / "acl.json5"
-    rules.write_text(keys.acl(["sim-1", "sim-2"], ["console"]))
-    return {name: {**keys.issue(folder, name).settings(), "STRANDS_MESH_ACL_FILE": str(rules)} for name in names}
+    rules.write_text(config.named_rules(["sim-1", "sim-2"], ["console"]))
+    return {
+        name: {**config.issue_certificate(folder, name).settings(), "STRANDS_MESH_ACL_FILE": str(rules)}
+        for name in names
+    }
 
 
 def test_certified_peers_see_and_command_each_other_with_signed_messages(join: Join, fleet: Fleet) -> None:
@@ -64,8 +67,8 @@ def test_peer_of_another_fleet_gets_no_link(join: Join, fleet: Fleet, tmp_path: 
     other: dict[str, str] = {"ZENOH_CONNECT": f"tcp/127.0.0.1:{port}"}
     if outsider == "another authority":
         foreign = tmp_path / "foreign"
-        keys.init(foreign)
-        other = {**keys.issue(foreign, "sim-1").settings(), "ZENOH_CONNECT": f"tls/127.0.0.1:{port}"}
+        config.make_authority(foreign)
+        other = {**config.issue_certificate(foreign, "sim-1").settings(), "ZENOH_CONNECT": f"tls/127.0.0.1:{port}"}
     stranger = join("sim-1", "world", **other)
     with pytest.raises(AssertionError):
         console.sees("sim-1", within=1.5)

@@ -14,7 +14,7 @@ from fixtures.forked import COMMANDS, start
 from fixtures.leaders import write_csv
 from fixtures.waiting import free_port
 
-from strands_robots.mesh import keys
+from strands_robots.mesh.transport import config
 
 pytest.importorskip("cryptography")
 
@@ -22,14 +22,14 @@ pytest.importorskip("cryptography")
 @pytest.fixture
 def side(tmp_path: Path) -> Callable[..., Mapping[str, str]]:
     """The settings of one side, with its own certificate and the rules of both."""
-    keys.init(tmp_path / "keys")
+    config.make_authority(tmp_path / "keys")
 
     def made(peer: str, relay: str, **more: str) -> Mapping[str, str]:
         rules = tmp_path / "rules.json5"
-        rules.write_text(keys.acl(["arm-1"], ["console"], [relay]), encoding="utf-8")
+        rules.write_text(config.named_rules(["arm-1"], ["console"], [relay]), encoding="utf-8")
         state = tmp_path / peer
         state.mkdir(mode=0o700)
-        issued = keys.issue(tmp_path / "keys", peer, ["127.0.0.1"]).settings()
+        issued = config.issue_certificate(tmp_path / "keys", peer, ["127.0.0.1"]).settings()
         own = {"STRANDS_STATE_DIR": str(state), "STRANDS_MESH_ACL_FILE": str(rules)}
         return {**os.environ, **own, **{name: str(value) for name, value in issued.items()}, **more}
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from fixtures.call_path import documented
 
 ROOT = Path(__file__).parents[3]
-MESH_FUNCTIONS_MAX = 125
+MESH_FUNCTIONS_MAX = 120
 
 
 def test_execute_takes_the_documented_way_of_at_most_ten_hops_and_ninety_functions() -> None:

@@ -1,22 +1,31 @@
-"""Transports of the mesh: their protocol, and the backends, loaded when named.
+"""Transports of the mesh: protocol, backends and a user's subscriptions.
 
-``zenoh`` is the default, ``iot`` is MQTT 5, ``bridge`` is both at once, ``memory`` stays inside one process.
+A backend is loaded when it is named: ``zenoh`` is the default, ``iot`` is MQTT 5, ``bridge`` is both at once,
+``memory`` stays inside one process.
 """
 
 from __future__ import annotations
 
 import contextlib
 import importlib
+import logging
+import threading
 from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 from strands_robots.errors import StrandsRobotsError
+from strands_robots.mesh import topics, wire
+from strands_robots.threads import BoundedExecutor
+
+logger = logging.getLogger(__name__)
 
 __all__ = [
     "BridgeTransport",
     "Callback",
+    "DataCallback",
     "Declaration",
     "IotMqttTransport",
     "LivenessCallback",
@@ -24,6 +33,8 @@ __all__ = [
     "MemoryTransport",
     "NoToken",
     "Sample",
+    "SampleCallback",
+    "Subscriptions",
     "Transport",
     "TransportError",
     "ZenohTransport",
@@ -101,11 +112,13 @@ class Transport(ABC):
         confirms: :meth:`put_confirmed` reports whether a topic has subscribers.
         pins_topics: the broker's policy lets a peer publish on topics of its own name alone.
         dials_only: it connects to a hub of others and never becomes one.
+        stops_apart: :meth:`open_stops` opens a connection of their own.
     """
 
     confirms = False
     pins_topics = False
     dials_only = False
+    stops_apart = False
 
     def take_part(self) -> None:
         """Let a robot of this process be found: from now on this may become the hub."""
@@ -206,3 +219,92 @@ class Transport(ABC):
     def lost_link_at(self) -> float | None:
         """Return the time of the last loss of the hub, monotonic s, or None."""
         return None
+
+
+DataCallback = Callable[[str, dict[str, Any]], None]
+SampleCallback = Callable[[str, dict[str, Any], str | None], None]
+
+INBOX_MAX = 256
+
+
+class Subscriptions:
+    """Named subscriptions of a peer's user; callbacks run one after another on one thread.
+
+    A slow callback loses the oldest messages; it never delays a command or a stop.
+    """
+
+    def __init__(self, executor: BoundedExecutor) -> None:
+        self._executor = executor
+        self._lock = threading.Lock()
+        self._declared: dict[str, Declaration] = {}
+        self.inbox: dict[str, deque[dict[str, Any]]] = {}
+
+    def add(
+        self,
+        transport: Transport,
+        topic: str,
+        name: str,
+        *,
+        callback: DataCallback | None = None,
+        on_sample: SampleCallback | None = None,
+        direct: Callable[[Sample], None] | None = None,
+    ) -> bool:
+        """Subscribe under ``name``, replacing it; False when the transport refused.
+
+        Args:
+            direct: called with the raw sample on the transport's thread instead, for parts of the mesh.
+        """
+        try:
+            declared = transport.declare_subscriber(topic, direct or self._deliverer(callback, name, on_sample))
+        except TransportError as exc:
+            logger.warning("subscribe %s: %s", topic, exc)
+            return False
+        refused = transport.refusals().get(topic)
+        if refused is not None:
+            logger.warning("subscribe %s: %s", topic, refused)
+            undeclare([declared])
+            return False
+        self.remove(name)
+        with self._lock:
+            self._declared[name] = declared
+            if callback is None and on_sample is None and direct is None:
+                self.inbox.setdefault(name, deque(maxlen=INBOX_MAX))
+        return True
+
+    def remove(self, name: str) -> bool:
+        """Undeclare; False when there is none of that name."""
+        with self._lock:
+            declared = self._declared.pop(name, None)
+            self.inbox.pop(name, None)
+        if declared is None:
+            return False
+        undeclare([declared])
+        return True
+
+    def clear(self) -> int:
+        """Undeclare all of them; how many there were."""
+        names = list(self._declared)
+        return sum(self.remove(name) for name in names)
+
+    def _deliverer(
+        self, callback: DataCallback | None, name: str, on_sample: SampleCallback | None
+    ) -> Callable[[Sample], None]:
+        def deliver(sample: Sample) -> None:
+            try:
+                data = wire.decode(sample.payload, topics.topic_of(sample.key).max_bytes)
+            except wire.WireError as exc:
+                logger.debug("%s: %s", sample.key, exc)
+                return
+            if on_sample is not None:
+                on_sample(sample.key, data, sample.session)
+            elif callback is not None:
+                callback(sample.key, data)
+            else:
+                inbox = self.inbox.get(name)
+                if inbox is not None:
+                    inbox.append({"key": sample.key, **data})
+
+        def submit(sample: Sample) -> None:
+            self._executor.submit(lambda: deliver(sample))
+
+        return submit

@@ -13,7 +13,6 @@ from typing import Any
 
 from strands_robots import settings
 from strands_robots.mesh import topics, wire
-from strands_robots.mesh.scheduler import RecentKeys
 from strands_robots.mesh.transport import (
     Callback,
     Declaration,
@@ -24,6 +23,7 @@ from strands_robots.mesh.transport import (
     TransportError,
 )
 from strands_robots.mesh.transport.factory import make_transport
+from strands_robots.rate_limits import RecentKeys
 
 logger = logging.getLogger(__name__)
 
@@ -122,6 +122,7 @@ class BridgeTransport(Transport):
     """
 
     pins_topics = True
+    stops_apart = True
 
     def __init__(self, local: Transport | None = None, cloud: Transport | None = None) -> None:
         self._local = local or make_transport("zenoh")

@@ -1,4 +1,4 @@
-"""Configuration of a Zenoh session: endpoints, TLS, access rules, rates, sizes.
+"""Configuration of a Zenoh session: endpoints, certificates, access rules, rates.
 
 A mesh bound to loopback alone comes up without certificates. Leaving loopback needs mutual TLS, or an opt-in
 that says in its name what it is.
@@ -17,15 +17,17 @@ from __future__ import annotations
 import json
 import logging
 import stat
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
 
-from strands_robots import settings
+from strands_robots import certificates, settings
+from strands_robots.certificates import AUTHORITY_DAYS, CA_CERT, ISSUED_DAYS
 from strands_robots.mesh import topics
 from strands_robots.mesh.transport import TransportError
+from strands_robots.utils import ValidationError, peer_id
 from strands_robots.zenoh_session import LEASE_MS, transport_config, use_tls
 
 ACL_FILE = "STRANDS_MESH_ACL_FILE"
@@ -67,6 +69,48 @@ def certified_peers(prefix: str) -> dict[str, Any]:
     """Return the rules used without a file: every topic for certified peers."""
     rule = allow("mesh", MESSAGES, ["ingress", "egress"], [f"{prefix}{topics.ROOT}/**"])
     return deny_by_default([rule], [{"id": "certified"}], [{"rules": ["mesh"], "subjects": ["certified"]}])
+
+
+def named_rules(
+    robots: Sequence[str],
+    operators: Sequence[str] = (),
+    relays: Sequence[str] | None = None,
+    namespace: str = "strands",
+) -> str:
+    """Return Zenoh access rules (JSON5) that deny by default.
+
+    Every certified peer receives everything, may stop the fleet and may relay a resume, which only the operator's
+    key can have signed. A relay is a peer through which others are connected (the hub); what it forwards arrives
+    under its own certificate, so others accept everything from it, and the signatures on the messages say whose
+    they are. The relays are the operators where None.
+
+    Raises:
+        ValueError: no robot and no operator, or a name that is no peer id.
+    """
+    through = operators if relays is None else relays
+    certified = [peer_id("peer_id", each) for each in dict.fromkeys((*robots, *operators, *through))]
+    if not certified:
+        raise ValidationError("robots or operators must name at least one peer.")
+    prefix = f"{namespace}/{topics.ROOT}" if namespace else topics.ROOT
+    receiving = [message for message in MESSAGES if message not in ("put", "delete")]
+    rules: list[dict[str, Any]] = [
+        allow("hear", receiving, ["ingress", "egress"], [f"{prefix}/**"]),
+        allow("be-told", ["put", "delete"], ["egress"], [f"{prefix}/**"]),
+        allow("safety", ["put"], ["ingress"], [f"{prefix}/safety/*"]),
+        allow("relay", ["put", "delete"], ["ingress"], [f"{prefix}/**"]),
+        allow("command", ["put"], ["ingress"], [f"{prefix}/*/cmd", f"{prefix}/broadcast"]),
+    ]
+    subjects, policies = [], []
+    for peer in certified:
+        # A certificate speaks for its name, and for what its owner calls NAME__something.
+        names = (peer, f"{peer}__$*")
+        own = [key for name in names for key in (f"{prefix}/{name}/**", f"{prefix}/*/response/{name}/**")]
+        rules.append(allow(f"own-{peer}", ["put", "delete", "liveliness_token"], ["ingress"], own))
+        subjects.append({"id": peer, "cert_common_names": [peer]})
+        granted = ["hear", "be-told", "safety", f"own-{peer}"]
+        granted += [rule for rule, peers in (("command", operators), ("relay", through)) if peer in peers]
+        policies.append({"rules": granted, "subjects": [peer]})
+    return json.dumps(deny_by_default(rules, subjects, policies), indent=2) + "\n"
 
 
 def read_rules(path: Path) -> dict[str, Any]:
@@ -240,6 +284,19 @@ class TlsCredentials:
             "STRANDS_MESH_TLS_CERT": str(self.cert),
             "STRANDS_MESH_TLS_KEY": str(self.key),
         }
+
+
+def make_authority(folder: Path, name: str = "strands-robots mesh", days: int = AUTHORITY_DAYS) -> Path:
+    """Make the authority of a fleet; raises as :func:`strands_robots.certificates.init`."""
+    return certificates.init(folder, name, days)
+
+
+def issue_certificate(folder: Path, peer: str, hosts: Sequence[str] = (), days: int = ISSUED_DAYS) -> TlsCredentials:
+    """Make a peer's certificate, whose common name is the peer's id.
+
+    Raises as :func:`strands_robots.certificates.issue`.
+    """
+    return TlsCredentials(folder / CA_CERT, *certificates.issue(folder, peer_id("peer_id", peer), hosts, days))
 
 
 @dataclass(frozen=True, slots=True)

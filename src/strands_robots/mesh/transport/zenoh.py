@@ -43,6 +43,8 @@ class ZenohTransport(Transport):
         posture: endpoints and certificates; the environment's by default.
     """
 
+    stops_apart = True
+
     def __init__(self, posture: Posture | None = None) -> None:
         self._posture = posture
         self._id, self._stops_id = (secrets.token_hex(16).lstrip("0") or "1" for _ in range(2))
