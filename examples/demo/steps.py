@@ -16,7 +16,7 @@ from typing import Any
 
 from strands_robots import settings
 from strands_robots.audit import verify_audit_integrity
-from strands_robots.cli.output import CliError, first_line, label, plain, table
+from strands_robots.cli.output import CliError, label, plain, table
 from strands_robots.cli.watch import joints_table
 from strands_robots.fleet.reports import joint_limits
 from strands_robots.policies.base import plain_numbers
@@ -139,7 +139,7 @@ class DriveSteps:
                 raise CliError(f"{self._peer} was found, but without {', '.join(missing)}.")
             row["functions"] = sorted(functions)
         self._screen.done(f"Found {self._peer} ({device.get('device_type', '')}) at {self._agent.endpoint}")
-        rows = [(name, first_line(functions[name].get("description"))) for name in NEEDED]
+        rows = [(name, str(functions[name].get("description") or "").strip().partition("\n")[0]) for name in NEEDED]
         rows.append((f"and {len(functions) - len(NEEDED)} more", ""))
         self._screen.panel(table("What the agent can call", ("function", "description"), rows))
 

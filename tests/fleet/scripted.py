@@ -24,7 +24,7 @@ from strands_robots.fleet.adapter import (
     RobotEvent,
     StopRequest,
 )
-from strands_robots.fleet.refusals import answered
+from strands_robots.fleet.reports import answered
 from strands_robots.fleet.verdicts import measured, roster_verdict, unanswered
 from strands_robots.safety import network_key
 from strands_robots.safety.identity import SigningIdentity

@@ -7,7 +7,7 @@ import pytest
 from strands_robots import errors
 from strands_robots.envelope import RefusalReason
 from strands_robots.errors import RefusalError, StrandsRobotsError
-from strands_robots.fleet.refusals import BY_REASON, refusal_of_text, said
+from strands_robots.fleet.reports import BY_REASON, refusal_of_text, said
 from strands_robots.mesh import commands
 from strands_robots.safety.authorization import Approval
 

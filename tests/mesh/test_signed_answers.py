@@ -11,8 +11,7 @@ from fixtures.waiting import eventually
 from tests.mesh.peers import Fleet, received
 
 from strands_robots.cli.stop import exit_code, style_of
-from strands_robots.fleet.mesh.lockouts import ask_peers
-from strands_robots.fleet.mesh.stops import MeshController
+from strands_robots.fleet.mesh.stops import MeshController, ask_peers
 from strands_robots.mesh import topics
 from strands_robots.mesh.safety_adapter import SafetyAdapter
 from strands_robots.safety.identity import ROBOTS, EnrolledKeys, KeyFile, robot_identity

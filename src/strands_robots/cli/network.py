@@ -264,7 +264,7 @@ def answering(there: Networks, robot: str, verb: str) -> Iterator[None]:
         CliError: no such robot or no answer (exit code 3), the call was refused as such, or two robots have the id
             (exit code 1), or its arguments were refused (exit code 2).
     """
-    from strands_robots.fleet.refusals import near_verbs, said  # noqa: PLC0415 - only a call needs it
+    from strands_robots.fleet.reports import near_verbs, said  # noqa: PLC0415 - only a call needs it
 
     try:
         yield

@@ -129,11 +129,6 @@ def _length(encoded: re.Match[str]) -> str:
     return f"<{len(text)} characters, shown by --json>"
 
 
-def first_line(description: object) -> str:
-    """Return the first line of a function's description."""
-    return str(description or "").strip().partition("\n")[0]
-
-
 class Screen:
     """Output of one command: for people, or one JSON value a line for programs.
 

@@ -167,15 +167,12 @@ def _warn(screen: Screen, unheard: Unheard) -> None:
         screen.say(plain(str(unheard), 6000), "bold red")
 
 
-def _scope(lockout: Lockout) -> str:
-    return "" if lockout.scope.everything else f" for {lockout.scope}"
-
-
 def _lockout_rows(name: str, lockouts: Iterable[Lockout]) -> list[tuple[str, str]]:
     """Return two cells for each lockout: time, source and reason; and its epoch."""
     cells: list[tuple[str, str]] = []
     for each in lockouts:
-        why = f"{_scope(each)}{f': {each.reason}' if each.reason else ''}"
+        scope = "" if each.scope.everything else f" for {each.scope}"
+        why = f"{scope}{f': {each.reason}' if each.reason else ''}"
         cells += [("" if cells else name, f"since {utc(each.at)} by {each.source}{why}"), ("", f"epoch {each.epoch}")]
     return cells
 

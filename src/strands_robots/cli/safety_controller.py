@@ -183,8 +183,26 @@ class ConsoleScreen:
         watched, button = self._console.watched[network], self._console.buttons.latest.get(network)
         answers = button.progress.answered if button is not None and button.progress is not None else {}
         chosen = (name, network) == self._chosen
-        seen_at, silent = watched.seen_at(last), name in watched.unanswered
-        return _row(name, last, seen_at, silent, answers.get(name), chosen=chosen)
+        now, lockouts, trip_ms = time.monotonic(), last.lockouts, last.round_trip_ms
+        age, report_age = now - watched.seen_at(last), now - last.at
+        locked = f"LOCKED x{len(lockouts)}" if len(lockouts) > 1 else "LOCKED"
+        old = f", {report_age:.0f} s ago" if report_age > BEAT_FRESH_S else ""
+        seen = f"GONE, {age:.0f} s"
+        if age < GONE_S:
+            silent = name in watched.unanswered and old
+            seen = f"beats, NO ANSWER for {report_age:.0f} s" if silent else f"{age:.0f} s ago"
+        cell = last.facts.get("cell")
+        place = f", {cell}" if isinstance(cell, str) and cell else "" if isinstance(cell, str) else ", stops always"
+        scope = f" for {lockouts[0].scope}" if lockouts and not lockouts[0].scope.everything else ""
+        return (
+            label(f"{'> ' if chosen else ''}{name}{place}", "reverse" if chosen else ""),
+            label(locked + old, "bold red") if lockouts else label("free" + old),
+            f"{utc(lockouts[0].at)} {lockouts[0].source}{scope} {lockouts[0].reason}" if lockouts else "",
+            _stop_cell(answers.get(name)),
+            label(f"{trip_ms:.1f} ms", "red" if trip_ms > SLOW_MS else ""),
+            label(seen, "" if seen.endswith("ago") else "bold red"),
+            _check_in_cell(last.facts.get("check_in")),
+        )
 
 
 def _link_state(links: Mapping[str, bool]) -> str:
@@ -192,30 +210,6 @@ def _link_state(links: Mapping[str, bool]) -> str:
     if len(states) < 2:
         return next(iter(states.values()), "DOWN")
     return ", ".join(f"{state} on {name}" for name, state in states.items())
-
-
-def _row(
-    name: str, last: LockoutReport, seen_at: float, unanswered: bool, answer: Answer | None, *, chosen: bool = False
-) -> tuple[Any, ...]:
-    now, lockouts, trip_ms = time.monotonic(), last.lockouts, last.round_trip_ms
-    age, report_age = now - seen_at, now - last.at
-    locked = f"LOCKED x{len(lockouts)}" if len(lockouts) > 1 else "LOCKED"
-    old = f", {report_age:.0f} s ago" if report_age > BEAT_FRESH_S else ""
-    seen = f"GONE, {age:.0f} s"
-    if age < GONE_S:
-        seen = f"beats, NO ANSWER for {report_age:.0f} s" if unanswered and old else f"{age:.0f} s ago"
-    cell = last.facts.get("cell")
-    place = f", {cell}" if isinstance(cell, str) and cell else "" if isinstance(cell, str) else ", stops always"
-    scope = f" for {lockouts[0].scope}" if lockouts and not lockouts[0].scope.everything else ""
-    return (
-        label(f"{'> ' if chosen else ''}{name}{place}", "reverse" if chosen else ""),
-        label(locked + old, "bold red") if lockouts else label("free" + old),
-        f"{utc(lockouts[0].at)} {lockouts[0].source}{scope} {lockouts[0].reason}" if lockouts else "",
-        _stop_cell(answer),
-        label(f"{trip_ms:.1f} ms", "red" if trip_ms > SLOW_MS else ""),
-        label(seen, "" if seen.endswith("ago") else "bold red"),
-        _check_in_cell(last.facts.get("check_in")),
-    )
 
 
 def _stop_cell(answer: Answer | None) -> Text | str:

@@ -238,7 +238,7 @@ def stop(
         else:
             verdict = stop_all(networks, seconds)
             _say_ignored(screen, unread, unfit)
-            _report(screen, networks, verdict, _plain_facts)
+            _report(screen, networks, verdict)
 
 
 def estop(
@@ -300,7 +300,7 @@ def estop(
         verdict = _watched(screen, networks, pressed, latest) if screen.live else pressed()
         _say_ignored(screen, cut, unread, unfit)
         try:
-            _report(screen, networks, verdict, _estop_facts, drawn=screen.live)
+            _report(screen, networks, verdict, drawn=screen.live)
         finally:
             # A robot that did not stop is locked all the same.
             locked = {each.network for each in verdict.networks if _locked(each)}
@@ -395,21 +395,13 @@ def _rows(shown: Sequence[NetworkVerdict]) -> dict[str, list[tuple[Any, ...]]]:
     return {each.network: outcome_rows(each.outcome) for each in shown if each.outcome is not None}
 
 
-def _report(
-    screen: Screen,
-    networks: Networks,
-    verdict: FleetVerdict,
-    facts: Callable[[Networks, NetworkVerdict], Mapping[str, Any]],
-    *,
-    drawn: bool = False,
-) -> None:
+def _report(screen: Screen, networks: Networks, verdict: FleetVerdict, *, drawn: bool = False) -> None:
     """Print a stop of all; raise unless every robot that must answer stands still.
 
     Args:
         screen: where.
         networks: of the stop.
         verdict: of the stop.
-        facts: returns what programs read of the first network; robots of others stand under the network's name.
         drawn: the table is on the screen already.
     """
     shown = _shown(verdict)
@@ -432,7 +424,8 @@ def _report(
             failed.append((code, _why(networks, each, each.outcome)))
     everywhere = (*verdict.networks, *verdict.unreached)
     first = next((each for each in everywhere if each.network == networks.stated[0].name), everywhere[0])
-    known = {**facts(networks, first)}
+    # Programs read these of the first network; robots of others stand under the network's name.
+    known = (_estop_facts if estop else _plain_facts)(networks, first)
     for each in verdict.reporting:
         if each is not first:
             known[each.network] = {name: every.stopped for name, every in each.verdicts().items()}
@@ -499,8 +492,10 @@ def _report_one(screen: Screen, networks: Networks, device: str, robot: str, ans
     said = {each.name: _explained(each, device, answers[each.name]) for each in networks.stated if each.name in answers}
     verdict = combined_verdict({f"{robot} on {name}" if len(said) > 1 else robot: each for name, each in said.items()})
     stopped, texts = verdict["stopped"], verdict["robots"]
-    marks = dict.fromkeys(verdict["not_stopped"], False) | dict.fromkeys(verdict["silent"])
-    _show_answers(screen, {name: (marks.get(name, True), text) for name, text in texts.items()})
+    marks = dict.fromkeys(verdict["not_stopped"], label("DID NOT STOP", "bold red"))
+    marks |= dict.fromkeys(verdict["silent"], label("NO ANSWER", "bold red"))
+    rows = ((name, marks.get(name) or label("stopped", "green"), text) for name, text in texts.items())
+    screen.show(table("", ("robot", "answer", "what it said"), rows))
     known = {
         "devices": {robot: {"stopped": stopped, "said": "; ".join(texts.values())}},
         **_facts(verdict),
@@ -529,7 +524,7 @@ def _explained(there: NetworkAdapter, device: str, answer: Envelope) -> Envelope
     return error(f"{said.rstrip('.')}: {why}", stopped=None) if why and why not in said else answer
 
 
-def _estop_facts(networks: Networks, each: NetworkVerdict) -> Mapping[str, Any]:
+def _estop_facts(networks: Networks, each: NetworkVerdict) -> dict[str, Any]:
     if each.outcome is None:
         return {}
     there = _usable(networks, each.network)
@@ -542,7 +537,7 @@ def _usable(networks: Networks, name: str) -> NetworkAdapter | None:
     return next((each for each in there if each.name == name), None)
 
 
-def _plain_facts(networks: Networks, each: NetworkVerdict) -> Mapping[str, Any]:
+def _plain_facts(networks: Networks, each: NetworkVerdict) -> dict[str, Any]:
     del networks
     if each.outcome is None:
         return {}
@@ -550,16 +545,6 @@ def _plain_facts(networks: Networks, each: NetworkVerdict) -> Mapping[str, Any]:
     missing = {name: (None, each.outcome.reasons.get(name, "no answer")) for name in each.outcome.report.silent}
     devices = {name: {"stopped": stopped, "said": said} for name, (stopped, said) in {**graded, **missing}.items()}
     return {"devices": devices, **_facts(roster_verdict(each.outcome)), **each.outcome.facts()}
-
-
-def _show_answers(screen: Screen, answers: Mapping[str, tuple[bool | None, str]]) -> None:
-    marks = {
-        True: label("stopped", "green"),
-        False: label("DID NOT STOP", "bold red"),
-        None: label("NO ANSWER", "bold red"),
-    }
-    rows = ((name, marks[stopped], said) for name, (stopped, said) in answers.items())
-    screen.show(table("", ("robot", "answer", "what it said"), rows))
 
 
 def _facts(answer: Envelope) -> dict[str, Any]:

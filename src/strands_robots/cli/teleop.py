@@ -26,7 +26,6 @@ from strands_robots.teleoperators import FULL_RANGES_PER_S, LeaderPolicy
 from strands_robots.utils import ValidationError, identifier, number
 
 if TYPE_CHECKING:
-    from strands_robots.hardware import LeaderArm
     from strands_robots.hardware.lerobot_device import JointReach
 
 MESH_PREFIX = "mesh:"
@@ -385,7 +384,11 @@ def _check_stopped(verdict: StopVerdict) -> None:
 
 @contextmanager
 def _connected_leader(leader: str, robot: Any, options: dict[str, Any]) -> Iterator[Any]:
-    """Yield the leader of that name, ready to lead ``robot``."""
+    """Yield the leader of that name, ready to lead ``robot``.
+
+    Raises:
+        ConnectionError: a leader arm cannot be connected.
+    """
     if leader in _MANUAL:
         from strands_robots.teleoperators import GamepadLeader, KeyboardLeader  # noqa: PLC0415 - as above
 
@@ -403,18 +406,12 @@ def _connected_leader(leader: str, robot: Any, options: dict[str, Any]) -> Itera
     from strands_robots.hardware import LeaderArm  # noqa: PLC0415 - real arms only
     from strands_robots.hardware.lerobot_device import make_device  # noqa: PLC0415
 
-    with _connected_arm(leader, LeaderArm(make_device(kind, {**options, "port": port}, "leader"))) as arm:
-        yield arm
-
-
-@contextmanager
-def _connected_arm(name: str, arm: LeaderArm) -> Iterator[LeaderArm]:
-    """Yield the connected leader arm; raise ``ConnectionError`` where it fails."""
     with ExitStack() as stack:
+        arm = LeaderArm(make_device(kind, {**options, "port": port}, "leader"))
         try:
             stack.enter_context(arm)
         except Exception as exc:
-            raise ConnectionError(f"{name} could not be connected: {' '.join(str(exc).split())}") from exc
+            raise ConnectionError(f"{leader} could not be connected: {' '.join(str(exc).split())}") from exc
         yield arm
 
 

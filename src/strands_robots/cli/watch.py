@@ -7,7 +7,7 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from typing import TYPE_CHECKING, Annotated, Any, TypeGuard
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Group, RenderableType
@@ -19,8 +19,8 @@ from strands_robots.cli.network import Network, answering
 from strands_robots.cli.output import LATE_S, CliError, Exit, Screen, label, plain
 from strands_robots.envelope import is_error
 from strands_robots.errors import NoSuchRobotError, RefusalError
-from strands_robots.fleet.adapter import Detail
-from strands_robots.fleet.reports import Range, joint_limits
+from strands_robots.fleet.adapter import MISSED_BEATS, Detail
+from strands_robots.fleet.reports import Range, is_finite, joint_limits
 from strands_robots.utils import number
 
 if TYPE_CHECKING:
@@ -31,9 +31,6 @@ READ_S = 3.0
 
 REDRAW_S = 0.07
 """Seconds between two redraws."""
-
-MISSED_BEATS = 3
-"""Beats that are missing in a row when a device counts as silent."""
 
 FIRST_SIGN_S = 6.0
 """Seconds in which any live device has sent a first heartbeat."""
@@ -253,17 +250,13 @@ def joints_table(joints: Mapping[str, object], limits: Mapping[str, Range]) -> T
     grid.add_column(width=NAME_WIDTH, no_wrap=True, overflow="ellipsis")
     grid.add_column(no_wrap=True)
     grid.add_column(justify="right", no_wrap=True)
-    drawn = {str(name): float(value) for name, value in joints.items() if _finite(value)}
+    drawn = {str(name): float(value) for name, value in joints.items() if is_finite(value)}
     for name, value in list(drawn.items())[:JOINTS_MAX]:
         around = limits.get(name) or (min(FULL_TURN[0], value), max(FULL_TURN[1], value))
         grid.add_row(label(name), joint_bar(value, around), Text(f"{value:+.3f}"))
     if len(drawn) > JOINTS_MAX:
         grid.add_row(Text(f"and {len(drawn) - JOINTS_MAX} more", style="bright_black"), "", "")
     return grid
-
-
-def _finite(value: object) -> TypeGuard[int | float]:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def _present_state(there: NetworkAdapter, device: str, limits: Mapping[str, Range]) -> DeviceView:

@@ -27,8 +27,7 @@ from strands_robots.fleet.adapter import (
     StopSender,
 )
 from strands_robots.fleet.networks import Networks
-from strands_robots.fleet.refusals import answered
-from strands_robots.fleet.reports import joint_limits, joint_units, task_of
+from strands_robots.fleet.reports import answered, joint_limits, joint_units, task_of
 from strands_robots.fleet.safety_console import StandingController, StopButtons
 from strands_robots.fleet.stops import not_left
 from strands_robots.fleet.verdicts import NetworkVerdict

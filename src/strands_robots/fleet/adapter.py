@@ -51,15 +51,6 @@ Resumed = tuple[bool, str]
 """Whether a robot is free now, and what it said."""
 
 
-def before_resume(robot: LockoutReport) -> Resumed:
-    """Return the outcome of a resume where none can be sent to a robot."""
-    if robot.problem:
-        return False, robot.problem
-    if not robot.lockouts:
-        return True, "was not locked"
-    return False, TOO_MANY
-
-
 logger = logging.getLogger(__name__)
 
 DEVICE_CONNECT, MESH = "device_connect", "mesh"

@@ -283,7 +283,15 @@ class Networks:
         Raises:
             UnreachableError: no network answers.
         """
-        return _by_id(self.on_each(lambda each: each.find(timeout, peers=peers), "robots cannot be looked for"))
+        found: dict[str, tuple[FoundRobot, NetworkAdapter]] = {}
+        # The first network is the last to write, so its robots win an id.
+        for network, robots in reversed(
+            self.on_each(lambda each: each.find(timeout, peers=peers), "robots cannot be looked for")
+        ):
+            # Locked on one of two networks is locked.
+            locked = {each.id for each in robots if each.id in found and found[each.id][0].locked}
+            found |= {each.id: (replace(each, locked=True) if each.id in locked else each, network) for each in robots}
+        return found
 
     def bearers(self, robot: str) -> list[NetworkAdapter]:
         """Return the networks on which a robot of this id is known; asks no one."""
@@ -405,7 +413,7 @@ class Networks:
                 robot, verb, lambda network: network.call_async(robot, verb, arguments, within), moves=moves
             )
 
-        from strands_robots.fleet.refusals import answered  # noqa: PLC0415 - a stop need not load it
+        from strands_robots.fleet.reports import answered  # noqa: PLC0415 - a stop need not load it
 
         return await answered(called())
 
@@ -626,16 +634,6 @@ class Networks:
                 del self._shared_ids[next(iter(self._shared_ids))]
             shared_id = self._shared_ids.setdefault(robot, SharedId())
         return decided(shared_id, robot, verb, bearers, absent)
-
-
-def _by_id(listed: Sequence[tuple[NetworkAdapter, list[FoundRobot]]]) -> dict[str, tuple[FoundRobot, NetworkAdapter]]:
-    found: dict[str, tuple[FoundRobot, NetworkAdapter]] = {}
-    # The first network is the last to write, so its robots win an id.
-    for network, robots in reversed(listed):
-        # Locked on one of two networks is locked.
-        locked = {each.id for each in robots if each.id in found and found[each.id][0].locked}
-        found |= {each.id: (replace(each, locked=True) if each.id in locked else each, network) for each in robots}
-    return found
 
 
 def _meant(arguments: Mapping[str, Any]) -> tuple[str, str]:

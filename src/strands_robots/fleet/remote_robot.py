@@ -29,8 +29,7 @@ from strands_robots.errors import (
 )
 from strands_robots.fleet.adapter import STOP_S, FoundRobot, NetworkAdapter
 from strands_robots.fleet.networks import STILL, Networks
-from strands_robots.fleet.refusals import refusal_of
-from strands_robots.fleet.reports import EventFeed
+from strands_robots.fleet.reports import EventFeed, refusal_of
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.advertised import (
     PYTHON_TYPES,

@@ -186,7 +186,8 @@ def _on_each(networks: Networks, stop: Callable[[NetworkAdapter], NetworkVerdict
         (not_left(name, key, networks.absent.get(name, "it is not joined")), False)
         for name, key in networks.keys.items()
     ]
-    return _for_all(stops)
+    outcomes = for_all([each.outcome for each, _ in stops])
+    return [(replace(each, outcome=told), left) for (each, left), told in zip(stops, outcomes, strict=True)]
 
 
 def _told_once(verdicts: Sequence[Stopped], named: Collection[str]) -> list[Stopped]:
@@ -198,11 +199,6 @@ def _told_once(verdicts: Sequence[Stopped], named: Collection[str]) -> list[Stop
         for at in {*silent} - {*known}:
             dropped[at].add(name)
     return [(each.without(names), left) for (each, left), names in zip(verdicts, dropped, strict=True)]
-
-
-def _for_all(stops: Sequence[Stopped]) -> list[Stopped]:
-    outcomes = for_all([each.outcome for each, _ in stops])
-    return [(replace(each, outcome=told), left) for (each, left), told in zip(stops, outcomes, strict=True)]
 
 
 def for_all(outcomes: Sequence[StopOutcome | None]) -> list[StopOutcome | None]:

@@ -58,8 +58,6 @@ def load_model(path: Path, label: str) -> Any:
     Raises:
         ValidationError: no such model, one that MuJoCo refuses, or one beyond a bound, which the message names.
     """
-    import mujoco  # noqa: PLC0415 - slow to load, and a simulation chooses its renderer before
-
     try:
         check_model(path)
         return mujoco.MjSpec.from_file(str(path))

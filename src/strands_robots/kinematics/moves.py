@@ -244,7 +244,7 @@ def place(start: Start, position: Floats, approach: float | None, held: Held, on
     for degrees in wanted:
         way = _lowering(planner, centre, degrees, held)
         # The jaws open beside what stands around the place.
-        if way is None or any(opened.meets_object(joints) for joints in way):
+        if way is None or any(opened.meets(joints, objects=True) for joints in way):
             continue
         try:
             legs = carrying.path(way[-1])
@@ -354,14 +354,12 @@ def _heights(planner: Planner, target: SeenObject) -> Iterator[float]:
 def _lowering(planner: Planner, centre: Floats, degrees: float, held: Held) -> Floats | None:
     """Return the joint path straight up from where the held object is at ``centre``."""
     tip = centre.copy()
-    joints: Floats | None = None
     for _ in range(4):
         found = planner.find(tip, degrees)
         if found is None:
             return None
-        joints = found.joints
         # The object stays where it is between the jaws, so the tip's place depends on how the jaws are turned.
-        tip = centre - planner.chain.forward(joints).rotation @ held.offset
+        tip = centre - planner.chain.forward(found.joints).rotation @ held.offset
     found = planner.find(tip, degrees)
     return None if found is None else _upwards(planner, found.joints, tip)
 

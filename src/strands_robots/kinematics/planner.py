@@ -73,10 +73,10 @@ def solve(
     return None
 
 
-def nearest(chain: Chain, goal: TipGoal, start: Floats, *, starts: int = STARTS) -> Solution:
+def nearest(chain: Chain, goal: TipGoal, start: Floats) -> Solution:
     """Return joints whose tip is nearest to ``goal``, its approach kept."""
     solver = _Solver(chain, goal)
-    found = [solver.descend(joints) for joints in _starts(chain, start, starts)]
+    found = [solver.descend(joints) for joints in _starts(chain, start, STARTS)]
     return min(found, key=lambda each: (each.direction_error > DIRECTION_TOLERANCE_RAD, each.position_error))
 
 
@@ -368,16 +368,15 @@ class Planner:
             wanted[by_name[name]] = value
         return wanted
 
-    def reach(self, position: Floats, approach_deg: float | None = None, near: Floats | None = None) -> Reached:
+    def reach(self, position: Floats, approach_deg: float | None = None) -> Reached:
         """Return joints whose tip is at ``position``.
 
         Args:
             position: metres in the base frame.
             approach_deg: degrees below the horizontal; None for the steepest reachable.
-            near: joints to stay near to; the present ones by default.
         """
         self.chain.require_arm()
-        start = self.start if near is None else near
+        start = self.start
         if approach_deg is not None:
             direction = self.direction(position, approach_deg)
             found = solve(self.chain, TipGoal(position, direction), start, accept=self.free)
@@ -399,18 +398,11 @@ class Planner:
         """True for joints that bring no new contact."""
         return not new_contact(self._check.at(joints), self._touching)
 
-    def meets_object(self, joints: Floats) -> bool:
-        """True for joints that bring a new contact with an object."""
-        objects = self._check.objects
-        contacts = {pair: depth for pair, depth in self._check.at(joints).items() if objects & set(pair)}
-        return bool(new_contact(contacts, self._touching))
-
-    def _free_of_itself(self, joints: Floats) -> bool:
-        """Return True for joints whose only new contacts are with objects."""
-        contacts = {
-            pair: depth for pair, depth in self._check.at(joints).items() if not self._check.objects & set(pair)
-        }
-        return not new_contact(contacts, self._touching)
+    def meets(self, joints: Floats, *, objects: bool) -> bool:
+        """True for joints that bring a new contact with an object, or of the arm alone."""
+        known, contacts = self._check.objects, self._check.at(joints)
+        chosen = {pair: depth for pair, depth in contacts.items() if bool(known & set(pair)) is objects}
+        return bool(new_contact(chosen, self._touching))
 
     def direction(self, position: Floats, degrees: float) -> Floats:
         """Return the approach away from the shoulder, ``degrees`` below level."""
@@ -424,12 +416,12 @@ class Planner:
         found = solve(self.chain, goal, self.start, starts=6, accept=self.free)
         return None if found is None else Reached(found.joints, approach_deg)
 
-    def path(self, goal: Floats, start: Floats | None = None) -> list[Floats]:
+    def path(self, goal: Floats) -> list[Floats]:
         """Return joint paths to ``goal``, one after another, without contact.
 
         One path where that is free, else up, across and down again, else around by a search.
         """
-        begin = self.start if start is None else start
+        begin = self.start
         direct = np.array([begin, goal])
         problem = self._check.along(direct, self._touching)
         if not problem:
@@ -504,7 +496,9 @@ class Planner:
         return None if found is None else found.joints
 
     def _unreachable(self, goal: TipGoal, start: Floats, approach_deg: float | None) -> ValidationError:
-        best = solve(self.chain, goal, start, accept=self._free_of_itself) if self._check.objects else None
+        best = None
+        if self._check.objects:
+            best = solve(self.chain, goal, start, accept=lambda joints: not self.meets(joints, objects=False))
         best = nearest(self.chain, goal, start) if best is None else best
         wanted = f"({', '.join(f'{v:.3f}' for v in goal.position)}) m"
         how = "" if approach_deg is None else f" with an approach of {approach_deg:g} degrees"

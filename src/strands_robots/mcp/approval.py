@@ -33,7 +33,7 @@ from pydantic import BaseModel, Field
 from strands_robots.envelope import Envelope, error, is_error
 from strands_robots.errors import ApprovalError
 from strands_robots.fleet.adapter import ReceivedCall
-from strands_robots.fleet.refusals import refusal_of
+from strands_robots.fleet.reports import refusal_of
 from strands_robots.mcp.caller import Caller, ClientAccess
 from strands_robots.mcp.results import jpeg_of, result
 from strands_robots.safety.authorization import Approval, Grants, digest

@@ -23,8 +23,7 @@ from strands_robots.envelope import Envelope, error, is_error, success, text_of
 from strands_robots.errors import NoAnswerError, NoSuchRobotError, RefusalError, StrandsRobotsError, UnreachableError
 from strands_robots.fleet.adapter import FoundRobot, NetworkAdapter, ReceivedCall, StopRequest
 from strands_robots.fleet.networks import Networks
-from strands_robots.fleet.refusals import LEASE_CODES, said
-from strands_robots.fleet.reports import runs
+from strands_robots.fleet.reports import LEASE_CODES, runs, said
 from strands_robots.fleet.stops import answer_of, estop_all, stop_all
 from strands_robots.fleet.verdicts import FleetVerdict, answer_of_bearers
 from strands_robots.mcp.results import refused

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ValidationError
 from strands_robots.envelope import Envelope, error, is_error, jsonable, success, text_of
 from strands_robots.errors import NoSuchRobotError, RefusalError
 from strands_robots.fleet.adapter import FoundRobot
-from strands_robots.fleet.refusals import answer_to
+from strands_robots.fleet.reports import answer_to
 from strands_robots.serving.advertised import STOPS, AdvertisedVerb, RobotDescription, find_verb, fitting, verb_names
 from strands_robots.utils import near, shown
 

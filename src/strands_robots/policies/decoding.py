@@ -76,15 +76,15 @@ def decode_file(data: bytes, *, bytes_max: int = MESSAGE_MAX, elements_max: int 
         raise ForeignDataError(f"it is malformed: {type(exc).__name__}: {exc!s:.200}") from None
 
 
-def read_json(path: Path, *, bytes_max: int = MESSAGE_MAX, elements_max: int = ELEMENTS_MAX) -> Any:
-    """Return what a JSON file holds; no more of it is read than it may have.
+def read_json(path: Path) -> Any:
+    """Return what a JSON file holds; no more of it is read than a message may have.
 
     Raises:
         ForeignDataError: it is beyond a bound, or no JSON.
         OSError: it cannot be read.
     """
     with path.open("rb") as file:
-        return decode_file(file.read(bytes_max + 1), bytes_max=bytes_max, elements_max=elements_max)
+        return decode_file(file.read(MESSAGE_MAX + 1))
 
 
 def _marks(data: str | bytes) -> int:

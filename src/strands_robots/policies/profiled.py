@@ -178,16 +178,12 @@ class InferenceWorker:
         name: named in the thread and in the log.
         infer: called on the thread.
         finish: called once when no inference runs any more, as the last thing: it may free the model.
-        now: monotonic time in seconds.
     """
 
-    def __init__(
-        self, name: str, infer: Infer, finish: Callable[[], None], now: Callable[[], float] = time.monotonic
-    ) -> None:
+    def __init__(self, name: str, infer: Infer, finish: Callable[[], None]) -> None:
         self._name = name
         self._infer = infer
         self._finish = finish
-        self._now = now
         self._asked_at: float | None = None
         self._requests: queue.SimpleQueue[tuple[Any] | None] = queue.SimpleQueue()
         self._answers: queue.SimpleQueue[InferenceResult] = queue.SimpleQueue()
@@ -200,7 +196,7 @@ class InferenceWorker:
         if self._thread is None:
             self._thread = threading.Thread(target=self._run, name=f"inference-{self._name}", daemon=True)
             self._thread.start()
-        self._asked_at = self._now()
+        self._asked_at = time.monotonic()
         self._requests.put((request,))
 
     def answer(self) -> InferenceResult | None:
@@ -213,7 +209,7 @@ class InferenceWorker:
 
     @property
     def waited_s(self) -> float | None:
-        return None if self._asked_at is None else self._now() - self._asked_at
+        return None if self._asked_at is None else time.monotonic() - self._asked_at
 
     def close(self) -> None:
         """Drop the request in flight; the model is freed once it has returned."""
@@ -231,14 +227,14 @@ class InferenceWorker:
     def _run(self) -> None:
         try:
             while (request := self._requests.get()) is not None and not self._closed:
-                began = self._asked_at if self._asked_at is not None else self._now()
+                began = self._asked_at if self._asked_at is not None else time.monotonic()
                 value, failure = None, None
                 try:
                     with computing(f"The inference of the policy {self._name}"):
                         value = self._infer(request[0])
                 except BaseException as exc:  # noqa: BLE001 - raised again in the control thread
                     failure = exc
-                self._answers.put(InferenceResult(value, failure, self._now() - began))
+                self._answers.put(InferenceResult(value, failure, time.monotonic() - began))
         finally:
             self._finish()
 
@@ -386,11 +382,7 @@ class ProfiledPolicy:
         inner: decides the actions, in its own units.
     """
 
-    def __init__(
-        self,
-        profile: Profile,
-        inner: Policy,
-    ) -> None:
+    def __init__(self, profile: Profile, inner: Policy) -> None:
         self.profile = profile
         self.uses_cameras = bool(profile.cameras)
         self.preparing = True

@@ -7,9 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from strands_robots.tools.robot_mesh import robot_mesh
-    from strands_robots.tools.use_ros import use_ros
-    from strands_robots.tools.use_rosbridge import use_rosbridge
-    from strands_robots.tools.use_rtps import use_rtps
+    from strands_robots.tools.ros import use_ros, use_rosbridge, use_rtps
 
 __all__ = ["robot_mesh", "use_ros", "use_rosbridge", "use_rtps"]
 
@@ -17,6 +15,7 @@ __all__ = ["robot_mesh", "use_ros", "use_rosbridge", "use_rtps"]
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    # The tool replaces the module of the same name, which the import has just bound here.
-    tool = globals()[name] = getattr(import_module(f"{__name__}.{name}"), name)
+    # `robot_mesh` replaces the module of the same name, which the import has just bound here.
+    module = import_module(f"{__name__}.{'robot_mesh' if name == 'robot_mesh' else 'ros'}")
+    tool = globals()[name] = getattr(module, name)
     return tool

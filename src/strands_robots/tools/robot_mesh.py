@@ -23,7 +23,7 @@ from strands_robots.errors import NoSuchRobotError, RefusalError, StrandsRobotsE
 from strands_robots.fleet.adapter import STOP_S, TOOL, FoundRobot, StopRequest
 from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.profiles import networks_for_stop, networks_of, profile_for
-from strands_robots.fleet.refusals import near_verbs, said
+from strands_robots.fleet.reports import near_verbs, said
 from strands_robots.fleet.stops import answer_of, estop_all, stop_all
 from strands_robots.fleet.verdicts import by_bearer, combined_verdict
 from strands_robots.serving import advertised

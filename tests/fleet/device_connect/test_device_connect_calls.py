@@ -14,7 +14,7 @@ from strands_robots.device_connect.backends import loopback_config
 from strands_robots.device_connect.discovery import Peer
 from strands_robots.envelope import success
 from strands_robots.fleet.adapter import CLOSED
-from strands_robots.fleet.device_connect import lockouts
+from strands_robots.fleet.device_connect import stops
 from strands_robots.fleet.device_connect.network import DeviceConnectNetwork
 from strands_robots.safety.identity import KeyFileError
 from strands_robots.serving.advertised import AdvertisedVerb, find_verb
@@ -143,8 +143,8 @@ def test_lockouts_count_only_while_the_enrolled_keys_can_be_used(there: Any, mon
     def unusable(link: Any) -> Any:
         raise KeyFileError("open to others")
 
-    monkeypatch.setattr(lockouts, "enrolled_keys", unusable)
+    monkeypatch.setattr(stops, "enrolled_keys", unusable)
     other = DeviceConnectNetwork.joined(there._client)
     report = asyncio.run(other.lockout_async("arm-1", 1.0))
-    assert report.problem == lockouts.KEYS_UNUSABLE
+    assert report.problem == stops.KEYS_UNUSABLE
     assert report.facts["locked"] is False

@@ -15,8 +15,8 @@ from fixtures.waiting import eventually
 from tests.mesh.peers import Fleet, fleet
 
 from strands_robots.fleet.adapter import EVERY, Detail, RobotEvent
-from strands_robots.fleet.mesh.events import LOAD_MAX
 from strands_robots.fleet.mesh.network import MeshNetwork
+from strands_robots.fleet.mesh.peers import LOAD_MAX
 
 Say = Callable[[str, dict[str, Any]], None]
 

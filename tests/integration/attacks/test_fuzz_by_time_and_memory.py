@@ -85,7 +85,7 @@ RECEIVERS = {
     "drivers/reachy/links.py": "64 KiB, by the WebSocket and before it is copied",
     "drivers/reachy/motion.py": "64 KiB by the WebSocket",
     "drivers/reachy/rest.py": "512 KiB, of a stop 64 KiB, read in parts",
-    "fleet/mesh/events.py": "by the transport: the topic's own bound",
+    "fleet/mesh/peers.py": "by the transport: the topic's own bound",
     "fleet/mesh/stops.py": "by the transport: the topic's own bound",
     "mesh/children.py": "by the transport: the topic's own bound",
     "mesh/core.py": "by the transport: the topic's own bound",

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from strands_robots import settings
 from strands_robots.utils import ValidationError, device_id, missing_extra, redacted, shown
@@ -96,7 +96,13 @@ class LinkFlags:
         if self.nats and (self.connect or self.listen or self.multicast):
             zenoh = f"{spelled('connect')}, {spelled('listen')} and {spelled('multicast')}"
             raise ValidationError(f"{spelled('nats')} names a broker; {zenoh} are for Zenoh.")
-        link = self._secured(self._reached(), spelled)
+        link = self._reached()
+        link = replace(
+            link,
+            ca=_pem(spelled("tls_ca"), self.tls_ca, link.ca),
+            cert=_pem(spelled("tls_cert"), self.tls_cert, link.cert),
+            key=_pem(spelled("tls_key"), self.tls_key, link.key),
+        )
         if not link.authenticated and not link.loopback_only and not self.opted_in:
             raise ValidationError(
                 "A network beyond this machine needs authentication: certificates "
@@ -107,9 +113,13 @@ class LinkFlags:
         return link
 
     def _reached(self) -> LinkConfig:
-        backends = _backends()
+        # The framework is looked up and not imported: a command that refuses its flags need not load it.
+        if find_spec("device_connect_edge") is None:
+            raise missing_extra("Device Connect", "device-connect")
+        from strands_robots.device_connect import backends  # noqa: PLC0415 - loaded when a network is used
+        from strands_robots.device_connect.backends.config import endpoints, split_urls, usual_link  # noqa: PLC0415 - as above
+
         tenant = self.stated_tenant
-        link: LinkConfig
         if self.nats or self.connect or self.listen or self.multicast:
             transport = "nats" if self.nats else "zenoh"
             link = backends.LinkConfig(transport=transport, tenant=tenant)
@@ -118,38 +128,17 @@ class LinkFlags:
             return replace(
                 link,
                 mode="peer" if self.listen or self.multicast else "auto",
-                connect=_urls(self.nats) if self.nats else _endpoints(self.connect),
-                listen=_endpoints(self.listen),
+                connect=split_urls(self.nats) if self.nats else endpoints(split_urls(self.connect or [])),
+                listen=endpoints(split_urls(self.listen or [])),
                 multicast=True if self.multicast else None,
                 verify_hostname=True,
             )
         if self.alone and (self.port is not None or not self.credentials):
             meets = int(settings.default("STRANDS_DC_PORT")) if self.port is None else self.port
-            link = backends.loopback_config(meets, tenant)
-            return link
+            return backends.loopback_config(meets, tenant)
         if self.alone:
-            link = backends.link_from_environment(tenant, credentials_file=self.credentials, alone=True)
-            return link
-        from strands_robots.device_connect.backends.config import usual_link  # noqa: PLC0415 - loaded when a network is used
-
+            return backends.link_from_environment(tenant, credentials_file=self.credentials, alone=True)
         return usual_link(tenant, self.port, self.credentials)
-
-    def _secured(self, link: LinkConfig, spelled: Spelled) -> LinkConfig:
-        return replace(
-            link,
-            ca=_pem(spelled("tls_ca"), self.tls_ca, link.ca),
-            cert=_pem(spelled("tls_cert"), self.tls_cert, link.cert),
-            key=_pem(spelled("tls_key"), self.tls_key, link.key),
-        )
-
-
-def _backends() -> Any:
-    # The framework is looked up and not imported: a command that refuses its flags need not load it.
-    if find_spec("device_connect_edge") is None:
-        raise missing_extra("Device Connect", "device-connect")
-    from strands_robots.device_connect import backends  # noqa: PLC0415 - loaded when a network is used
-
-    return backends
 
 
 def _pem(flag: str, path: Path | None, otherwise: str) -> str:
@@ -158,16 +147,19 @@ def _pem(flag: str, path: Path | None, otherwise: str) -> str:
     return str(path) if path is not None else otherwise
 
 
-def _urls(values: Sequence[str] | None) -> tuple[str, ...]:
-    from strands_robots.device_connect.backends.config import split_urls  # noqa: PLC0415 - as above
+def enrolled_keys(link: LinkConfig) -> dict[str, bytes]:
+    """Return the enrolled keys of the robots on this network.
 
-    return split_urls(values or [])
+    Raises:
+        KeyFileError: the keys cannot be used.
+    """
+    from strands_robots.device_connect.backends.config import enrolled_robots  # noqa: PLC0415 - loaded when a network is used
+    from strands_robots.safety.identity import KeyFileError  # noqa: PLC0415 - as above
 
-
-def _endpoints(values: Sequence[str] | None) -> tuple[str, ...]:
-    from strands_robots.device_connect.backends.config import endpoints  # noqa: PLC0415 - as above
-
-    return endpoints(_urls(values))
+    try:
+        return enrolled_robots(link)
+    except (KeyFileError, OSError) as exc:
+        raise KeyFileError(f"The enrolled keys cannot be used: {exc}") from exc
 
 
 def described(link: LinkConfig) -> str:

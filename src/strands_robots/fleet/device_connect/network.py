@@ -32,7 +32,7 @@ from strands_robots.fleet.adapter import (
     RobotEvent,
     StopRequest,
 )
-from strands_robots.fleet.device_connect.config import described
+from strands_robots.fleet.device_connect.config import described, enrolled_keys
 from strands_robots.fleet.reports import task_of
 from strands_robots.utils import ValidationError, device_id, plain_text
 
@@ -174,8 +174,7 @@ class DeviceConnectNetwork:
 
     def enrolled_key(self, robot: str) -> bytes | None:
         """Return the device's enrolled key."""
-        from strands_robots.fleet.device_connect.lockouts import enrolled_keys  # noqa: PLC0415 - a call need not load it
-        from strands_robots.safety.identity import KeyFileError  # noqa: PLC0415 - as above
+        from strands_robots.safety.identity import KeyFileError  # noqa: PLC0415 - a call need not load it
 
         try:
             return enrolled_keys(self._link).get(robot)
@@ -256,7 +255,7 @@ class DeviceConnectNetwork:
         try:
             return await self._connected.stop_async(robot, within, robot_name)
         except Exception as exc:  # noqa: BLE001 - a stop that fails is a verdict, whatever it raised
-            return error(_why(exc), stopped=None)
+            return error(plain_text(str(exc.args[0]) if exc.args else "") or type(exc).__name__, stopped=None)
 
     @property
     def key(self) -> NetworkKey:
@@ -322,7 +321,7 @@ class DeviceConnectNetwork:
 
     def lockouts(self, robots: Iterable[str], timeout: float, *, signed: bool = False) -> list[LockoutReport]:
         """Ask each device for its status."""
-        from strands_robots.fleet.device_connect.lockouts import ask_robots  # noqa: PLC0415 - a call need not load it
+        from strands_robots.fleet.device_connect.stops import ask_robots  # noqa: PLC0415 - a call need not load it
 
         with _carried():
             return ask_robots(self._connected, dict.fromkeys(robots), timeout, signed=signed)
@@ -330,7 +329,7 @@ class DeviceConnectNetwork:
     async def lockout_async(self, robot: str, within: float) -> LockoutReport:
         """Ask the device for its status."""
         from strands_robots.fleet.adapter import LockoutReport  # noqa: PLC0415 - as above
-        from strands_robots.fleet.device_connect.lockouts import ask_robot, usable_keys  # noqa: PLC0415 - as above
+        from strands_robots.fleet.device_connect.stops import ask_robot, usable_keys  # noqa: PLC0415 - as above
         from strands_robots.fleet.shared_id import CachedKeys  # noqa: PLC0415 - a call need not load it
 
         if self._keys is None:
@@ -342,7 +341,7 @@ class DeviceConnectNetwork:
 
     def resume(self, reports: Sequence[LockoutReport], signer: Any, timeout: float) -> dict[str, Resumed]:
         """Send each device a resume of each of its lockouts."""
-        from strands_robots.fleet.device_connect.lockouts import resume_robots  # noqa: PLC0415 - a call need not load it
+        from strands_robots.fleet.device_connect.stops import resume_robots  # noqa: PLC0415 - a call need not load it
 
         with _carried():
             return resume_robots(self._connected, reports, signer, timeout)
@@ -441,10 +440,6 @@ def _found(peer: Peer) -> FoundRobot:
         },
         functions=peer.functions,
     )
-
-
-def _why(exc: Exception) -> str:
-    return plain_text(str(exc.args[0]) if exc.args else "") or type(exc).__name__
 
 
 def _refusal(exc: Exception, robot: str, verb: str) -> RefusalError | None:

@@ -43,14 +43,13 @@ from strands_robots.fleet.adapter import (
     StopSender,
 )
 from strands_robots.fleet.mesh.config import MeshSettings, no_hub
-from strands_robots.fleet.mesh.events import follow
-from strands_robots.fleet.mesh.lockouts import ask_peer, ask_peers, lockable_peers, resume_peers
 from strands_robots.fleet.mesh.peers import (
     CALLER,
     CONSOLE,
     LOOK_S,
     awaited,
     discover,
+    follow,
     functions_of,
     functions_of_each,
     functions_of_kind,
@@ -60,13 +59,17 @@ from strands_robots.fleet.mesh.peers import (
 )
 from strands_robots.fleet.mesh.stops import (
     MeshController,
+    ask_peer,
+    ask_peers,
     lock_peers,
+    lockable_peers,
     mesh_network,
+    resume_peers,
     stand_on_mesh,
     stop_peer,
     stop_peers,
 )
-from strands_robots.fleet.refusals import refusal_of, refusal_of_text, with_meaning
+from strands_robots.fleet.reports import refusal_of, refusal_of_text, with_meaning
 from strands_robots.fleet.shared_id import CachedKeys
 from strands_robots.fleet.verdicts import roster_verdict
 from strands_robots.safety.network_key import NetworkKey
@@ -108,51 +111,16 @@ T = TypeVar("T")
 
 
 class PeerRequests:
-    """Calls, stops and questions of one peer; none waits for one of another kind."""
+    """Threads of one peer's requests; none waits for one of another kind."""
 
     def __init__(self) -> None:
-        self._calls = ThreadPoolExecutor(IN_FLIGHT, "mesh call")
-        self._stops = ThreadPoolExecutor(STOPS_IN_FLIGHT, "mesh stop")
-        self._questions = ThreadPoolExecutor(IN_FLIGHT, "mesh question")
-        self._keys = CachedKeys(enrolled_peers)
-
-    async def call(self, work: Callable[[], Envelope]) -> Envelope:
-        """Return what ``work`` answers.
-
-        Raises:
-            RefusalError: as ``work``; no answer for whatever else it raises.
-        """
-
-        def refused() -> Envelope | RefusalError:
-            try:
-                return work()
-            except RefusalError as refusal:
-                return refusal
-
-        answer = await _done(self._calls, refused, NoAnswerError)
-        if isinstance(answer, RefusalError):
-            raise answer
-        return answer
-
-    async def stop(self, mesh: Mesh, robot: str, seconds: float, robot_name: str = "") -> Envelope:
-        """Stop a peer; *stopped* counts only where an enrolled robot has signed it."""
-        return await _done(
-            self._stops,
-            lambda: stop_peer(mesh, robot, seconds, robot_name),
-            lambda why: error(why, stopped=None),
-        )
-
-    async def lockout(self, mesh: Mesh, robot: str, seconds: float) -> LockoutReport:
-        """Ask a peer for its status."""
-        return await _done(
-            self._questions,
-            lambda: ask_peer(mesh, robot, seconds, self._keys.read()),
-            lambda why: LockoutReport(robot, problem=why),
-        )
+        self.calls = ThreadPoolExecutor(IN_FLIGHT, "mesh call")
+        self.stops = ThreadPoolExecutor(STOPS_IN_FLIGHT, "mesh stop")
+        self.questions = ThreadPoolExecutor(IN_FLIGHT, "mesh question")
 
     def close(self) -> None:
         """Begin no more requests."""
-        for pool in (self._calls, self._stops, self._questions):
+        for pool in (self.calls, self.stops, self.questions):
             pool.shutdown(wait=False, cancel_futures=True)
 
 
@@ -206,6 +174,7 @@ class MeshNetwork:
         self._discoveries = 0
         self._given = False
         self._requests = PeerRequests()
+        self._keys = CachedKeys(enrolled_peers)
 
     @classmethod
     def joined(cls, mesh: Mesh) -> Self:
@@ -224,6 +193,7 @@ class MeshNetwork:
             self._settings.give_back()
             raise
         self._joined, self._requests = time.monotonic(), PeerRequests()
+        self._keys = CachedKeys(enrolled_peers)
 
     def find(self, timeout: float | None = FIND_S, *, peers: bool = False) -> list[FoundRobot]:
         """Return the robots in reach, once they had the time to announce themselves."""
@@ -376,9 +346,17 @@ class MeshNetwork:
 
         A verb of the robot's own gets them all.
         """
-        return await self._requests.call(
-            lambda: self.call(robot, verb, _given_to(self._mesh, robot, verb, arguments), within)
-        )
+
+        def answered() -> Envelope | RefusalError:
+            try:
+                return self.call(robot, verb, _given_to(self._mesh, robot, verb, arguments), within)
+            except RefusalError as refusal:
+                return refusal
+
+        answer = await _done(self._requests.calls, answered, NoAnswerError)
+        if isinstance(answer, RefusalError):
+            raise answer
+        return answer
 
     async def describe_async(self, robot: str, within: float) -> FoundRobot:
         """Return the peer as it describes itself, an older one by its kind."""
@@ -390,11 +368,18 @@ class MeshNetwork:
         return replace(self.known(robot), functions=told)
 
     async def stop_async(self, robot: str, within: float = STOP_S, robot_name: str = "") -> Envelope:
-        """Stop the peer on a thread that no call takes."""
+        """Stop the peer on a thread that no call takes.
+
+        *Stopped* counts only where an enrolled robot has signed it.
+        """
         mesh = self._mesh
         if mesh is None:
             return error(CLOSED, stopped=None)
-        return await self._requests.stop(mesh, robot, within, robot_name)
+        return await _done(
+            self._requests.stops,
+            lambda: stop_peer(mesh, robot, within, robot_name),
+            lambda why: error(why, stopped=None),
+        )
 
     @property
     def key(self) -> NetworkKey:
@@ -458,8 +443,12 @@ class MeshNetwork:
     async def lockout_async(self, robot: str, within: float) -> LockoutReport:
         """Ask the peer for its status."""
         mesh = self._mesh
-        return (
-            LockoutReport(robot, problem=CLOSED) if mesh is None else await self._requests.lockout(mesh, robot, within)
+        if mesh is None:
+            return LockoutReport(robot, problem=CLOSED)
+        return await _done(
+            self._requests.questions,
+            lambda: ask_peer(mesh, robot, within, self._keys.read()),
+            lambda why: LockoutReport(robot, problem=why),
         )
 
     def resume(self, reports: Sequence[LockoutReport], signer: Any, timeout: float) -> dict[str, Resumed]:
