@@ -1,4 +1,7 @@
-"""``python -m strands_robots.cli``, for processes that start one another without a script on the path."""
+"""``python -m strands_robots.cli``, for processes that start one another.
+
+They need no script on the path.
+"""
 
 from strands_robots.cli import main
 

@@ -1,4 +1,4 @@
-"""Application of the command line: functions as commands, with their flags, arguments and exit codes."""
+"""Application of the command line: functions become commands with flags."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``dashboard``: every robot in a browser, and a STOP for all of them. ``demo``: an example."""
+"""``dashboard``: every robot in a browser, with a STOP. ``demo``: an example."""
 
 from __future__ import annotations
 

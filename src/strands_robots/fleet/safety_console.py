@@ -1,4 +1,4 @@
-"""Safety controllers of a program on every network: that stand, and an operator's console."""
+"""Safety controllers of a program on every network, and an operator's console."""
 
 from __future__ import annotations
 
