@@ -480,10 +480,10 @@ class Mesh(SensorLoopsMixin):
         done = self._subscriptions.add(transport, topic, chosen, callback=callback, on_sample=on_sample)
         return chosen if done else None
 
-    def listen(self, topic: str, heard: Callable[[Sample], None], name: str) -> bool:
+    def listen(self, topic: str, receive: Callable[[Sample], None], name: str) -> bool:
         """Subscribe to raw samples on the transport's thread, for quick handlers."""
         transport = self._context.transport
-        return transport is not None and self._subscriptions.add(transport, topic, name, direct=heard)
+        return transport is not None and self._subscriptions.add(transport, topic, name, direct=receive)
 
     def unsubscribe(self, name: str) -> None:
         """Drop a subscription by its name; an unknown one is fine."""

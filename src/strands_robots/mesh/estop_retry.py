@@ -80,18 +80,18 @@ class ScopedStop:
         now = time.monotonic()
         # Until then a peer that is linked to us may not be in the registry yet.
         known_at = now + max(0.0, DISCOVERY_S - self.context.age_s)
-        publish_at, told, inside = now, {("", "")}, False
+        publish_at, answered, inside = now, {("", "")}, False
         known = KnownRobots(self.scope, remembers)
 
         def goes_on(replies: Replies) -> bool:
-            nonlocal publish_at, told, inside
+            nonlocal publish_at, answered, inside
             now = time.monotonic()
             if self.scope.cell and now >= publish_at:
                 publish_at = now + self.spacing_s
                 self.publish()
             received = {(str(each["responder_id"]), str(each["type"])) for each in replies}
-            if received != told:
-                told = received
+            if received != answered:
+                answered = received
                 on_answers([each for each in replies if each["type"] == "response"])
                 inside = any(kind == "response" and self._means(name) for name, kind in received)
             if now >= known_at + known.widens_after_s and not inside:
@@ -258,7 +258,7 @@ class LatePeers:
         """Note a resume that is signed anew for the next ten minutes."""
         self._note(epoch, KNOWN_S, targets, lambda peers: renew(epoch, peers), locks=False)
 
-    def heard(self, epoch: str) -> None:
+    def repeated(self, epoch: str) -> None:
         """Note that another peer published the stop of this epoch just now."""
         missing = self._missing.get((epoch, True))
         if missing is not None:

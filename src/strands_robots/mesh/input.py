@@ -151,7 +151,7 @@ class InputPublisher:
             due += period
             left = due - time.monotonic()
             if left < 0:
-                due -= left  # a late frame shifts the beat: no burst follows
+                due -= left  # a late frame shifts the next ones: no burst follows
             elif stopping.wait(left):
                 return
 

@@ -280,8 +280,8 @@ class InputReceiver:
             # Not queued, so that a stranger's flood displaces none of the leader's frames.
             self._counts["source"] += 1
             return
-        heard = time.monotonic()
-        executor.submit(lambda: self._take(sample, heard))
+        received = time.monotonic()
+        executor.submit(lambda: self._take(sample, received))
 
     def _open(self, request: MotionRequest | None) -> str | None:
         session = self._mesh.peer_wire_zid(self._source)
@@ -351,7 +351,7 @@ class InputReceiver:
     def _name(self) -> str:
         return f"input:{self._source}/{self._device}"
 
-    def _take(self, sample: Sample, heard: float) -> None:
+    def _take(self, sample: Sample, received: float) -> None:
         if not self._running:
             return
         permit = self._permit
@@ -369,11 +369,11 @@ class InputReceiver:
         except wire.WireError:
             self._counts["invalid"] += 1
             return
-        action = self._checked(frame, heard)
+        action = self._checked(frame, received)
         if action is not None:
             self._do(action)
 
-    def _checked(self, frame: Mapping[str, Any], heard: float) -> dict[str, float] | None:
+    def _checked(self, frame: Mapping[str, Any], received: float) -> dict[str, float] | None:
         """Return the action of a frame that passed every guard; else count it."""
         stamp = wire.finite(frame.get("t"))
         if stamp is None or not wire.fresh(stamp, self._mesh.inputs.now()):
@@ -400,8 +400,8 @@ class InputReceiver:
         if cap > 0:
             # A few frames may come together where a link or a scheduler held them up; a flood may not. Counted as they
             # arrive: those that waited here for a slow bus were none.
-            self._tokens = min(BURST, self._tokens + (heard - self._refilled) * cap)
-            self._refilled = heard
+            self._tokens = min(BURST, self._tokens + (received - self._refilled) * cap)
+            self._refilled = received
             if self._tokens < 1.0:
                 self._counts["rate_dropped"] += 1
                 return None

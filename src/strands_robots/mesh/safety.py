@@ -330,7 +330,7 @@ class FleetSafety:
         """Note a stop of another peer whose halts are ordered; return at once."""
         context, epoch = self.context, order.epoch
         if repeated:
-            self.late.heard(epoch)
+            self.late.repeated(epoch)
             if self.adapter.within(order.scope):
                 context.audit("remote_estop_redundant", order.source, estop_id=epoch)
             return
@@ -340,7 +340,7 @@ class FleetSafety:
             self.late.stopped(epoch, lambda: self._repeat_estop({**fields, "estop_id": epoch}))
         self._publish_event("emergency_stop", epoch)
 
-    def on_own_estop(self, given: object, sample: Sample, sender: str, peer_id: str) -> str | None:
+    def on_own_estop(self, envelope: object, sample: Sample, sender: str, peer_id: str) -> str | None:
         """Lock by the envelope in a ``stop`` for this peer; return its epoch, or None.
 
         The plain stop is carried out whatever this says.
@@ -352,7 +352,7 @@ class FleetSafety:
         context, received, stops = self.context, time.monotonic(), self.stops
         if stops is None:
             return None
-        body = dict(given) if isinstance(given, Mapping) else {}
+        body = dict(envelope) if isinstance(envelope, Mapping) else {}
         original = None
         with contextlib.suppress(wire.WireError):  # too long to be passed on
             original = wire.encode(body, topics.BY_NAME["estop"].max_bytes)

@@ -84,7 +84,7 @@ class MeshStopLink:
     def open(self, events: Collection[str], on_event: OnEvent, on_state: OnState) -> None:
         transport, self._on_state = self._transport, on_state
 
-        def asked(event: str) -> Callable[[Sample], None]:
+        def handler(event: str) -> Callable[[Sample], None]:
             return lambda sample: on_event(event, sample.key.split("/", 2)[1], sample.payload)
 
         if self._on_check_in is not None:
@@ -92,7 +92,7 @@ class MeshStopLink:
         # No topic names who stops: until the message is read, a session stands for its sender.
         self.on_stop = partial(on_event, ESTOP)
         for event, topic in TOPICS.items():
-            self._declared.append(transport.declare_subscriber(topic("*"), asked(event)))
+            self._declared.append(transport.declare_subscriber(topic("*"), handler(event)))
         on_state(True)
         self._end_looks = repeat("missed stops", LOOK_HZ, self._look)
 

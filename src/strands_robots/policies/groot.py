@@ -37,7 +37,6 @@ from strands_robots.policies.policy_server import (
     checked_chunk,
     compare,
     numbers_of,
-    picture_key,
     wait_for_answer,
 )
 from strands_robots.policies.preload import PreloadedModels
@@ -284,7 +283,7 @@ class GrootPolicy(ServedPolicy):
         # History of one: time before height or number, and the batch before time.
         axes = (None,) if self._layout == "n1.5" else (None, None)
         kind = numpy.float64 if self._layout == "n1.5" else numpy.float32
-        video = {picture_key(each): numpy.asarray(seen[picture_key(each)])[axes] for each in self.profile.cameras}
+        video = {each.short_key: numpy.asarray(seen[each.short_key])[axes] for each in self.profile.cameras}
         state = {part: numpy.array([seen[key] for key in keys], kind)[axes] for part, keys in self._state.items()}
         if nested:
             request: dict[str, Any] = {"video": video, "state": state, "language": {self._language: [[task]]}}
@@ -330,7 +329,7 @@ class GrootPolicy(ServedPolicy):
         """
         profile = self.profile
         wanted = {
-            "video": [picture_key(each) for each in profile.cameras],
+            "video": [each.short_key for each in profile.cameras],
             "state": list(self._state),
             "action": list(self._action),
         }

@@ -30,16 +30,16 @@ from typing import Any, BinaryIO
 from urllib.parse import urlsplit
 
 from strands_robots.policies.base import Action
+from strands_robots.policies.checkpoint import STATE
 from strands_robots.policies.policy_server import (
     PolicyServerError,
     ServedPolicy,
     actions_of,
     compare,
-    picture_key,
     wait_for_answer,
 )
 from strands_robots.policies.preload import PreloadedModels
-from strands_robots.policies.profiles import Profile
+from strands_robots.policies.profiles import IMAGES, Profile
 from strands_robots.utils import ValidationError, is_loopback_host, optional_module, shown
 
 HELPERS = "lerobot.async_inference.helpers"
@@ -380,7 +380,6 @@ CHUNK = 100
 """Actions that are asked for where the profile states no ``chunk``."""
 
 TASK = "task"
-STATE, IMAGES = "observation.state", "observation.images."
 
 _BEGIN, _MIDDLE, _END = 1, 2, 3
 _serving: dict[str, LeRobotAsyncConnection] = {}
@@ -520,7 +519,7 @@ class LeRobotAsyncPolicy(ServedPolicy):
             )
         if self.profile.environment:
             raise ValidationError(f"{where}: a server of LeRobot's takes no environment.")
-        names = [*self.profile.state, *(picture_key(each) for each in self.profile.cameras), TASK]
+        names = [*self.profile.state, *(each.short_key for each in self.profile.cameras), TASK]
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise ValidationError(f"{where}: state and cameras must have names of their own, not {', '.join(twice)}.")
         for module in ("grpc", "numpy"):
@@ -537,7 +536,7 @@ class LeRobotAsyncPolicy(ServedPolicy):
 
     def observation(self, seen: Mapping[str, Any], task: str) -> dict[str, Any]:
         numpy, profile = _module("numpy"), self.profile
-        pictures = {key: numpy.ascontiguousarray(seen[key]) for key in map(picture_key, profile.cameras)}
+        pictures = {each.short_key: numpy.ascontiguousarray(seen[each.short_key]) for each in profile.cameras}
         return {**{key: float(seen[key]) for key in profile.state}, **pictures, TASK: task}
 
     def actions(self, answer: Any) -> list[Action]:
@@ -572,7 +571,7 @@ class LeRobotAsyncPolicy(ServedPolicy):
         for camera in profile.cameras:
             size = (*(camera.size or (0, 0)), 3)
             axes = ["height", "width", "channels"]
-            features[IMAGES + picture_key(camera)] = {"dtype": "image", "shape": size, "names": axes}
+            features[IMAGES + camera.short_key] = {"dtype": "image", "shape": size, "names": axes}
         state = {
             "policy_type": profile.policy_type,
             "pretrained_name_or_path": profile.checkpoint,

@@ -19,9 +19,10 @@ from types import ModuleType
 from typing import Any
 
 from strands_robots.policies.base import Action, PolicyError, Ranges
+from strands_robots.policies.checkpoint import ENVIRONMENT, STATE
 from strands_robots.policies.decoding import read_json
 from strands_robots.policies.preload import PreloadedModels
-from strands_robots.policies.profiles import Profile
+from strands_robots.policies.profiles import IMAGES, Profile
 from strands_robots.utils import ValidationError, missing_extra, shown
 
 LEROBOT_IMPORTS = threading.RLock()
@@ -37,8 +38,6 @@ def lerobot_import(name: str) -> ModuleType:
     with LEROBOT_IMPORTS:
         return import_module(name)
 
-
-STATE, ENVIRONMENT, IMAGES = "observation.state", "observation.environment_state", "observation.images."
 
 _MODELS = PreloadedModels()
 """Loaded checkpoints by path and device."""
@@ -151,7 +150,7 @@ class LeRobotPolicy:
             if feature is None:
                 raise PolicyError(f"the checkpoint has no picture {camera.key}")
             _, height, width = feature.shape
-            blank[camera.key.removeprefix(IMAGES)] = numpy.zeros((height, width, 3), numpy.uint8)
+            blank[camera.short_key] = numpy.zeros((height, width, 3), numpy.uint8)
         return blank
 
     def _computed(
@@ -163,7 +162,7 @@ class LeRobotPolicy:
         frame = {STATE: numpy.array([seen[key] for key in profile.state], numpy.float32)}
         if profile.environment:
             frame[ENVIRONMENT] = numpy.array([seen[key] for key in profile.environment], numpy.float32)
-        frame |= {_feature(camera.key): seen[camera.key.removeprefix(IMAGES)] for camera in profile.cameras}
+        frame |= {_feature(camera.key): seen[camera.short_key] for camera in profile.cameras}
         utils = import_module("lerobot.policies.utils")
         # Real-time chunking differentiates, which inference mode forbids.
         with torch.no_grad() if self.continues else torch.inference_mode():

@@ -27,7 +27,6 @@ from strands_robots.policies.policy_server import (
     actions_of,
     compare,
     numbers_of,
-    picture_key,
     wait_for_answer,
 )
 from strands_robots.policies.preload import PreloadedModels
@@ -143,7 +142,7 @@ class OpenPiPolicy(ServedPolicy):
     def observation(self, seen: Mapping[str, Any], task: str) -> dict[str, Any]:
         numpy, profile = _module("numpy"), self.profile
         state = numpy.array([seen[key] for key in profile.state], numpy.float32)
-        pictures = {each.key: seen[picture_key(each)] for each in profile.cameras}
+        pictures = {each.key: seen[each.short_key] for each in profile.cameras}
         if self._layout == "aloha":
             first = {key: numpy.ascontiguousarray(numpy.transpose(image, (2, 0, 1))) for key, image in pictures.items()}
             return {"state": state, "images": first, "prompt": task}

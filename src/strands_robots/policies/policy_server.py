@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Protocol
 from strands_robots.policies.base import Action, PolicyError, Ranges
 from strands_robots.policies.decoding import MESSAGE_MAX
 from strands_robots.policies.preload import PreloadedModels
-from strands_robots.policies.profiles import CameraMap, Profile
+from strands_robots.policies.profiles import Profile
 from strands_robots.utils import ValidationError, choice, optional_module, shown
 
 CHUNK_MAX = 10_000
@@ -105,7 +105,7 @@ class ServedPolicy:
         """Return what is seen in the form that the server takes.
 
         Args:
-            seen: numbers by the keys of ``state``, and RGB pictures by :func:`picture_key`.
+            seen: numbers by the keys of ``state``, and RGB pictures by :attr:`CameraMap.short_key`.
             task: the instruction.
         """
         raise NotImplementedError
@@ -160,7 +160,7 @@ class ServedPolicy:
         try:
             blank: dict[str, Any] = dict.fromkeys(profile.state, 0.0)
             for camera in profile.cameras:
-                blank[picture_key(camera)] = numpy.zeros((*(camera.size or PICTURE), 3), numpy.uint8)
+                blank[camera.short_key] = numpy.zeros((*(camera.size or PICTURE), 3), numpy.uint8)
             seen = self.observation(blank, profile.task or "stand still")
             self.actions(connection.infer(seen, deadline, threading.Event()))
         except BaseException:
@@ -194,11 +194,6 @@ def wait_for_answer(
             return receive(min(left, SLICE_S))
         except TimeoutError:
             continue
-
-
-def picture_key(camera: CameraMap) -> str:
-    """Return the key under which :class:`ProfiledPolicy` hands a picture on."""
-    return camera.key.removeprefix("observation.images.")
 
 
 def actions_of(rows: Any, keys: tuple[str, ...]) -> list[Action]:

@@ -524,7 +524,7 @@ class ProfiledPolicy:
         """Return the chunk for a request, in the robot's units."""
         seen, pictures, played, delay = request
         for camera, given in pictures.items():
-            seen[camera.key.removeprefix("observation.images.")] = picture(camera, given)
+            seen[camera.short_key] = picture(camera, given)
         if isinstance(self._inner, RealTimeChunking) and self._inner.continues:
             answer: object = self._inner.act_on(seen, played=played, delay=delay)
         else:

@@ -36,6 +36,9 @@ ASYNC = "lerobot_async"
 CONFIRMABLE = ("units", "rate", "image size", "robot type")
 """Facts that a profile may declare to be right although nothing states them."""
 
+IMAGES = "observation.images."
+"""Prefix of LeRobot's keys of pictures."""
+
 KEYS_MAX = 64
 RATE_MAX = 2000.0
 
@@ -57,6 +60,11 @@ class CameraMap:
     size: tuple[int, int] | None = None
     crop: tuple[int, int, int, int] | None = None
     flip: str = "none"
+
+    @property
+    def short_key(self) -> str:
+        """Key under which :class:`ProfiledPolicy` hands the picture on."""
+        return self.key.removeprefix(IMAGES)
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from fixtures.waiting import eventually
 from tests.integration.mesh.networks import Network, OverZenoh, network
 
 from strands_robots.mesh import topics
+from strands_robots.mesh.transport import config
 
 WAVE = {"action": "start", "instruction": "wave", "policy_provider": "mock", "duration": 60}
 APPROVED = "start@arm-1,teleop_receive@arm-1"
@@ -32,19 +33,19 @@ class Attacker:
     """A bare session; it may put any source on its messages that it has seen."""
 
     def __init__(self, net: OverZenoh) -> None:
-        config: dict[str, Any] = {"mode": "client", "namespace": "strands"}
-        config["connect"] = {"endpoints": [f"tcp/127.0.0.1:{net.port}"]}
+        stated: dict[str, Any] = {"mode": "client", "namespace": "strands"}
+        stated["connect"] = {"endpoints": [f"tcp/127.0.0.1:{net.port}"]}
         if net.kind == "zenoh-tls":
             own = config.issue_certificate(net.folder / "keys", f"mallory-{uuid.uuid4().hex[:6]}")
-            config["connect"] = {"endpoints": [f"tls/127.0.0.1:{net.port}"]}
+            stated["connect"] = {"endpoints": [f"tls/127.0.0.1:{net.port}"]}
             tls = {
                 "root_ca_certificate": str(own.ca),
                 "connect_certificate": str(own.cert),
                 "connect_private_key": str(own.key),
                 "enable_mtls": True,
             }
-            config["transport"] = {"link": {"tls": tls}}
-        self.session = zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
+            stated["transport"] = {"link": {"tls": tls}}
+        self.session = zenoh.open(zenoh.Config.from_json5(json.dumps(stated)))
 
     def put(self, key: str, body: object, source: Any = None) -> None:
         data = body if isinstance(body, bytes) else json.dumps(body).encode()
