@@ -91,6 +91,7 @@ RECEIVERS = {
     "mesh/core.py": "by the transport: the topic's own bound",
     "mesh/input_receiver.py": "by the transport: the topic's own bound",
     "mesh/presence.py": "by the transport: the topic's own bound",
+    "mesh/state.py": "none: it publishes on a topic of that name",
     "mesh/stop_link.py": "by the transport: the topic's own bound",
     "mesh/transport/__init__.py": "by the transport: the topic's own bound",
     "mesh/transport/bridge.py": "by its two transports",
