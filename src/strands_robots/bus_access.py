@@ -56,7 +56,7 @@ def bus_lock(device: Any) -> threading.RLock:
     with _guard:
         known = _locks.get(id(key))
         if known is None:
-            known = (_kept(key), threading.RLock())
+            known = (_reference(key), threading.RLock())
             _locks[id(key)] = known
         return known[1]
 
@@ -221,7 +221,7 @@ def _readable(candidate: Any) -> bool:
     return any(callable(getattr(candidate, name, None)) for name in _READERS)
 
 
-def _kept(key: Any) -> object:
+def _reference(key: Any) -> object:
     """Return a weak reference to the device, or the device where it allows none."""
     number = id(key)
     try:

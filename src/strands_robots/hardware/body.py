@@ -252,9 +252,9 @@ class DeviceBody:
 
         def exchange() -> Mapping[str, Any]:
             sent = self._exchange(send, self._send_tries)
-            told = sent if isinstance(sent, Mapping) else dict(action)
-            self.targets |= numbers(told)
-            return told
+            taken = sent if isinstance(sent, Mapping) else dict(action)
+            self.targets |= numbers(taken)
+            return taken
 
         return permit.write(self.lock, exchange)
 

@@ -254,12 +254,12 @@ def stated_joints(device: Any, bounds: Ranges, speeds: Mapping[str, float] | Non
     )
 
 
-def still_action(device: Any, bounds: Ranges, told: Mapping[str, float], observed: Mapping[str, float]) -> Action:
+def still_action(device: Any, bounds: Ranges, targets: Mapping[str, float], observed: Mapping[str, float]) -> Action:
     """Return an action that leaves every joint where it was told to be, or is.
 
     Velocities are zero. A key that may be no position, such as a force, is left out.
     """
-    known = {key: value for key, value in {**observed, **told}.items() if key in bounds}
+    known = {key: value for key, value in {**observed, **targets}.items() if key in bounds}
     positions = {key: known[key] for key in _positions(bounds, joint_units(device)) if key in known}
     return {**{key: 0.0 for key in bounds if is_velocity(key)}, **positions}
 

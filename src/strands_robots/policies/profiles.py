@@ -176,11 +176,11 @@ def profiles() -> Mapping[str, Profile]:
         ValidationError: as :func:`load_profiles`.
     """
     path = settings.raw("STRANDS_POLICIES")
-    return _kept(path) if path else {}
+    return _profiles_of(path) if path else {}
 
 
 @lru_cache(maxsize=4)
-def _kept(path: str) -> Mapping[str, Profile]:
+def _profiles_of(path: str) -> Mapping[str, Profile]:
     return load_profiles(Path(path).expanduser())
 
 
