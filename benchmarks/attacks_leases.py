@@ -15,7 +15,7 @@ from benchmarks.attacks_robots import state_folder
 from benchmarks.table import Row
 from strands_robots.device_connect import FleetClient, LinkConfig
 from strands_robots.safety import ed25519
-from strands_robots.safety.lease_signatures import sign_take
+from strands_robots.safety.resume import sign_take
 
 WEDGED, HEALTHY = 40, 10
 TTL_S, LOST_AFTER_S = 3.0, 15.0

@@ -27,7 +27,7 @@ from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.act.modeling_act import ACTPolicy
 from lerobot.policies.factory import make_pre_post_processors
 
-from strands_robots.evaluation.episode import Episode, run_episode, table_of
+from strands_robots.evaluation import Episode, run_episode, table_of
 from strands_robots.recording.file import STEP, RecordedEvent, read_items
 
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")

@@ -29,7 +29,6 @@ FLOORS: list[set[str]] = [
         "tags",
         "utils",
         "bounded_json",
-        "identity_map",
         "state_files",
         "stop_log",
         "agent_tool",

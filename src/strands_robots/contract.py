@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Any, Generic, Literal, ParamSpec, Protocol, Ty
 
 from strands_robots import settings
 from strands_robots.envelope import Envelope, error, success
-from strands_robots.identity_map import IdentityMap
 from strands_robots.safety.gate import MotionGate, MotionRefused, MotionRequest, VerbCall, gate_of
 from strands_robots.safety.stop_targets import Haltable as Haltable  # noqa: PLC0414 - part of the contract
 from strands_robots.safety.stop_targets import RobotWrapper, halted_with_verbs
@@ -34,7 +33,7 @@ from strands_robots.safety.stopping import (
     read_verdict,
 )
 from strands_robots.stop_log import stop_logger
-from strands_robots.utils import ValidationError, shown
+from strands_robots.utils import IdentityMap, ValidationError, shown
 from strands_robots.verb_declaration import declared_verbs
 
 if TYPE_CHECKING:

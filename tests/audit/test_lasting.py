@@ -9,8 +9,16 @@ import pytest
 from fixtures.audit_files import entry
 
 from strands_robots import audit
-from strands_robots.audit import flush_audit, journal, log_safety_event, read_audit_log, verify_audit_integrity
-from strands_robots.audit.lasting import FOLDER, LastingRecords, lasting_journal
+from strands_robots.audit import (
+    FOLDER,
+    LastingRecords,
+    flush_audit,
+    journal,
+    lasting_journal,
+    log_safety_event,
+    read_audit_log,
+    verify_audit_integrity,
+)
 
 EPOCH = "0123456789abcdef0123456789abcdef"
 
@@ -95,7 +103,7 @@ def test_queue_that_is_full_sheds_noise_before_a_stop(state_directory: Path, mon
 def test_full_log_of_kept_records_takes_no_more_and_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("strands_robots.audit.lasting.LASTING_MAX_BYTES", 400)
+    monkeypatch.setattr("strands_robots.audit.LASTING_MAX_BYTES", 400)
     kept = lasting_journal(tmp_path, None, tmp_path / "anchor")
     lasting = LastingRecords(kept)
     for number in range(9):

@@ -8,7 +8,7 @@ import threading
 
 import pytest
 
-from strands_robots.device_connect.process import StopSignal
+from strands_robots.threads import StopSignal
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -11,8 +11,7 @@ import numpy
 import pytest
 
 from strands_robots import policies
-from strands_robots.evaluation.episode import run_episode, table_of, write_plot
-from strands_robots.evaluation.tasks import ROBOT, TASKS, task_of
+from strands_robots.evaluation import ROBOT, TASKS, run_episode, table_of, task_of, write_plot
 from strands_robots.policies.check import PolicyCheckError
 from strands_robots.recording.file import STEP, RecordedEvent, RecordedJoints, read_items
 from strands_robots.simulation import Simulation

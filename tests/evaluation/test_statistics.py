@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from strands_robots.evaluation.episode import wilson
+from strands_robots.evaluation import wilson
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from fixtures.waiting import eventually
 
 from strands_robots.envelope import RefusalReason
 from strands_robots.safety import ed25519
-from strands_robots.safety.lease_signatures import PURPOSE, VERSION, sign_take
+from strands_robots.safety.resume import TAKE_PURPOSE, VERSION, sign_take
 from strands_robots.serving.control import ControlChange, ControlLease, LeaseWatch, NotHolderError
 from strands_robots.serving.control_leases import CONTROL_VERBS, leases_of
 from strands_robots.serving.pipeline import Command, Pipeline, Result
@@ -229,7 +229,7 @@ def test_assertion_for_something_else_takes_nothing(bench: Bench, changed: dict[
     assert bench.body.halts == []
 
 
-@pytest.mark.parametrize("assertion", [None, {}, {"v": VERSION}, "x", {"sig": None, "purpose": PURPOSE}])
+@pytest.mark.parametrize("assertion", [None, {}, {"v": VERSION}, "x", {"sig": None, "purpose": TAKE_PURPOSE}])
 def test_unsigned_takeover_is_refused(bench: Bench, assertion: object) -> None:
     bench.acquire()
     assert bench.lease.take("mallory", "because", "arm-1", assertion)["code"] == "not_proven"

@@ -12,7 +12,7 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from strands_robots.safety import ed25519
-from strands_robots.safety.lease_signatures import EPOCHS_EACH, reserve_epochs, sign_take
+from strands_robots.safety.resume import EPOCHS_EACH, reserve_epochs, sign_take
 from strands_robots.serving.control import ControlLease, FirstEpoch
 from strands_robots.state_files import StateFileError
 

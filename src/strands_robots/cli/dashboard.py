@@ -166,7 +166,7 @@ def _serve(
 ) -> None:
     """Serve until Ctrl-C or SIGTERM; the demo's robots start after the page."""
     from strands_robots.dashboard.server import QuietServer, configured  # noqa: PLC0415 - as above
-    from strands_robots.device_connect.process import StopSignal  # noqa: PLC0415 - as above
+    from strands_robots.threads import StopSignal  # noqa: PLC0415 - as above
 
     port = int(sockets[0].getsockname()[1])
     app, url = page.app(), f"http://127.0.0.1:{port}/"

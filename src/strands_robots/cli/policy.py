@@ -18,7 +18,7 @@ from strands_robots.policies.profiles import Profile, load_profiles
 from strands_robots.utils import ValidationError, duration, missing_extra, number, shown, whole
 
 if TYPE_CHECKING:
-    from strands_robots.evaluation.episode import Episode
+    from strands_robots.evaluation import Episode
 
 _STYLES = {"ok": "green", "confirmed": "green", "unverified": "yellow", "refused": "bold red"}
 
@@ -137,7 +137,7 @@ def evaluate(
         import mujoco  # noqa: F401, PLC0415 - a simulation is needed by this command alone
     except ModuleNotFoundError as exc:
         raise missing_extra("An evaluation", "sim") from exc
-    from strands_robots.evaluation.episode import HEADINGS, rows_of, run_episode, write_plot  # noqa: PLC0415 - MuJoCo
+    from strands_robots.evaluation import HEADINGS, rows_of, run_episode, write_plot  # noqa: PLC0415 - MuJoCo
 
     if policies is not None:
         settings.put("STRANDS_POLICIES", str(policies))

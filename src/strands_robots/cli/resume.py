@@ -40,10 +40,9 @@ from strands_robots.safety.identity import (
     enrolled_consoles,
     fingerprint,
 )
-from strands_robots.safety.lease_signatures import sign_take
 from strands_robots.safety.lockout import Lockout, utc
 from strands_robots.safety.persistence import LockoutStore, StoredLockout
-from strands_robots.safety.resume import NOT_LOCKED, clear_here
+from strands_robots.safety.resume import NOT_LOCKED, clear_here, sign_take
 from strands_robots.safety.roster import described
 from strands_robots.safety.stop_notes import Unheard, unheard_since
 from strands_robots.state_files import state_dir

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from device_connect_edge.drivers import DeviceDriver
 
     from strands_robots.device_connect.backends import LinkConfig
-    from strands_robots.device_connect.process import StopSignal
+    from strands_robots.threads import StopSignal
 
 EVERY_PROGRAM_HERE = "Every program of this machine can drive and read it, no other machine can."
 
@@ -331,7 +331,7 @@ def _arm_options(mode: str, model: Path | None, detector: str | None) -> dict[st
 
 def _serve(screen: Screen, body: Any, served: AbstractContextManager[str], *, piped: bool) -> None:
     """Serve until a signal comes, stop the robot, and leave the network."""
-    from strands_robots.device_connect.process import StopSignal  # noqa: PLC0415 - loads nothing of the framework
+    from strands_robots.threads import StopSignal  # noqa: PLC0415 - loads nothing of the framework
 
     with StopSignal() as signals:
         with served as peer_id:

@@ -17,7 +17,7 @@ from typing import Any
 from strands_robots.dashboard.page_robots import PageRobot
 from strands_robots.envelope import Envelope, error, is_error, text_of
 from strands_robots.policies.base import plain_numbers
-from strands_robots.safety.lease_signatures import sign_take
+from strands_robots.safety.resume import sign_take
 from strands_robots.safety.stopping import grade
 from strands_robots.serving.control import HUMAN
 from strands_robots.serving.verbs import LEASE_ID

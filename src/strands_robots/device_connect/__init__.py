@@ -28,12 +28,12 @@ if TYPE_CHECKING:
         stop_device_connect,
     )
     from strands_robots.device_connect.client import FleetClient, connect_agent
-    from strands_robots.device_connect.process import LOOP_JOIN_TIMEOUT_S as _LOOP_JOIN_TIMEOUT_S
-    from strands_robots.device_connect.process import StopSignal
     from strands_robots.device_connect.reachy_mini_driver import ReachyMiniDriver
     from strands_robots.device_connect.robot_driver import RobotDeviceDriver
     from strands_robots.device_connect.simulation_driver import SimulationDeviceDriver
     from strands_robots.safety.sightings import DuplicateDeviceError
+    from strands_robots.threads import LOOP_JOIN_TIMEOUT_S as _LOOP_JOIN_TIMEOUT_S
+    from strands_robots.threads import StopSignal
 
 __all__ = [
     "_LOOP_JOIN_TIMEOUT_S",
@@ -55,7 +55,7 @@ __all__ = [
 
 _HERE = "strands_robots.device_connect"
 _HOMES = {
-    "_LOOP_JOIN_TIMEOUT_S": f"{_HERE}.process",
+    "_LOOP_JOIN_TIMEOUT_S": "strands_robots.threads",
     "DeviceRuntime": "device_connect_edge",
     "DuplicateDeviceError": "strands_robots.safety.sightings",
     "FleetClient": f"{_HERE}.client",
@@ -63,7 +63,7 @@ _HOMES = {
     "ReachyMiniDriver": f"{_HERE}.reachy_mini_driver",
     "RobotDeviceDriver": f"{_HERE}.robot_driver",
     "SimulationDeviceDriver": f"{_HERE}.simulation_driver",
-    "StopSignal": f"{_HERE}.process",
+    "StopSignal": "strands_robots.threads",
     "connect_agent": f"{_HERE}.client",
     "init_device_connect": f"{_HERE}.bringup",
     "init_device_connect_sync": f"{_HERE}.bringup",

@@ -16,7 +16,7 @@ from collections import Counter
 from collections.abc import Collection
 from concurrent.futures import Future
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Self
 
 from device_connect_edge.drivers import DeviceDriver
 from device_connect_edge.messaging import MessagingError
@@ -29,7 +29,6 @@ from strands_robots.device_connect.backends.base import NoResponderError
 from strands_robots.device_connect.backends.config import insecure_opt_in, link_for
 from strands_robots.device_connect.base_driver import RobotDriver
 from strands_robots.device_connect.presence import encoded_capabilities
-from strands_robots.device_connect.process import LOOP_JOIN_TIMEOUT_S, DeviceLoop, enter_loop
 from strands_robots.device_connect.robot_driver import (
     MobileBaseDeviceDriver,
     NavigatingBaseDeviceDriver,
@@ -46,6 +45,7 @@ from strands_robots.device_connect.simulation_driver import SimulationDeviceDriv
 from strands_robots.safety.sightings import DuplicateDeviceError
 from strands_robots.serving.workers import called
 from strands_robots.tags import tags_of
+from strands_robots.threads import LOOP_JOIN_TIMEOUT_S, LoopThread
 from strands_robots.utils import ValidationError, choice, own_device_id, redacted
 
 logger = logging.getLogger(__name__)
@@ -505,3 +505,54 @@ def _depart_at_exit() -> None:
     for runtime, host in started.items():
         if not host.ended.wait(max(until - time.monotonic(), 0.0)):
             logger.warning("Device %s could not announce its departure.", runtime.device_id)
+
+
+class DeviceLoop(LoopThread):
+    """The event loop of devices; it ends when its last user has left.
+
+    The code of a robot runs on workers, so its device needs no loop of its own. The methods of a ready ``DeviceDriver``
+    are coroutines of somebody else; such a driver gets a loop of its own, where it blocks no other device.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("device-connect")
+        self._users = 0
+
+    def enter(self) -> Self:
+        """Begin one use."""
+        self._users += 1
+        return self
+
+    def leave(self) -> None:
+        """End one use; the last one ends loop and thread, without waiting for it."""
+        with _loops_lock:
+            self._users -= 1
+            if self._users:
+                return
+            if self in _loops:
+                _loops.remove(self)
+        self.end()
+
+    def join(self, within: float) -> bool:
+        """Wait for the thread to end where no user is left; False when it did not."""
+        with _loops_lock:
+            if self._users:
+                return True
+        return super().join(within)
+
+
+_loops_lock = threading.Lock()
+_loops: list[DeviceLoop] = []
+
+
+def enter_loop(*, alone: bool) -> DeviceLoop:
+    """Return the loop of the process's robots, or one for a driver ``alone``.
+
+    Every call needs one :meth:`DeviceLoop.leave`.
+    """
+    with _loops_lock:
+        if alone:
+            return DeviceLoop().enter()
+        if not _loops:
+            _loops.append(DeviceLoop())
+        return _loops[0].enter()

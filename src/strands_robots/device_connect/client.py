@@ -27,13 +27,12 @@ from strands_robots.device_connect.backends import LinkConfig, open_client
 from strands_robots.device_connect.backends.base import NoResponderError, ResponderLostError
 from strands_robots.device_connect.backends.config import network_of, usual_link
 from strands_robots.device_connect.discovery import DESCRIBE_S, HEARTBEATS_S, Discovery, Peer, parts
-from strands_robots.device_connect.process import LOOP_JOIN_TIMEOUT_S
 from strands_robots.envelope import Envelope, error
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety.sightings import sightings
 from strands_robots.safety.statements import Purpose
 from strands_robots.safety.stopping import Outcome, explain, grade
-from strands_robots.threads import LoopThread
+from strands_robots.threads import LOOP_JOIN_TIMEOUT_S, LoopThread
 from strands_robots.utils import ValidationError, device_id, finite, shown, text
 
 if TYPE_CHECKING:

@@ -15,10 +15,9 @@ from strands_robots import settings
 from strands_robots._mesh_switch import mesh_env_request
 from strands_robots.contract import body_of, holds_robots
 from strands_robots.mesh import session, topics
-from strands_robots.mesh.children import Children
 from strands_robots.mesh.commands import CommandReceiver, SenderCheck, execute_on, pong
 from strands_robots.mesh.input_receiver import InputReceiver, InputSide, TeleopReceivers, join
-from strands_robots.mesh.presence import DESCRIBE_S, PresencePublisher
+from strands_robots.mesh.presence import DESCRIBE_S, Children, PresencePublisher
 from strands_robots.mesh.rpc import Requester
 from strands_robots.mesh.safety import FleetSafety, OnAnswers, status_of
 from strands_robots.mesh.safety_adapter import SafetyAdapter

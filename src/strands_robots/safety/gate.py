@@ -22,9 +22,8 @@ from typing import Literal, ParamSpec, Protocol, TypeVar
 
 from strands_robots.envelope import Envelope, error
 from strands_robots.errors import StrandsRobotsError
-from strands_robots.identity_map import IdentityMap
 from strands_robots.safety.process import AWAKE, AwakeClock
-from strands_robots.utils import MissingExtraError, ValidationError
+from strands_robots.utils import IdentityMap, MissingExtraError, ValidationError
 
 P = ParamSpec("P")
 T = TypeVar("T")

@@ -1,18 +1,27 @@
-"""Resume: the operator's signed one, and ``resume --local``.
+"""The operator's orders: to resume, signed or ``--local``, and to take a robot from its holder.
 
 An assertion is exactly ``v``, ``epoch``, ``targets``, ``t``, ``nonce`` and ``sig``, the Ed25519 signature over the
 canonical JSON of the other five. It clears one epoch of the robots it names, once, within a minute. Why one was
 refused is for the local audit; the sender learns only that it was.
+
+The order to take a robot names it and the epoch of its control lease. That epoch rises with each holder, so an order is
+good once, and a restarted process begins above all epochs of the one before, so that a recorded order never fits again.
+Neither a clock that is set back nor a second process with the same state directory changes that. The file
+``control-epochs`` there has one byte for each robot that ever reserved its first epoch; the byte's place is the high
+part of the epoch. The low part is random, so that a state directory that was lost or put back does not bring an epoch
+back either.
 """
 
 from __future__ import annotations
 
 import contextlib
 import json
+import os
 import secrets
 import threading
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
@@ -25,6 +34,7 @@ from strands_robots.safety.lockout import is_epoch
 from strands_robots.safety.persistence import LockoutStore
 from strands_robots.state_files import (
     StateFileError,
+    adopt,
     boot,
     make_private,
     read_private,
@@ -386,3 +396,94 @@ def _sweep(directory: Path) -> None:
             left = path.suffix in (".taken", ".draft", ".said") or path.name.startswith(".")
             if left and time.time() - path.lstat().st_mtime > VALID_S:
                 path.unlink()
+
+
+TAKE_PURPOSE = "take-control"
+TAKE_FIELDS = frozenset({"v", "purpose", "robot", "epoch", "t", "nonce", "sig"})
+"""Fields of the operator's assertion; ``sig`` is the Ed25519 signature over the canonical JSON of the others."""
+
+TAKE_TEXT_MAX = 1024
+"""Longest text of a field, in characters."""
+
+
+EPOCHS_EACH = 2**28
+"""Epochs from one reservation to the next; the first half is where a lease may begin."""
+
+
+def sign_take(signing_key: Any, robot: str, epoch: int, *, clock: Callable[[], float] = time.time) -> dict[str, Any]:
+    """Return the operator's assertion that takes ``robot`` from its holder."""
+    body = {
+        "v": VERSION,
+        "purpose": TAKE_PURPOSE,
+        "robot": robot,
+        "epoch": epoch,
+        "t": clock(),
+        "nonce": secrets.token_hex(16),
+    }
+    return {**body, "sig": ed25519.encode(signing_key.sign(canonical_json(body)))}
+
+
+def unproven_take(assertion: object, robot: str, keys: Sequence[bytes]) -> str | None:
+    """Return why none of ``keys`` has signed that ``robot`` be taken, or None."""
+    if not assertion:
+        return "it needs the operator's signature (assertion; strands-robots take --key FILE)"
+    if not isinstance(assertion, Mapping) or set(assertion) != TAKE_FIELDS:
+        return f"assertion must have exactly the fields {', '.join(sorted(TAKE_FIELDS))}"
+    misshapen = sorted(name for name, value in assertion.items() if not _is_scalar(value))
+    if misshapen or not isinstance(assertion["nonce"], str):
+        return f"{', '.join(misshapen) or 'nonce'} of the assertion is none that an operator's machine makes"
+    body = {name: value for name, value in assertion.items() if name != "sig"}
+    signature = ed25519.decode(assertion["sig"], 64)
+    try:
+        signed = signature is not None and ed25519.signed_by_one_of(keys, signature, canonical_json(body))
+    except ValueError:  # a number that JSON cannot carry
+        signed = False
+    if not signed:
+        return "no configured key made the signature"
+    if (body["v"], body["purpose"], body["robot"]) != (VERSION, TAKE_PURPOSE, robot):
+        return f"the assertion is for something else than taking control of {robot}"
+    return None
+
+
+def outdated_take(assertion: Mapping[str, Any], epoch: int, now: float) -> str | None:
+    """Return why it is not for the lease of ``epoch`` at ``now``, or None.
+
+    Args:
+        assertion: one that is not :func:`unproven_take`.
+        now: wall-clock seconds.
+    """
+    named, at = assertion["epoch"], assertion["t"]
+    if named != epoch or isinstance(named, bool):
+        return f"the assertion names epoch {shown(named)}, and the lease has epoch {epoch}"
+    if isinstance(at, bool) or not isinstance(at, int | float) or not -NEWEST_S < now - at < OLDEST_S:
+        return "the assertion is not fresh"
+    return None
+
+
+def _is_scalar(value: object) -> bool:
+    return isinstance(value, int | float) or (isinstance(value, str) and len(value) <= TAKE_TEXT_MAX)
+
+
+def reserve_epochs() -> int:
+    """Return an epoch above all that were ever reached here, kept on the disk.
+
+    Raises:
+        OSError: the state directory cannot be written.
+        StateFileError: it, or the file, is not this user's alone.
+    """
+    root = state_dir()
+    path = root / "control-epochs"
+    adopt(root)
+    make_private(root)
+    require_private(root, root)
+    with suppress(FileNotFoundError):
+        read_private(path, root, longest=0)
+    descriptor = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+    try:
+        os.write(descriptor, b".")
+        os.fsync(descriptor)
+        # Appending is atomic: no other process ends its byte at this place.
+        place = os.lseek(descriptor, 0, os.SEEK_CUR)
+    finally:
+        os.close(descriptor)
+    return place * EPOCHS_EACH + secrets.randbelow(EPOCHS_EACH // 2)

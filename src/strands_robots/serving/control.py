@@ -6,7 +6,7 @@ and a lockout is separate and stronger. A lease prevents accidents among program
 authorization and the operator's approval.
 
 Leases live in memory: a restart of the robot's process ends them all. Their epochs outlive it, see
-:mod:`~strands_robots.safety.lease_signatures`.
+:mod:`~strands_robots.safety.resume`.
 
 Nothing foreign delays the end of a lease. The stop executor carries out the halt, its verdict and the observers come
 afterwards, and a robot whose state cannot be read in time counts as moving.
@@ -29,9 +29,8 @@ from strands_robots.contract import Observers
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety.authorization import ANONYMOUS, Leave, caller_name
-from strands_robots.safety.lease_signatures import outdated, reserve_epochs, unproven
 from strands_robots.safety.process import undisturbed
-from strands_robots.safety.resume import configured_keys
+from strands_robots.safety.resume import configured_keys, outdated_take, reserve_epochs, unproven_take
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.workers import UNBOUNDED, BoundedCall
 from strands_robots.stop_log import stop_logger
@@ -395,13 +394,13 @@ class ControlLease:
 
         Args:
             robot: the name that the assertion has to bear.
-            assertion: of :func:`~strands_robots.safety.lease_signatures.sign_take`.
+            assertion: of :func:`~strands_robots.safety.resume.sign_take`.
         """
         holder, keys = caller_name(caller) or ANONYMOUS, self._keys()
         problem = self._unproven(robot, assertion, keys)
         with self._changing:
             if problem is None and keys:
-                problem = outdated(cast("dict[str, Any]", assertion), self.epoch, self._wall())
+                problem = outdated_take(cast("dict[str, Any]", assertion), self.epoch, self._wall())
             before = self._lease
             lease = self._give(holder, HUMAN, TTL_S) if problem is None else None
             epoch = self.epoch
@@ -625,7 +624,7 @@ class ControlLease:
         if not keys:
             setting = "STRANDS_MESH_RESUME_PUBLIC_KEY; strands-robots keys resume"
             return f"no operator's key is configured here ({setting})" if self.hardware else None
-        problem = unproven(assertion, robot, keys)
+        problem = unproven_take(assertion, robot, keys)
         if problem is not None:
             return problem
         unreserved = self._unreserved()

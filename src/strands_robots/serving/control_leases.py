@@ -11,7 +11,6 @@ from typing import Any, Protocol, cast
 
 from strands_robots.contract import Observers, Robot, WorldRobot, body_of, holds_robots, robots_in, task_runs
 from strands_robots.envelope import Envelope, is_error, success
-from strands_robots.identity_map import IdentityMap
 from strands_robots.safety.authorization import Leave
 from strands_robots.safety.stop_executor import stop_executor
 from strands_robots.safety.stopping import StopVerdict
@@ -28,7 +27,7 @@ from strands_robots.serving.stops import RobotStop, stop_within
 from strands_robots.serving.verbs import LEASE_ID, LEASE_ID_MAX, TTL_MAX_S, TTL_MIN_S, Arguments, Kind, Verb, table
 from strands_robots.serving.workers import Share, ShareFullError
 from strands_robots.stop_log import stop_logger
-from strands_robots.utils import choice, number, text
+from strands_robots.utils import IdentityMap, choice, number, text
 from strands_robots.verb_parameters import Parameter
 
 logger = stop_logger(__name__)

@@ -21,7 +21,6 @@ from weakref import WeakKeyDictionary
 from strands_robots import settings
 from strands_robots.contract import Robot, body_of
 from strands_robots.envelope import Envelope, RefusalReason, Refused, error, is_error
-from strands_robots.identity_map import IdentityMap
 from strands_robots.safety.authorization import Approval, Leave, digest
 from strands_robots.safety.gate import REFUSALS, MotionGate, MotionRefused, MotionRequest, refusal_envelope
 from strands_robots.serving.control import NotHolderError
@@ -31,7 +30,7 @@ from strands_robots.serving.policy_arguments import MOCK, MOCK_REFUSED
 from strands_robots.serving.verbs import LEASE_ID, LEASE_NAMES, LEASE_TTL_S, Arguments, Kind, Verb
 from strands_robots.serving.workers import Shares, shares_of
 from strands_robots.stop_log import stop_logger
-from strands_robots.utils import ValidationError
+from strands_robots.utils import IdentityMap, ValidationError
 
 logger = stop_logger(__name__)
 

@@ -21,8 +21,8 @@ from typing import Any, Generic, TypeVar
 
 from strands_robots.contract import body_of
 from strands_robots.errors import StrandsRobotsError
-from strands_robots.identity_map import IdentityMap
 from strands_robots.stop_log import stop_logger
+from strands_robots.utils import IdentityMap
 
 logger = stop_logger(__name__)
 

@@ -87,7 +87,6 @@ RECEIVERS = {
     "drivers/reachy/rest.py": "512 KiB, of a stop 64 KiB, read in parts",
     "fleet/mesh/peers.py": "by the transport: the topic's own bound",
     "fleet/mesh/stops.py": "by the transport: the topic's own bound",
-    "mesh/children.py": "by the transport: the topic's own bound",
     "mesh/core.py": "by the transport: the topic's own bound",
     "mesh/input_receiver.py": "by the transport: the topic's own bound",
     "mesh/presence.py": "by the transport: the topic's own bound",

@@ -16,7 +16,7 @@ from fixtures.waiting import eventually
 
 from strands_robots.device_connect import FleetClient, LinkConfig
 from strands_robots.safety import ed25519
-from strands_robots.safety.lease_signatures import sign_take
+from strands_robots.safety.resume import sign_take
 
 KEY = Ed25519PrivateKey.generate()
 RESTARTS = 5

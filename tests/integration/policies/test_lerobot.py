@@ -13,7 +13,7 @@ import pytest
 from fixtures.bodies import StepClock
 from fixtures.ending import NAMED, ended
 
-from strands_robots.evaluation.episode import run_episode
+from strands_robots.evaluation import run_episode
 from strands_robots.policies import create_policy
 from strands_robots.policies.base import PolicyError
 from strands_robots.policies.bench import StillBody

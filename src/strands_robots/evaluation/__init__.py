@@ -1,1 +1,0 @@
-"""Evaluation of policies in simulation: tasks, experts, episodes, report."""
