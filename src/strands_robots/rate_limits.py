@@ -9,6 +9,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Hashable
+from contextlib import suppress
 
 KEYS_MAX = 256
 """Keys remembered, so that invented names take no memory."""
@@ -54,7 +55,8 @@ class EventBudget:
         over = now - since >= self._window_s
         self._keys[key] = (now, 1) if over else (since, count + 1)
         while len(self._keys) > KEYS_MAX:
-            del self._keys[next(iter(self._keys))]
+            with suppress(RuntimeError, StopIteration):  # another thread counts at this moment
+                self._keys.pop(next(iter(self._keys)), None)
         self._all = (self._all[0], self._all[1] + 1) if now - self._all[0] < self._window_s else (now, 1)
         return max(0, count - int(self._each)) if over else 0
 

@@ -134,6 +134,7 @@ class DeviceBody:
             self.bring_up(self.device)
             self._lost, self._was_connected = False, True
             self.speeds = default_speeds(self.device) | self._speeds
+            self._read_joints = joint_reader(self.device)
             # A driver that connects switches the torque on.
             self._limp = set()
 

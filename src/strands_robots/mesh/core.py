@@ -313,13 +313,13 @@ class Mesh(SensorLoopsMixin):
         if dropped:
             logger.info("%s left the mesh and dropped %d subscriptions.", self.peer_id, dropped)
         self._presence.stop()
-        self._safety.leave()
         if self.children is not None:
             self.children.close()
         for handle in self._handles:
             handle.undeclare()
         self._handles = []
         alive += self._pipeline.close(left()) + self._delivery.stop(left()) + join(streams, left())
+        self._safety.leave()
         self._context.transport = None
         self._unwatch()
         if self.robot is not None:

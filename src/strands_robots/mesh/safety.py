@@ -170,8 +170,8 @@ class FleetSafety:
             if absent and time.monotonic() - published >= SPACING_S:
                 # A link that was down when the stop was published may be back: the same stop again.
                 published = time.monotonic()
-                self._open_link()
                 self._publish_estop(order, none, signing_key)
+                self._open_link()
             return absent
 
         replies = self._requester.broadcast({"action": "stop"}, COLLECT_S, missing)

@@ -1,8 +1,9 @@
 """Emergency stops as a process receives them, and its questions for missed ones.
 
-Stops and check-ins arrive on a Zenoh session of their own, whose callbacks hand over to the e-stop listener's thread:
-nothing that the presence session carries is before them. The presence session is their second way, and the only one
-over MQTT and in memory. A repetition is known by its epoch.
+Stops and check-ins arrive on a Zenoh session of their own. Its callbacks hand stops over to the e-stop listener's
+thread, so nothing that the presence session has queued is before them. Zenoh reads all sessions of a process with the
+same few threads: a callback of the presence session hands over as well, and waits for nothing. That session is the
+second way of stops, and the only one over MQTT and in memory. A repetition is known by its epoch.
 """
 
 from __future__ import annotations
@@ -87,12 +88,17 @@ class MeshStopLink:
         def handler(event: str) -> Callable[[Sample], None]:
             return lambda sample: on_event(event, sample.key.split("/", 2)[1], sample.payload)
 
+        callbacks = {topic("*"): handler(event) for event, topic in TOPICS.items()}
         if self._on_check_in is not None:
-            self._declared.append(transport.declare_subscriber(topics.check_in("*"), self._on_presence_check_in))
+            callbacks[topics.check_in("*")] = self._on_presence_check_in
         # No topic names who stops: until the message is read, a session stands for its sender.
         self.on_stop = partial(on_event, ESTOP)
-        for event, topic in TOPICS.items():
-            self._declared.append(transport.declare_subscriber(topic("*"), handler(event)))
+        try:
+            for key, callback in callbacks.items():
+                self._declared.append(transport.declare_subscriber(key, callback))
+        except TransportError:
+            self.close()
+            raise
         on_state(True)
         self._end_looks = repeat("missed stops", LOOK_HZ, self._look)
 
@@ -120,7 +126,7 @@ class MeshStopLink:
 
     def _on_presence_check_in(self, sample: Sample) -> None:
         # A signed check-in counts once: its second copy would be refused as one played again.
-        if self._on_check_in is not None and not self.up:
+        if self._on_check_in is not None and (sample.sessionless or not self.up):
             self._on_check_in(sample)
 
     def _look(self) -> None:
@@ -316,7 +322,14 @@ class PeerStops:
                 asks=adapter.moves,
             )
             self._link = registration.link if isinstance(registration.link, MeshStopLink) else None
-        registration.open()
+        try:
+            registration.open()
+        except TransportError:
+            # The next stop or check-in opens it anew.
+            with self._joining:
+                self._registered.pop(name, None)
+                registration.close()
+            raise
 
     def connect(self, peer: StopPeer) -> None:
         """Have a connection for stops alone; as :meth:`open` besides."""
@@ -333,11 +346,12 @@ class PeerStops:
             registration = self._registered.pop(name, None)
             last = not self.peers and self._all.pop((self._transport, self._plane), None) is not None
             subscription, self._subscription = self._subscription, None if last else self._subscription
+            if registration is not None:
+                # Who joins meanwhile gets a link of its own, and not the end of this one.
+                registration.close()
         if last:
             undeclare([] if subscription is None else [subscription])
             self._notes.close()
-        if registration is not None:
-            registration.close()
 
     @property
     def has_link(self) -> bool:
@@ -357,7 +371,7 @@ class PeerStops:
                 self._audit("remote_estop_redundant", issuer, estop_id=epoch, reason="resumed since")
                 return
         stop = StopEvent(ESTOP, sample.session or "", sample.payload, time.monotonic(), self.network.text, self.codec)
-        self._listener.accept(stop, "mesh", fields)
+        self._listener.accept(stop, "mesh", fields, only_way=sample.sessionless)
 
     def publish(self, key: str, body: Mapping[str, Any]) -> bool:
         """Publish on the connection for stops; False where that is not up.

@@ -169,7 +169,11 @@ class RobotsPort(MissedStopsPort):
         return [each.name for each in self._members() if each.asks]
 
     def publish(self, event: str, source: str, fields: Mapping[str, Any]) -> bool:
-        return self._link.publish(source, event, self._codec.encode(event, fields))
+        try:
+            payload = self._codec.encode(event, fields)
+        except ValueError:  # more than its network carries
+            return False
+        return self._link.publish(source, event, payload)
 
     def signer(self) -> tuple[str, SigningIdentity | None]:
         members = self._members()
@@ -286,8 +290,11 @@ class EstopListener:
             opened: False to have a new link opened by :meth:`ListenerRegistration.open` only.
         """
         with self._registering:
+            rules = self._make_rules() if self._inbox is None else self._rules
+            if asks:
+                rules.require_keys()  # what only sends stops needs none
             if self._inbox is None:
-                self._start()
+                self._start(rules)
             link = next((each.link for each in self._registrations if each.key == key), None)
             made = make() if link is None else link
             registration = ListenerRegistration(self, robot_id, key, made, identity, network, was_here, codec, asks)
@@ -306,7 +313,12 @@ class EstopListener:
                 link = OpenLink(_text(registration.network), registration.codec, missed)
                 self._open[registration.key] = link
                 receive = functools.partial(self.receive, link=link)
-                registration.link.open(EVENTS, receive, lambda up: missed.link_up() if up else missed.link_down())
+                try:
+                    registration.link.open(EVENTS, receive, lambda up: missed.link_up() if up else missed.link_down())
+                except Exception:
+                    del self._open[registration.key]
+                    missed.close()
+                    raise
 
     def unregister(self, registration: ListenerRegistration) -> None:
         """Serve a device no longer; the thread ends with the last one."""
@@ -340,7 +352,9 @@ class EstopListener:
         for link in tuple(self._open.values()):
             link.missed.ask("the process did not run for a while")
 
-    def accept(self, stop: StopEvent, path: str, fields: Mapping[str, Any] | None = None) -> None:
+    def accept(
+        self, stop: StopEvent, path: str, fields: Mapping[str, Any] | None = None, *, only_way: bool = False
+    ) -> None:
         """Act on an emergency stop of any network; return at once.
 
         The listener's thread calls it for what its links received. A network that receives stops over a further
@@ -350,13 +364,15 @@ class EstopListener:
         Args:
             path: how it arrived.
             fields: of its payload, where they were read already.
+            only_way: it cannot arrive at the listener's own link.
         """
         codec, source = stop.codec, stop.source
         stated = codec.fields(stop.payload) if fields is None else fields
         if self._plane.under_way(stated.get("estop_id")):
             return
         events = self._inbox.events if self._inbox is not None and path == LISTENER else None
-        if events is None and codec.vouches(self._rules) and not self._budget.allows(source, time.monotonic()):
+        further = events is None and not only_way
+        if further and codec.vouches(self._rules) and not self._budget.allows(source, time.monotonic()):
             return
         order = codec.order(self._rules, stop, stated, path)
         if isinstance(order, StopOrder):
@@ -367,9 +383,9 @@ class EstopListener:
         elif order is not None:
             if not codec.refused(order):
                 self._record_refusal(order, stop.event)
-            if events is None:
+            if further:
                 self._budget.count(source, time.monotonic())
-            elif not events.vouched_for(source):
+            elif events is not None and not events.vouched_for(source):
                 # In a flood the link's thread needs the interpreter to receive what comes behind it.
                 time.sleep(REFUSED_PAUSE_S)
 
@@ -432,9 +448,8 @@ class EstopListener:
         port = RobotsPort(self._plane, self._rules, registration, members, self._answer)
         return MissedStops(port, registration.codec.fields)
 
-    def _start(self) -> None:
-        self._rules = self._make_rules()
-        self._rules.require_keys()
+    def _start(self, rules: StopRules) -> None:
+        self._rules = rules
         self._check_ins = CheckInRules(self._rules)
         audit_head(), own_log_id(), own_run()  # read from the disk now, so that no stop waits for it
         self._end_short_slices = shorten_time_slices()
