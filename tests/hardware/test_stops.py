@@ -443,3 +443,57 @@ def test_cleanup_of_a_robot_that_was_never_connected_ends_and_claims_nothing() -
     robot = HardwareRobot(RecordingDevice(), "arm")
     answer = robot.cleanup()
     assert (answer["status"], answer["stopped"]) == ("success", None)
+
+
+class ClosedBus(SimpleNamespace):
+    """A bus of one motor, whose port is closed."""
+
+    def __init__(self) -> None:
+        super().__init__(motors={"a": 1})
+
+    def sync_read(self, register: str) -> dict[str, float]:
+        raise OSError("the port is closed")
+
+
+class OpenBus(ClosedBus):
+    """The same, open."""
+
+    def sync_read(self, register: str) -> dict[str, float]:
+        return {"a": 10.0}
+
+
+class BusMakingDevice:
+    """A device that makes its bus as it connects, and whose camera does not answer."""
+
+    name = "maker"
+
+    def __init__(self, bus: ClosedBus | None) -> None:
+        self.action_features = {"a.pos": float}
+        self.observation_features = {"a.pos": float, "front": (4, 4, 3)}
+        self.bus, self.is_connected = bus, False
+        self.sent: list[dict[str, float]] = []
+
+    def connect(self, calibrate: bool = False) -> None:
+        self.bus, self.is_connected = OpenBus(), True
+
+    def disconnect(self) -> None:
+        self.is_connected = False
+
+    def get_observation(self) -> dict[str, Any]:
+        raise TimeoutError("the camera does not answer")
+
+    def send_action(self, action: dict[str, float]) -> dict[str, float]:
+        self.sent.append(action)
+        return action
+
+
+@pytest.mark.parametrize("bus_before", [None, ClosedBus()])
+def test_a_halt_reads_the_bus_that_the_device_made_as_it_connected(bus_before: ClosedBus | None) -> None:
+    device = BusMakingDevice(bus_before)
+    robot = HardwareRobot(device, "maker")
+    robot.connect()
+    try:
+        assert robot.halt("test").stopped is True
+        assert device.sent == [{"a.pos": 10.0}]
+    finally:
+        robot.cleanup()
