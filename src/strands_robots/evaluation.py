@@ -1,4 +1,4 @@
-"""Policies tried on tasks: goals that the simulator judges, set up from a seed; episodes, and the report of many."""
+"""Policies tried on tasks in simulation, and the report of many episodes."""
 
 from __future__ import annotations
 

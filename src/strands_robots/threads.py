@@ -1,4 +1,4 @@
-"""Threads that stand ready, are woken or do jobs in order, event loops, and the signal that ends a program."""
+"""Threads that are ready, woken or in order; event loops; the end of a program."""
 
 from __future__ import annotations
 

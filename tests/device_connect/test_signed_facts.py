@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from fixtures.toy_robots import ToyRobot
 
-from strands_robots.device_connect.safety_registration import SafetyRegistration
+from strands_robots.device_connect.device_stops import SafetyRegistration
 from strands_robots.safety.statements import Purpose, own_key
 
 

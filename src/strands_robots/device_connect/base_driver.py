@@ -20,9 +20,8 @@ from device_connect_edge.types import DeviceIdentity, DeviceStatus, EventDef, Fu
 from strands_robots import settings
 from strands_robots.contract import Haltable, Robot, RolloutEvent, Unsubscribe, observe
 from strands_robots.device_connect._compat import CollectedOnce, Runtime, describe_anew, emit, observed, on, rpc
-from strands_robots.device_connect.device_stops import DeviceStops, stops_of
+from strands_robots.device_connect.device_stops import DeviceStops, SafetyRegistration, stops_of
 from strands_robots.device_connect.presence import lock_stated
-from strands_robots.device_connect.safety_registration import SafetyRegistration
 from strands_robots.device_connect.telemetry import (
     READ_DEADLINE_S,
     Activity,

@@ -28,18 +28,18 @@ from strands_robots.device_connect.backends import LinkConfig
 from strands_robots.device_connect.backends.base import NoResponderError
 from strands_robots.device_connect.backends.config import insecure_opt_in, link_for
 from strands_robots.device_connect.base_driver import RobotDriver
-from strands_robots.device_connect.presence import encoded_capabilities
-from strands_robots.device_connect.robot_driver import (
-    MobileBaseDeviceDriver,
-    NavigatingBaseDeviceDriver,
-    RobotDeviceDriver,
-)
-from strands_robots.device_connect.safety_registration import (
+from strands_robots.device_connect.device_stops import (
     LEAVE_TIMEOUT_S,
     REGISTRATIONS,
     SafetyRegistration,
     cell_of,
     register_safety,
+)
+from strands_robots.device_connect.presence import encoded_capabilities
+from strands_robots.device_connect.robot_driver import (
+    MobileBaseDeviceDriver,
+    NavigatingBaseDeviceDriver,
+    RobotDeviceDriver,
 )
 from strands_robots.device_connect.simulation_driver import SimulationDeviceDriver
 from strands_robots.safety.sightings import DuplicateDeviceError

@@ -1,4 +1,4 @@
-"""The operator's orders: to resume, signed or ``--local``, and to take a robot from its holder.
+"""Orders of the operator: to resume robots, and to take one from its holder.
 
 An assertion is exactly ``v``, ``epoch``, ``targets``, ``t``, ``nonce`` and ``sig``, the Ed25519 signature over the
 canonical JSON of the other five. It clears one epoch of the robots it names, once, within a minute. Why one was
