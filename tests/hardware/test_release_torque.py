@@ -17,7 +17,7 @@ from strands_robots.safety.authorization import Approval
 from strands_robots.safety.lockout import LockoutLatch
 from strands_robots.serving.peer_verbs import PEER_VERBS
 from strands_robots.serving.pipeline import Command, Pipeline, Result
-from strands_robots.serving.robot_verbs import ARM_VERBS
+from strands_robots.serving.robot_verbs import TASK_VERBS
 from strands_robots.serving.verbs import Arguments
 
 ALL = ["pan", "lift", "grip"]
@@ -38,7 +38,7 @@ def locked(robot: HardwareRobot) -> HardwareRobot:
     return robot
 
 
-def served(robot: Any, *approved: str, allowed: bool = True, verbs: Any = ARM_VERBS, **arguments: Any) -> Result:
+def served(robot: Any, *approved: str, allowed: bool = True, verbs: Any = TASK_VERBS, **arguments: Any) -> Result:
     def authorize(command: Command, checked: Arguments) -> None:
         if not allowed:
             raise Refused(RefusalReason.CALLER, "not you")
@@ -51,7 +51,7 @@ def served(robot: Any, *approved: str, allowed: bool = True, verbs: Any = ARM_VE
     return results[0]
 
 
-@pytest.mark.parametrize("verbs", [ARM_VERBS, PEER_VERBS], ids=["Device Connect", "mesh"])
+@pytest.mark.parametrize("verbs", [TASK_VERBS, PEER_VERBS], ids=["Device Connect", "mesh"])
 def test_a_locked_robot_lets_go_with_the_operators_approval_alone(robot: HardwareRobot, verbs: Any) -> None:
     refused = served(locked(robot), verbs=verbs)
     assert refused.refusal is not None
@@ -74,7 +74,7 @@ def test_a_halt_that_came_after_the_call_does_not_refuse_it(robot: HardwareRobot
     asked = line.pending.arrive()
     robot.halt("test")
     results: list[Result] = []
-    line.serve(Command(ARM_VERBS["releaseTorque"], {}, "agent", asked), results.append)
+    line.serve(Command(TASK_VERBS["releaseTorque"], {}, "agent", asked), results.append)
     assert results[0].result["status"] == "success"
 
 

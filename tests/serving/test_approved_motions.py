@@ -23,7 +23,7 @@ from strands_robots.safety.gate import MotionRequest
 from strands_robots.serving import control
 from strands_robots.serving.peer_verbs import PEER_VERBS
 from strands_robots.serving.pipeline import Command, Pipeline, Result
-from strands_robots.serving.robot_verbs import ARM_VERBS
+from strands_robots.serving.robot_verbs import TASK_VERBS
 from strands_robots.serving.verbs import Arguments, Verb
 
 GOOD = {"instruction": "GOOD", "duration": 300.0}
@@ -63,7 +63,7 @@ def served(
     caller: str,
     arguments: Arguments = GOOD,
     verb: str = "execute",
-    verbs: Mapping[str, Verb] = ARM_VERBS,
+    verbs: Mapping[str, Verb] = TASK_VERBS,
 ) -> Result:
     results: list[Result] = []
     line.serve(Command(verbs[verb], arguments, caller, line.pending.arrive()), results.append)
@@ -77,9 +77,9 @@ def ok(result: Result) -> bool:
 @pytest.mark.parametrize(
     ("verb", "verbs", "said"),
     [
-        ("execute", ARM_VERBS, "arm-1 runs no tasks; it has verbs of its own."),
+        ("execute", TASK_VERBS, "arm-1 runs no tasks; it has verbs of its own."),
         ("execute", PEER_VERBS, "arm-1 runs no tasks; it has verbs of its own."),
-        ("pick", ARM_VERBS, "pick is refused: arm-1 lacks what it needs"),
+        ("pick", TASK_VERBS, "pick is refused: arm-1 lacks what it needs"),
         ("releaseTorque", PEER_VERBS, "releaseTorque is refused: arm-1 lacks what it needs"),
         ("nod", PEER_VERBS, "nod is refused: arm-1 lacks what it needs"),
     ],
@@ -181,7 +181,7 @@ def refuse_approval(robot: ToyRobot, line: Pipeline) -> Result:
 
 def refuse_late(robot: ToyRobot, line: Pipeline) -> Result:
     results: list[Result] = []
-    command = Command(ARM_VERBS["execute"], EVIL, "agent-b", line.pending.arrive())
+    command = Command(TASK_VERBS["execute"], EVIL, "agent-b", line.pending.arrive())
     robot.gate.revoke()
     line.serve(command, results.append)
     return results[0]
@@ -352,7 +352,7 @@ def test_another_callers_motion_is_refused_at_once_while_a_call_that_lasts_moves
         end.wait(120)
         return success("done")
 
-    lasting = replace(ARM_VERBS["execute"], begin=last)
+    lasting = replace(TASK_VERBS["execute"], begin=last)
     line, results = pipeline(robot, grants, "execute"), list[Result]()
     with ThreadPoolExecutor(2) as pool:
         try:

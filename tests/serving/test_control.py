@@ -17,7 +17,7 @@ from strands_robots.safety.resume import TAKE_PURPOSE, VERSION, sign_take
 from strands_robots.serving.control import ControlChange, ControlLease, LeaseWatch, NotHolderError
 from strands_robots.serving.control_leases import CONTROL_VERBS, leases_of
 from strands_robots.serving.pipeline import Command, Pipeline, Result
-from strands_robots.serving.robot_verbs import ARM_VERBS, WORLD_VERBS
+from strands_robots.serving.robot_verbs import TASK_VERBS, WORLD_VERBS
 from strands_robots.utils import canonical_json
 
 KEY = Ed25519PrivateKey.generate()
@@ -295,7 +295,7 @@ def pipeline(robot: Any, name: str = "arm-1") -> Pipeline:
 
 def served(line: Pipeline, caller: str, name: str, **arguments: Any) -> Result:
     results: list[Result] = []
-    verbs = {**ARM_VERBS, **WORLD_VERBS} if isinstance(line.robot, ToyWorld) else ARM_VERBS
+    verbs = {**TASK_VERBS, **WORLD_VERBS} if isinstance(line.robot, ToyWorld) else TASK_VERBS
     line.serve(Command(verbs[name], arguments, caller, line.pending.arrive()), results.append)
     return results[0]
 
@@ -315,7 +315,7 @@ def test_stop_and_reads_need_no_lease(robot: ToyRobot) -> None:
     served(line, "agent-a", "acquireControl")
     for verb in ("getStatus", "getFeatures", "getControl"):
         assert served(line, "agent-b", verb).result["status"] == "success"
-    assert not any(verb.leased for verb in ARM_VERBS.values() if verb.name in ("stop", "releaseTorque", "getState"))
+    assert not any(verb.leased for verb in TASK_VERBS.values() if verb.name in ("stop", "releaseTorque", "getState"))
 
 
 def test_take_control_stops_the_rollout_of_the_holder(robot: ToyRobot, monkeypatch: pytest.MonkeyPatch) -> None:

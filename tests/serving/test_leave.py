@@ -24,7 +24,7 @@ from strands_robots.serving.offered_verbs import own_verbs
 from strands_robots.serving.peer_verbs import PEER_VERBS
 from strands_robots.serving.pipeline import Command, Pipeline, Result
 from strands_robots.serving.reachy_verbs import REACHY_VERBS
-from strands_robots.serving.robot_verbs import ARM_VERBS, NAVIGATING_BASE_VERBS, WORLD_VERBS
+from strands_robots.serving.robot_verbs import NAVIGATING_BASE_VERBS, TASK_VERBS, WORLD_VERBS
 from strands_robots.serving.stops import OneRobot
 from strands_robots.serving.verbs import Verb
 
@@ -86,7 +86,7 @@ TASK = {"instruction": "wave"}
 PEER_TASK = {"instruction": "wave", "policy_provider": "mock", "duration": 1.0}
 POINT = {"x": 0.2, "y": 0.0, "z": 0.1}
 OURS = [
-    (arm, ARM_VERBS["execute"], TASK),
+    (arm, TASK_VERBS["execute"], TASK),
     (arm, PEER_VERBS["start"], PEER_TASK),
     (world, WORLD_VERBS["execute"], TASK),
     (world, PEER_VERBS["start"], PEER_TASK),
@@ -166,13 +166,13 @@ def test_task_of_a_strangers_robot_is_not_started(made: Callable[[], WithoutGate
     stranger = made()
     robot = adapt(stranger)
     assert isinstance(robot, AdaptedRobot)
-    assert "halted after it was asked for" in overtaken(robot, ARM_VERBS["execute"], **TASK)["reason"]
+    assert "halted after it was asked for" in overtaken(robot, TASK_VERBS["execute"], **TASK)["reason"]
     assert stranger.started == 0
 
 
 def test_strangers_permit_is_given_for_the_request() -> None:
     stranger = WithGate()
-    answer = overtaken(adapt(stranger), ARM_VERBS["moveJoints"], joints={"pan": 1.0})
+    answer = overtaken(adapt(stranger), TASK_VERBS["moveJoints"], joints={"pan": 1.0})
     assert "halted after it was asked for" in answer["reason"]
     assert stranger.started == 0
 
@@ -184,7 +184,9 @@ def test_verb_of_a_robots_own_is_not_begun() -> None:
     assert stranger.started == 0
 
 
-@pytest.mark.parametrize(("toy", "verbs"), [(ToyRobot(), ARM_VERBS), (ToyWorld(), WORLD_VERBS)], ids=["robot", "world"])
+@pytest.mark.parametrize(
+    ("toy", "verbs"), [(ToyRobot(), TASK_VERBS), (ToyWorld(), WORLD_VERBS)], ids=["robot", "world"]
+)
 def test_strangers_robot_with_the_whole_contract_is_refused_its_permit(toy: Any, verbs: dict[str, Verb]) -> None:
     answer = overtaken(toy, verbs["execute"], **TASK)
     assert "halted after it was asked for" in answer["reason"]

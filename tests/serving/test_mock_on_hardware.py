@@ -15,7 +15,7 @@ from strands_robots.hardware import HardwareRobot
 from strands_robots.safety.authorization import Approval
 from strands_robots.serving.peer_verbs import PEER_VERBS
 from strands_robots.serving.pipeline import Command, Pipeline, Result
-from strands_robots.serving.robot_verbs import ARM_VERBS
+from strands_robots.serving.robot_verbs import TASK_VERBS
 from strands_robots.simulation import Simulation
 
 
@@ -27,7 +27,7 @@ def arm() -> Iterator[HardwareRobot]:
     made.cleanup()
 
 
-def served(robot: Any, verb: Any = ARM_VERBS["execute"], *, hardware: bool = True, **arguments: Any) -> Result:
+def served(robot: Any, verb: Any = TASK_VERBS["execute"], *, hardware: bool = True, **arguments: Any) -> Result:
     approval = Approval(lambda _: ("execute", "start"), lambda: False)
     line = Pipeline.of(
         robot, lambda: "arm-1", hardware=hardware, authorize=lambda command, checked: None, approval=approval
@@ -40,8 +40,8 @@ def served(robot: Any, verb: Any = ARM_VERBS["execute"], *, hardware: bool = Tru
 @pytest.mark.parametrize(
     ("verb", "arguments"),
     [
-        (ARM_VERBS["execute"], {}),
-        (ARM_VERBS["execute"], {"policy_provider": "mock"}),
+        (TASK_VERBS["execute"], {}),
+        (TASK_VERBS["execute"], {"policy_provider": "mock"}),
         (PEER_VERBS["start"], {"policy_provider": "mock"}),
     ],
     ids=["by default", "by name", "on the mesh"],
@@ -85,4 +85,4 @@ def test_a_foreign_robot_decides_itself_what_its_default_policy_is(monkeypatch: 
 
 
 def test_the_schema_says_so_as_well() -> None:
-    assert "follows no instruction" in ARM_VERBS["execute"].by_name["policy_provider"].meaning
+    assert "follows no instruction" in TASK_VERBS["execute"].by_name["policy_provider"].meaning

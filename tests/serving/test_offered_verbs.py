@@ -26,7 +26,7 @@ from strands_robots.serving.control_leases import CONTROL_VERBS
 from strands_robots.serving.offered_verbs import offered
 from strands_robots.serving.peer_verbs import KINDS, PEER_VERBS, kind_of
 from strands_robots.serving.reachy_verbs import REACHY_VERBS
-from strands_robots.serving.robot_verbs import ARM_VERBS, WORLD_VERBS
+from strands_robots.serving.robot_verbs import TASK_VERBS, WORLD_VERBS
 from strands_robots.serving.stops import OneRobot
 from strands_robots.simulation import Simulation
 
@@ -114,31 +114,31 @@ def test_moving_world_is_not_waited_for(world: Simulation) -> None:
     ],
 )
 def test_real_robot_offers_what_its_device_has(robot: Callable[[], Any], more: set[str]) -> None:
-    assert set(offered(robot(), ARM_VERBS)) == OF_TASKS | more
+    assert set(offered(robot(), TASK_VERBS)) == OF_TASKS | more
 
 
 def test_camera_and_detector_of_a_real_arm_are_offered() -> None:
     device = ArmDevice()
     robot = real(device)
-    assert offered(robot, ARM_VERBS).keys().isdisjoint(PICTURE_VERBS)
+    assert offered(robot, TASK_VERBS).keys().isdisjoint(PICTURE_VERBS)
     device.cameras = {"front": SimpleNamespace()}  # type: ignore[attr-defined]
-    assert offered(robot, ARM_VERBS).keys() >= PICTURE_VERBS.keys()
+    assert offered(robot, TASK_VERBS).keys() >= PICTURE_VERBS.keys()
     robot.detector = lambda frames: []  # type: ignore[assignment]
-    assert "getObjects" in offered(robot, ARM_VERBS)
+    assert "getObjects" in offered(robot, TASK_VERBS)
 
 
 def test_arm_of_another_model_file_offers_its_jaws_when_it_states_them(tmp_path: Path) -> None:
     model = tmp_path / "arm.xml"
     model.write_text("<mujoco/>")
-    assert "pick" not in offered(real(PanTilt(), model=str(model)), ARM_VERBS)
+    assert "pick" not in offered(real(PanTilt(), model=str(model)), TASK_VERBS)
     robot = real(ArmDevice(), model=str(model))
-    assert offered(robot, ARM_VERBS).keys() >= {"moveTo", "pick", "setGripper"}
+    assert offered(robot, TASK_VERBS).keys() >= {"moveTo", "pick", "setGripper"}
 
 
 def test_model_that_is_loaded_decides() -> None:
     robot = real(ArmDevice())
     assert robot.arm().jaw is not None
-    assert set(offered(robot, ARM_VERBS)) == OF_TASKS | {*ARM_MOTION_VERBS} - {"getObjects"}
+    assert set(offered(robot, TASK_VERBS)) == OF_TASKS | {*ARM_MOTION_VERBS} - {"getObjects"}
 
 
 @pytest.mark.parametrize("method", ["pick", "release_torque", "camera_frames", "arm_pose"])
@@ -153,7 +153,7 @@ def test_foreign_robot_with_a_method_offers_its_verb(method: str) -> None:
         "camera_frames": set(PICTURE_VERBS),
         "arm_pose": {"getPose"},
     }
-    assert set(offered(adapt(More()), ARM_VERBS)) == OF_TASKS | verbs[method]
+    assert set(offered(adapt(More()), TASK_VERBS)) == OF_TASKS | verbs[method]
 
 
 def test_foreign_robot_that_states_a_picture_offers_its_cameras() -> None:
@@ -163,7 +163,7 @@ def test_foreign_robot_that_states_a_picture_offers_its_cameras() -> None:
         def get_observation(self) -> dict[str, Any]:
             raise AssertionError("no picture is taken to describe a robot")
 
-    assert set(offered(adapt(Seeing()), ARM_VERBS)) == {*OF_TASKS, *PICTURE_VERBS}
+    assert set(offered(adapt(Seeing()), TASK_VERBS)) == {*OF_TASKS, *PICTURE_VERBS}
 
 
 def test_reachy_offers_what_it_always_did() -> None:
@@ -205,12 +205,12 @@ def test_robot_whose_parts_cannot_be_told_is_described_all_the_same() -> None:
         def has_cameras(self) -> bool:
             raise OSError("no bus")
 
-    assert offered(adapt(Broken()), ARM_VERBS).keys() >= {*OF_TASKS, *PICTURE_VERBS}
+    assert offered(adapt(Broken()), TASK_VERBS).keys() >= {*OF_TASKS, *PICTURE_VERBS}
 
 
 def test_verb_that_is_not_offered_is_refused_by_its_reason() -> None:
     robot = real(PanTilt())
-    assert "pick" not in offered(robot, ARM_VERBS)
+    assert "pick" not in offered(robot, TASK_VERBS)
     answer = robot.pick(x=0.2, y=0.0, z=0.02)
     assert "no model of pan_tilt is known" in answer["reason"]
 
@@ -224,8 +224,8 @@ import sys
 from fixtures.pan_tilt import ArmDevice
 from strands_robots.hardware import HardwareRobot
 from strands_robots.serving.offered_verbs import offered
-from strands_robots.serving.robot_verbs import ARM_VERBS
-verbs = offered(HardwareRobot(ArmDevice(), "arm"), ARM_VERBS)
+from strands_robots.serving.robot_verbs import TASK_VERBS
+verbs = offered(HardwareRobot(ArmDevice(), "arm"), TASK_VERBS)
 print("pick" in verbs, [name for name in ("mujoco", "numpy") if name in sys.modules])
 """
 

@@ -13,7 +13,7 @@ from fixtures.toy_robots import ToyRobot
 from strands_robots.envelope import RefusalReason, Refused, error
 from strands_robots.safety.authorization import Approval, Grants
 from strands_robots.serving.pipeline import Command, Pipeline, Result
-from strands_robots.serving.robot_verbs import ARM_VERBS
+from strands_robots.serving.robot_verbs import TASK_VERBS
 from strands_robots.serving.verbs import Arguments
 from strands_robots.serving.workers import shares_of
 
@@ -42,7 +42,7 @@ def pipeline(robot: Any, *, allow: bool = True, approved: bool = True, grants: P
 
 def served(line: Pipeline, name: str = "execute", **arguments: Any) -> Result:
     results: list[Result] = []
-    line.serve(Command(ARM_VERBS[name], arguments, "agent", line.pending.arrive()), results.append)
+    line.serve(Command(TASK_VERBS[name], arguments, "agent", line.pending.arrive()), results.append)
     return results[0]
 
 
@@ -118,7 +118,7 @@ def test_a_closed_pipeline_refuses_and_names_what_still_runs(robot: ToyRobot) ->
     robot.before["start_task"] = wait_in_the_robot
     line = pipeline(robot)
     results: list[Result] = []
-    command = Command(ARM_VERBS["execute"], {"instruction": "wave"}, "agent", line.pending.arrive())
+    command = Command(TASK_VERBS["execute"], {"instruction": "wave"}, "agent", line.pending.arrive())
     line.shares.motion.submit(lambda: line.serve(command, results.append))
     assert started.wait(20.0)
     assert line.close() == ["execute"]

@@ -19,7 +19,7 @@ from strands_robots.mesh.security import validate_command
 from strands_robots.serving.arm_verbs import ARM_MOTION_VERBS, PICTURE_VERBS
 from strands_robots.serving.control_leases import CONTROL_VERBS
 from strands_robots.serving.peer_verbs import KINDS, PEER_VERBS
-from strands_robots.serving.robot_verbs import ARM_VERBS
+from strands_robots.serving.robot_verbs import TASK_VERBS
 from strands_robots.serving.verbs import REQUIRED, Kind, Parameter, Verb
 from strands_robots.tools import robot_mesh
 from strands_robots.utils import ValidationError, whole
@@ -66,7 +66,7 @@ def test_the_agent_tool_describes_a_task_as_execute_does() -> None:
     page = inspect.getdoc(inspect.unwrap(getattr(robot_mesh, "_tool_func", robot_mesh)))
     assert page is not None
     for name in ("instruction", "policy_provider", "duration"):
-        described = " ".join(ARM_VERBS["execute"].by_name[name].meaning.split())
+        described = " ".join(TASK_VERBS["execute"].by_name[name].meaning.split())
         assert described.lower() in " ".join(page.split()).lower(), name
 
 
@@ -96,7 +96,7 @@ def test_the_mesh_knows_the_documented_actions() -> None:
     ],
 )
 def test_every_kind_of_robot_has_its_motions_on_the_mesh_as_on_device_connect(kind: str, driver: Any) -> None:
-    own = {name for name, verb in driver.verbs.items() if verb.kind is Kind.MOTION} - set(ARM_VERBS)
+    own = {name for name, verb in driver.verbs.items() if verb.kind is Kind.MOTION} - set(TASK_VERBS)
     assert own
     assert own <= set(KINDS[kind]) <= set(PEER_VERBS)
     for name in own:

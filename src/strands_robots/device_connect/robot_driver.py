@@ -14,7 +14,7 @@ from strands_robots.device_connect.telemetry import Activity, rollout_fields
 from strands_robots.envelope import fields_of
 from strands_robots.policies.base import plain_numbers
 from strands_robots.safety.authorization import Approval, Authorization
-from strands_robots.serving.robot_verbs import ARM_VERBS, BASE_VERBS, NAVIGATING_BASE_VERBS
+from strands_robots.serving.robot_verbs import BASE_VERBS, NAVIGATING_BASE_VERBS, TASK_VERBS
 from strands_robots.serving.verbs import Verb
 
 
@@ -27,7 +27,7 @@ class RobotDeviceDriver(RobotDriver):
 
     device_type = "strands_robot"
     labels: ClassVar[Labels] = {"category": "robot"}
-    verbs: ClassVar[Mapping[str, Verb]] = ARM_VERBS
+    verbs: ClassVar[Mapping[str, Verb]] = TASK_VERBS
 
     def __init__(
         self,

@@ -30,7 +30,7 @@ from strands_robots.hardware.device_facts import (
 from strands_robots.kinematics import ArmParts, StatedJoint
 from strands_robots.policies.base import Action, checked_action, is_velocity, numbers
 from strands_robots.policies.check import RobotFacts
-from strands_robots.policies.rollout import Rollout, unfollowed
+from strands_robots.policies.rollout import Rollout, instruction_note
 from strands_robots.policies.settling import Settling, checked_rest_pose
 from strands_robots.policies.task_engine import RolloutsEnd, TaskEngine, failure, unfrozen
 from strands_robots.recording.cameras import LazyFrames
@@ -328,7 +328,7 @@ class HardwareRobot(ArmMixin, TeleopMixin):
         if problem:
             return error(f"start_task: {problem}.", **self._task_fields())
         return success(
-            f"{self.tool_name_str} started: {task.instruction}.{unfollowed(task)}",
+            f"{self.tool_name_str} started: {task.instruction}.{instruction_note(task)}",
             task_status="running",
             follows_instruction=task.follows_instruction,
             instruction=task.instruction,

@@ -446,11 +446,11 @@ class Planner:
                 lows[index] = highs[index] = begin[index]
         if not (self.free(begin) and self.free(goal)):
             return None
-        end_short_turns = shorten_time_slices()
+        restore_time_slices = shorten_time_slices()
         try:
             poses = path_around(begin, goal, (lows, highs), self._clear, self._going)
         finally:
-            end_short_turns()
+            restore_time_slices()
         return None if poses is None else [np.array(pair) for pair in itertools.pairwise(poses)]
 
     def _clear(self, first: Floats, last: Floats) -> bool:

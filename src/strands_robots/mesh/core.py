@@ -223,7 +223,7 @@ class Mesh(SensorLoopsMixin):
         with self._lifecycle_lock:
             if self._context.transport is not None:
                 return
-            self._adapter.refuse_taken(session.network())
+            self._adapter.leave_if_served_elsewhere(session.network())
             transport = self._parts.acquire()
             if transport is None:
                 return

@@ -28,7 +28,7 @@ logger = stop_logger(__name__)
 REPORT_S = 2.0
 """Seconds besides the halt deadline in which the plane reports, its lockout file included."""
 
-Verdict = Callable[[], StopVerdict | None]
+VerdictWaiter = Callable[[], StopVerdict | None]
 
 
 class NoRobot:
@@ -71,10 +71,10 @@ class SafetyAdapter:
         self._network: NetworkKey | None = None
         self.was_here_s: float | None = None
         """Seconds since this robot was last served from this machine; None where over ten minutes, or never."""
-        self._decision = StopRules()
-        self._check_ins = CheckInRules(self._decision if self._decision.required else StopRules(keys=()))
+        self._rules = StopRules()
+        self._check_ins = CheckInRules(self._rules if self._rules.required else StopRules(keys=()))
         if robot is not None:
-            self._decision.require_keys()
+            self._rules.require_keys()
         self.open()
 
     @property
@@ -85,10 +85,10 @@ class SafetyAdapter:
     @property
     def rules(self) -> StopRules:
         """The rules by which an e-stop counts."""
-        return self._decision
+        return self._rules
 
     @property
-    def moves(self) -> bool:
+    def has_robot(self) -> bool:
         """True for a peer with a robot."""
         return not isinstance(self._robot, NoRobot)
 
@@ -111,7 +111,7 @@ class SafetyAdapter:
 
     def facts(self) -> dict[str, Any]:
         """Return ``locked`` and ``epochs``; nothing without a robot."""
-        if not self.moves:
+        if not self.has_robot:
             return {}
         epochs = self.epochs()
         return {"locked": bool(epochs), "epochs": list(epochs)}
@@ -121,10 +121,10 @@ class SafetyAdapter:
         facts = self.facts()
         if not facts:
             return {}
-        wants = {"signed_stops": True} if self._decision.required else {}
+        wants = {"signed_stops": True} if self._rules.required else {}
         return {**self._announcer.of(peer_id or self._peer_id, facts), "cell": self._cell, **wants}
 
-    def refuse_taken(self, network: NetworkKey) -> None:
+    def leave_if_served_elsewhere(self, network: NetworkKey) -> None:
         """Leave the plane where another process of this machine serves the robot.
 
         That one keeps the lockout and takes the operator's orders.
@@ -132,7 +132,7 @@ class SafetyAdapter:
         Raises:
             DuplicateDeviceError: it does.
         """
-        if self.moves:
+        if self.has_robot:
             with self._left_where_taken():
                 self.was_here_s = sightings().was_here(network, self._peer_id)
 
@@ -150,9 +150,9 @@ class SafetyAdapter:
         Raises:
             DuplicateDeviceError: another process of this machine began to serve it just before.
         """
-        if self.moves:
+        if self.has_robot:
             self._network, public = network, None if self.identity is None else self.identity.public
-            wants = self._decision.required
+            wants = self._rules.required
             with self._left_where_taken():
                 sightings().serve(network, self._peer_id, cell=self._cell, signed_only=wants, public=public)
 
@@ -180,7 +180,7 @@ class SafetyAdapter:
     @property
     def open_to_all(self) -> bool:
         """True when an e-stop of any name counts."""
-        return self._decision.open and not self._decision.required
+        return self._rules.open and not self._rules.required
 
     @property
     def needs_check_in(self) -> bool:
@@ -204,7 +204,7 @@ class SafetyAdapter:
 
         self._plane.executor.submit(self._robot, self._peer_id, reason).add_done_callback(halted)
 
-    def begin(self, order: StopOrder) -> Verdict | None:
+    def begin(self, order: StopOrder) -> VerdictWaiter | None:
         """Lock under the order's epoch and start the halt; None for a known epoch.
 
         The callable that is returned waits for the robot's verdict, at most the halt deadline and the time that the

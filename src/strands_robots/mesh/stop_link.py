@@ -205,7 +205,7 @@ class MeshStopCodec(StopCodec):
             pressed=wire.finite(fields.get("pressed_at")),
             scope=rules.scope(source, fields, demanded=rules.required) if SCOPE in fields else EVERY_ROBOT,
             # A console passes on what it sent, and nothing of others.
-            original=stop.payload if stops.moves and isinstance(stop.payload, bytes) else None,
+            original=stop.payload if stops.has_robots and isinstance(stop.payload, bytes) else None,
             network=stop.network,
             age_s=age_s,
         )
@@ -259,7 +259,7 @@ class PeerStops:
         self.network = session.network()
         self.peers: Mapping[str, StopPeer] = {}
         self.session = transport.session_id or ""
-        self.moves = False
+        self.has_robots = False
         """True where a peer of this process has a robot."""
         self._notes = BoundedExecutor("mesh-stops", RECENT_MAX)
         self._registered: dict[str, ListenerRegistration] = {}
@@ -287,7 +287,7 @@ class PeerStops:
             cls._all[key] = stops
         if before is not None:
             undeclare([before])
-        if peer.adapter.moves:
+        if peer.adapter.has_robot:
             if transport.stops_apart:
                 # The thread that takes stops must start none of its own.
                 stops._notes.prepare()
@@ -319,7 +319,7 @@ class PeerStops:
                 was_here=adapter.was_here_s is not None,
                 codec=self.codec,
                 opened=False,
-                asks=adapter.moves,
+                asks=adapter.has_robot,
             )
             self._link = registration.link if isinstance(registration.link, MeshStopLink) else None
         try:
@@ -405,7 +405,7 @@ class PeerStops:
 
     def _on_check_in(self, sample: Sample) -> None:
         for each in self.peers.values():
-            if each.adapter.moves:
+            if each.adapter.has_robot:
                 each.on_check_in(sample)
 
     def _audit(self, event: str, about: str, **payload: Any) -> None:
@@ -414,11 +414,11 @@ class PeerStops:
 
     def _set_peers(self, peers: Mapping[str, StopPeer]) -> None:
         self.peers = peers
-        self.moves = any(each.adapter.moves for each in peers.values())
+        self.has_robots = any(each.adapter.has_robot for each in peers.values())
 
     def _speaker(self) -> list[StopPeer]:
         """Return the peer that records and passes on for all, if any is left."""
-        return sorted(self.peers.values(), key=lambda each: not each.adapter.moves)[:1]
+        return sorted(self.peers.values(), key=lambda each: not each.adapter.has_robot)[:1]
 
 
 class Hearing:

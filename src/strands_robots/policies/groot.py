@@ -1,4 +1,4 @@
-"""A policy server of Isaac GR00T: MessagePack over ZeroMQ, REQ and REP.
+"""Client of a policy server of Isaac GR00T: MessagePack over ZeroMQ, REQ and REP.
 
 ZeroMQ's own library bounds each part of a message and not their number, so a server could fill the memory. Here an
 answer is bounded as a whole. Wire: ZMTP 3.0 (ZeroMQ RFC 23) with the mechanism NULL and the socket type REQ: a greeting

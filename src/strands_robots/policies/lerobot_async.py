@@ -1,4 +1,4 @@
-"""A server of LeRobot's asynchronous inference: pickles over gRPC.
+"""Client of LeRobot's asynchronous inference server: pickles over gRPC.
 
 The reader is an interpreter of its own for the few operations that lists of numbers need. It imports nothing, calls
 nothing and sets no attribute: a class or function in a pickle stays its name, and a name that is not listed ends the
@@ -10,7 +10,7 @@ loads, then ``SendObservations`` and ``GetActions`` for each chunk. Every messag
 :func:`read_actions` alone. Source: LeRobot 0.4.0 to 0.6.1, ``async_inference/policy_server.py`` and ``helpers.py``,
 ``transport/services.proto`` and ``transport/utils.py``.
 
-Nothing is encrypted and nobody is asked who he is, and the server unpickles what it is sent. So it has to be on this
+There is no encryption and no authentication, and the server unpickles what it is sent. So it has to be on this
 machine, or at the other end of a tunnel. It has one policy and one queue: it serves one robot at a time.
 """
 

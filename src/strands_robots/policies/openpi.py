@@ -1,4 +1,4 @@
-"""A policy server that speaks openpi's protocol: MessagePack on a WebSocket.
+"""Client of a policy server with openpi's protocol: MessagePack on a WebSocket.
 
 The server speaks first, with a map of metadata that may be empty. Then each observation, one map, is answered by one
 map with ``actions``: (horizon, dimension), in the policy's units. An error is a text frame, and the server closes.

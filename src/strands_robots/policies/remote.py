@@ -1,4 +1,4 @@
-"""A policy server on a WebSocket, which answers observations with actions.
+"""Client of a policy server on a WebSocket, which answers observations with actions.
 
 Every message is an object, as a JSON text frame or a MessagePack binary frame; the server answers with the same kind.
 The robot sends requests with an ``id`` that the answer repeats:

@@ -133,7 +133,7 @@ RolloutObservers = Observers[RolloutEvent]
 """Observers of the rollouts of one robot."""
 
 
-def unfollowed(rollout: Rollout) -> str:
+def instruction_note(rollout: Rollout) -> str:
     """Return the sentence for the answer of a policy that follows no instruction."""
     return "" if rollout.follows_instruction else f" The policy {rollout.policy_name} does not follow the instruction."
 
@@ -297,7 +297,7 @@ class Rollout:
         self._started_at = self._clock.now()
         state: State = "stopped"
         # A policy that computes in this process must not keep the interpreter from the control loop.
-        end_short_turns = shorten_time_slices()
+        restore_time_slices = shorten_time_slices()
         try:
             with self._body.running():
                 try:
@@ -322,7 +322,7 @@ class Rollout:
             state, self.error = "error", f"{type(exc).__name__}: {exc}"
             logger.exception("The rollout of %s on %s could not run.", self.policy_name, self.robot)
         finally:
-            end_short_turns()
+            restore_time_slices()
             self._finish(state)
 
     def _log_failure(self, exc: BaseException) -> None:
@@ -370,7 +370,7 @@ class Rollout:
                 began = started = self._clock.now()
                 tick = 0
             if self._held():
-                # Beats that were missed meanwhile are neither made up for nor left out: the plan goes on from here.
+                # Steps that were missed meanwhile are not made up for: the plan goes on from here.
                 started = self._clock.now() - tick * self._period
             tick = self._next(tick, started)
             self._clock.wait(started + tick * self._period, self._stop_requested)

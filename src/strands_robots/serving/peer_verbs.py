@@ -1,6 +1,7 @@
-"""Verbs of a mesh peer: of arms, worlds, mobile bases and Reachy Mini alike.
+"""Verbs of a mesh peer, for arms, worlds, mobile bases and Reachy Mini.
 
-A peer does not tell its verbs apart by its robot's kind: a robot that lacks what a verb needs refuses it.
+One table serves them all: a robot that lacks what a verb needs refuses it. :data:`KINDS` only says what callers may
+expect of a kind.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Verbs of arms, vehicles and worlds, and the methods that carry them out.
+"""Verbs of robots with tasks, worlds and mobile bases, and the methods that carry them out.
 
-Device Connect serves :data:`ARM_VERBS` and :data:`WORLD_VERBS`, the mesh :data:`PEER_VERBS`.
+Device Connect serves these tables; those of the mesh are in :mod:`~strands_robots.serving.peer_verbs`.
 """
 
 from __future__ import annotations
@@ -170,7 +170,7 @@ GET_STATE = Verb(
     returns="joints, joints_age_s, task",
     method="get_state",
 )
-ARM_VERBS = table(
+TASK_VERBS = table(
     [
         Verb(
             "execute",
@@ -326,5 +326,5 @@ NAVIGATE_TO = Verb(
     begin=_of_base("start_navigation", "navigateTo: this robot has no navigation stack."),
 )
 
-BASE_VERBS = {**ARM_VERBS, **table([DRIVE])}
+BASE_VERBS = {**TASK_VERBS, **table([DRIVE])}
 NAVIGATING_BASE_VERBS = {**BASE_VERBS, **table([NAVIGATE_TO])}

@@ -19,7 +19,7 @@ from strands_robots.policies.check import RobotFacts
 from strands_robots.policies.rollout import (
     STOP_JOIN_S,
     Rollout,
-    unfollowed,
+    instruction_note,
 )
 from strands_robots.policies.task_engine import TaskEngine
 from strands_robots.safety.gate import MotionRequest, answered
@@ -397,7 +397,7 @@ class Simulation(PicturesMixin, ArmMixin, TeleopMixin):
         if problem:
             return error(f"start_policy: {problem}.", **_row(rollout))
         return success(
-            f"{rollout.robot} started: {rollout.instruction}.{unfollowed(rollout)}",
+            f"{rollout.robot} started: {rollout.instruction}.{instruction_note(rollout)}",
             robot=rollout.robot,
             instruction=rollout.instruction,
             policy_provider=rollout.policy_name,

@@ -28,7 +28,7 @@ from strands_robots.fleet.stops import answer_of, estop_all, stop_all
 from strands_robots.fleet.verdicts import by_bearer, combined_verdict
 from strands_robots.serving import advertised
 from strands_robots.serving.advertised import RobotDescription, fitting
-from strands_robots.serving.robot_verbs import ARM_VERBS, WORLD_VERBS
+from strands_robots.serving.robot_verbs import TASK_VERBS, WORLD_VERBS
 from strands_robots.serving.stop_arguments import noted, stop_reason, stop_robot, stop_scope
 from strands_robots.serving.verbs import unknown_arguments
 from strands_robots.utils import WAIT_S, ValidationError, choice, device_id, identifier, mapping, plain_text, shown
@@ -110,7 +110,7 @@ def robot_mesh(
             return _with_image(_asked(lambda there: _called(there, robot, name, given)))
         if asked == "tell":
             given = {"instruction": instruction, "policy_provider": policy_provider, "duration": duration}
-            task = ARM_VERBS["execute"].checked(given)
+            task = TASK_VERBS["execute"].checked(given)
             wanted = {name: task[name] for name in ("instruction", "policy_provider", "duration")}
             return _asked(lambda there: _started(there, robot, wanted))
     except ValidationError as refused:
