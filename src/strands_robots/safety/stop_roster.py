@@ -9,7 +9,6 @@ from typing import Any, Protocol
 
 from strands_robots.audit import queue_safety_event
 from strands_robots.safety.answers import Answer, Progress, StopReport
-from strands_robots.safety.controller import SafetyController
 from strands_robots.safety.identity import key_here, local_name
 from strands_robots.safety.network_key import DEVICE_CONNECT, NetworkKey
 from strands_robots.safety.roster import Roster, RosterReport, Sending, reason_of
@@ -575,19 +574,3 @@ class RosterSearch:
             goes_on = self._controller.expect(self.estop_id, self.roster.awaited(self._answered), more=more)
             if goes_on and problem is not None:
                 self._problem = problem
-
-
-def stop_and_search(
-    controller: SafetyController, search: RosterSearch, expected: Collection[str], reason: str, deadline_s: float
-) -> StopReport:
-    """Send the stop of ``search``, which goes on meanwhile; return the report."""
-    return controller.stop(
-        expected,
-        reason,
-        deadline_s=deadline_s,
-        estop_id=search.estop_id,
-        more=True,
-        on_progress=search.begin,
-        on_report=search.take,
-        scope=search.scope,
-    )
