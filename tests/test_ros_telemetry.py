@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from strands_robots.envelope import Envelope, success
+from strands_robots.ros.link import graph_name
 from strands_robots.ros_telemetry import RosTelemetryBase
 from strands_robots.safety.gate import MotionGate
 from strands_robots.utils import ValidationError
@@ -30,12 +31,15 @@ class Arm:
         self.gate = MotionGate()
         self.taken: list[dict[str, float]] = []
         self.state: dict[str, Any] = {"joints": {"a.pos": 0.5}}
+        self.cameras: tuple[str, ...] | None = ("front",)
 
     def get_state(self) -> Envelope:
         return success("", **self.state)
 
     def camera_frames(self) -> dict[str, Any]:
-        return {"front": np.zeros((2, 2, 3), np.uint8)}
+        if self.cameras is None:
+            raise OSError("no camera answers")
+        return {name: np.zeros((2, 2, 3), np.uint8) for name in self.cameras}
 
     def send_action(self, action: dict[str, float]) -> Envelope:
         self.taken.append(action)
@@ -90,9 +94,47 @@ def test_joint_command_is_applied_whole_or_not_at_all(names: list[str], position
 
 def test_names_of_robots_and_cameras_become_one_word_of_a_topic() -> None:
     assert RosTelemetryBase.joint_states_topic("my arm/2") == "/my_arm_2/joint_states"
-    assert RosTelemetryBase.image_topic("1st", "front left") == "/_1st/front_left/image_raw"
+    assert RosTelemetryBase.image_topic("arm", "front left") == "/arm/front_left/image_raw"
     assert RosTelemetryBase.joint_states_topic("---") == "/robot/joint_states"
+    assert RosTelemetryBase.image_topic("arm", "é") == "/arm/camera/image_raw"
     assert bridge(Arm()).command_topic == "/arm/joint_command"
+
+
+def test_name_that_begins_with_a_digit_has_its_kind_before_it() -> None:
+    assert RosTelemetryBase.image_topic("1st", "0") == "/robot_1st/camera_0/image_raw"
+    assert RosTelemetryBase.joint_states_topic("2") == "/robot_2/joint_states"
+
+
+@given(robot=st.text(max_size=8), camera=st.text(max_size=8))
+def test_every_name_gives_a_topic_that_ros_2_shows(robot: str, camera: str) -> None:
+    topic = graph_name("topic", RosTelemetryBase.image_topic(robot, camera))
+    assert not any(word.startswith("_") for word in topic.split("/"))
+
+
+def test_second_of_two_cameras_of_one_topic_is_refused_by_name() -> None:
+    arm = Arm()
+    arm.cameras = ("a-b", "a_b")
+    with pytest.raises(ValidationError, match=r"camera 'a_b' of 'arm' .* /arm/a_b/image_raw .* 'a-b' of 'arm'"):
+        Bridge(arm)
+
+
+def test_second_of_two_names_of_one_topic_is_refused_where_it_is_published() -> None:
+    telling, picture = Bridge(None), np.zeros((2, 2, 3), np.uint8)
+    telling.publish_image("arm", "0", picture)
+    telling.publish_image("arm", "0", picture)
+    with pytest.raises(ValidationError, match="camera 'camera_0' of 'arm'"):
+        telling.publish_image("arm", "camera_0", picture)
+    telling.publish_joint_states("a b", ["a.pos"], [0.5])
+    with pytest.raises(ValidationError, match="robot 'a_b' must have a topic of its own"):
+        telling.publish_joint_states("a_b", ["a.pos"], [0.5])
+    assert telling.reported() == ["/arm/camera_0/image_raw"] * 2 + ["/a_b/joint_states"]
+    telling.shutdown()
+
+
+def test_camera_that_fails_at_construction_leaves_the_bridge_usable() -> None:
+    arm = Arm()
+    arm.cameras = None
+    Bridge(arm).shutdown()
 
 
 def test_joints_and_cameras_are_published_once_or_at_a_rate() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import math
 import re
@@ -40,10 +41,13 @@ STREAM_S = 0.1
 Limits = dict[str, tuple[float, float]]
 
 
-def segment(name: str) -> str:
-    """Return one word of a topic's name for the name of a robot or camera."""
-    word = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_") or "robot"
-    return f"_{word}" if word[0].isdigit() else word
+def segment(name: str, kind: str = "robot") -> str:
+    """Return one word of a topic's name for the name of a robot or camera.
+
+    A word may not begin with a digit, and ROS 2 hides one that begins with an underscore: ``kind`` goes before it.
+    """
+    word = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_") or kind
+    return f"{kind}_{word}" if word[0].isdigit() else word
 
 
 def checked_limits(limits: object) -> Limits:
@@ -97,7 +101,7 @@ class RosTelemetryBase:
             far target is reached by a stream of commands and not by one.
 
     Raises:
-        ValidationError: an argument outside its domain, before anything else has happened.
+        ValidationError: an argument outside its domain, or two cameras of one topic, before anything else has happened.
     """
 
     def __init__(
@@ -120,6 +124,8 @@ class RosTelemetryBase:
         self._robot = robot
         named = str(getattr(robot, "tool_name_str", "") or "robot")
         self.command_topic = f"/{segment(named if command_robot_name is None else command_robot_name)}/joint_command"
+        self._topics: dict[str, str] = {}
+        self._claim_known()
         self._limits = checked_limits(joint_limits)
         self._max_speed = number("max_joint_speed", max_joint_speed, above=0)
         self._sent: dict[str, float] = {}
@@ -137,7 +143,7 @@ class RosTelemetryBase:
         Joints that could not be read are not published: a message of now would hold positions of the past.
 
         Raises:
-            ValidationError: the bridge has no robot, or the robot no such camera.
+            ValidationError: the bridge has no robot, the robot no such camera, or the camera another one's topic.
         """
         if self._robot is None:
             raise ValidationError("robot must be given to publish all of it at once, not None.")
@@ -169,15 +175,25 @@ class RosTelemetryBase:
         self._publisher.start()
 
     def publish_joint_states(self, robot: str, names: list[str], positions: list[float]) -> None:
-        """Publish positions in the robot's unit; drop lists of different length."""
+        """Publish positions in the robot's unit; drop lists of different length.
+
+        Raises:
+            ValidationError: another robot's name gives the same topic.
+        """
+        topic = self._claim(self.joint_states_topic(robot), f"robot {robot!r}")
         if len(names) != len(positions):
             logger.warning("%d names and %d positions of %s are not published.", len(names), len(positions), robot)
             return
         fields = {"header": _header(), "name": list(names), "position": [float(each) for each in positions]}
-        self._send(self.joint_states_topic(robot), JOINT_STATE, fields)
+        self._send(topic, JOINT_STATE, fields)
 
     def publish_image(self, robot: str, camera: str, image: Any) -> None:
-        """Publish one RGB picture of shape (height, width, 3) and type uint8."""
+        """Publish one RGB picture of shape (height, width, 3) and type uint8.
+
+        Raises:
+            ValidationError: another camera's name gives the same topic.
+        """
+        topic = self._claim_image(robot, camera)
         shape = tuple(getattr(image, "shape", ()))
         if len(shape) != 3 or shape[2] != 3 or str(getattr(image, "dtype", "")) != "uint8":
             logger.warning("An image of %s must have shape (height, width, 3) and type uint8; not published.", camera)
@@ -190,7 +206,7 @@ class RosTelemetryBase:
             "step": 3 * int(shape[1]),
             "data": image.tobytes(),
         }
-        self._send(self.image_topic(robot, camera), IMAGE, fields)
+        self._send(topic, IMAGE, fields)
 
     def shutdown(self) -> None:
         """Take no more commands and leave the graph. A second call does nothing."""
@@ -210,7 +226,7 @@ class RosTelemetryBase:
     @staticmethod
     def image_topic(robot: str, camera: str) -> str:
         """Return the topic of a camera's pictures."""
-        return f"/{segment(robot)}/{segment(camera)}/image_raw"
+        return f"/{segment(robot)}/{segment(camera, 'camera')}/image_raw"
 
     def command_error(self, names: Sequence[Any], positions: Sequence[Any]) -> str | None:
         """Return why a joint command is dropped whole, or None."""
@@ -264,6 +280,27 @@ class RosTelemetryBase:
         if cut != action:
             logger.info("A command on %s is cut to %g a second: %s.", self.command_topic, self._max_speed, cut)
         return cut
+
+    def _claim_known(self) -> None:
+        """Claim the topics of all that this bridge knows before it publishes."""
+        frames = getattr(self._robot, "camera_frames", None)
+        if not callable(frames):
+            return
+        names: list[str] = []
+        with contextlib.suppress(Exception):  # a foreign camera that fails is reported when it is published
+            names = [str(name) for name in frames()]
+        for camera in names:
+            self._claim_image(str(getattr(self._robot, "tool_name_str", "") or "robot"), camera)
+
+    def _claim_image(self, robot: str, camera: str) -> str:
+        return self._claim(self.image_topic(robot, camera), f"camera {camera!r} of {robot!r}")
+
+    def _claim(self, topic: str, what: str) -> str:
+        """Return the topic, which is of the first that asks for it; refuse another."""
+        owner = self._topics.setdefault(topic, what)
+        if owner != what:
+            raise ValidationError(f"{what} must have a topic of its own: {topic} is that of {owner}. Rename one.")
+        return topic
 
     def _begin(self, link: BroadcastLink, name: str, *, open_now: bool = False) -> None:
         """Use this link from now on, and take commands from it where enabled.

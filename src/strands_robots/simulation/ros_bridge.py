@@ -22,7 +22,8 @@ class SimRosBridge(RosTelemetryBridge):
         qos_depth: KEEP_LAST history of each endpoint, 1 to ``MAX_QOS_HISTORY_DEPTH``.
 
     Raises:
-        ValidationError: an argument outside its domain, before anything else has happened.
+        ValidationError: an argument outside its domain, or two robots or cameras of one topic, before anything else
+            has happened.
         RosError: no ROS 2 is sourced, or it did not start.
     """
 
@@ -31,14 +32,14 @@ class SimRosBridge(RosTelemetryBridge):
     def __init__(
         self, simulation: Any = None, *, domain_id: int = 0, node_name: str | None = None, qos_depth: int = 10
     ) -> None:
-        super().__init__(domain_id=domain_id, node_name=node_name, qos_depth=qos_depth)
         self._simulation = simulation
+        super().__init__(domain_id=domain_id, node_name=node_name, qos_depth=qos_depth)
 
     def publish(self, cameras: Sequence[str] = (), *, width: int = 320, height: int = 240) -> None:
         """Publish every robot's joints (rad; m for a slide) and a picture a camera.
 
         Raises:
-            ValidationError: no simulation, or no such camera.
+            ValidationError: no simulation, no such camera, or one with another one's topic.
         """
         world = self._simulation
         if world is None:
@@ -51,3 +52,12 @@ class SimRosBridge(RosTelemetryBridge):
         for camera in cameras:
             picture, _ = world.picture(camera, width, height)
             self.publish_image(world.tool_name_str, camera, picture)
+
+    def _claim_known(self) -> None:
+        world = self._simulation
+        if world is None:
+            return
+        for name in world.list_robots():
+            self._claim(self.joint_states_topic(name), f"robot {name!r}")
+        for camera in world.get_features()["cameras"]:
+            self._claim_image(world.tool_name_str, camera)

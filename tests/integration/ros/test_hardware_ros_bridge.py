@@ -174,6 +174,17 @@ def test_simulation_publishes_joints_and_a_camera_to_a_dds_peer(sourced: None, p
         world.cleanup()
 
 
+def test_simulation_with_two_names_of_one_topic_is_refused_before_ros_2_is_imported() -> None:
+    world = Simulation("bench")
+    world.add_robot("arm-1", "so100")
+    world.add_robot("arm_1", "so100", position=[1.0, 0.0, 0.0])
+    try:
+        with pytest.raises(ValidationError, match="robot 'arm_1' must have a topic of its own: /arm_1/joint_states"):
+            SimRosBridge(world, domain_id=DOMAIN)
+    finally:
+        world.cleanup()
+
+
 def test_hardware_robot_is_published_driven_and_locked_over_the_graph(
     sourced: None, peer: DdsLink, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -95,6 +95,22 @@ def test_joints_and_images_are_published(controller: DdsLink) -> None:
         bridge.shutdown()
 
 
+def test_camera_and_robot_of_a_digit_are_seen_by_a_peer(controller: DdsLink) -> None:
+    bridge = HardwareRtpsBridge(domain_id=DOMAIN)
+    picture = np.zeros((2, 4, 3), np.uint8)
+
+    def listed() -> bool:
+        bridge.publish_image("1st", "0", picture)
+        return any(row["topic"] == "/robot_1st/camera_0/image_raw" for row in controller.topics())
+
+    try:
+        eventually(listed)
+        with pytest.raises(ValidationError, match="camera 'camera-0' of '1st'"):
+            bridge.publish_image("1st", "camera-0", picture)
+    finally:
+        bridge.shutdown()
+
+
 def test_commands_on_an_unsecured_graph_need_the_opt_out(arm: TakingArm) -> None:
     with pytest.raises(ValidationError, match=INSECURE):
         HardwareRtpsBridge(arm, domain_id=DOMAIN)
