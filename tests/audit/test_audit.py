@@ -18,6 +18,7 @@ from fixtures.waiting import eventually
 
 from strands_robots import audit
 from strands_robots.audit import (
+    audit_log_path,
     flush_audit,
     log_safety_event,
     queue_safety_event,
@@ -28,6 +29,7 @@ from strands_robots.audit import journal as journal_module
 from strands_robots.audit.head import GENESIS
 from strands_robots.audit.journal import NAME, AuditEntry, Journal
 from strands_robots.audit.verification import verify
+from strands_robots.utils import ValidationError
 
 
 def entry(number: int, peer: str = "arm-1", **payload: Any) -> AuditEntry:
@@ -87,6 +89,73 @@ def test_with_a_key_every_record_is_signed_and_verified(state_directory: Path, m
     found = verify_audit_integrity()
     assert (found["bad"], found["ok"]) == (3, False)
     (state_directory / NAME).write_bytes(b"")
+
+
+def test_result_has_the_longer_names_beside_the_short_ones(
+    state_directory: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("STRANDS_MESH_AUDIT_PSK", "a secret")
+    for _ in range(4):
+        log_safety_event("emergency_stop", "arm-1", {})
+    found = verify_audit_integrity()
+    assert (found["bad_signature"], found["missing_sig"], found["unverifiable_signed"]) == (0, 0, 0)
+    assert (found["psk_present"], found["sequence_gaps"], found["ok"]) == (True, [], True)
+    lines = audit_log_path().read_bytes().splitlines(keepends=True)
+    audit_log_path().write_bytes(b"".join([lines[0], lines[2].replace(b"emergency", b"emergence"), lines[3]]))
+    found = verify_audit_integrity()
+    assert (found["bad_signature"], found["sequence_gaps"], found["ok"]) == (found["bad"], [(1, 3)], False)
+
+
+def records(count: int, monkeypatch: pytest.MonkeyPatch, secret: str = "a secret") -> list[dict[str, Any]]:
+    monkeypatch.setenv("STRANDS_MESH_AUDIT_PSK", secret)
+    for _ in range(count):
+        log_safety_event("emergency_stop", "arm-1", {})
+    return read_audit_log()
+
+
+def test_records_that_were_read_are_checked_alone(state_directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    read = records(4, monkeypatch)
+    log_safety_event("emergency_stop", "arm-2", {})
+    found = verify_audit_integrity(read)
+    assert (found["total"], found["verified"], found["head"], found["ok"]) == (4, 4, "unread", True)
+    assert verify_audit_integrity([])["ok"]
+    found = verify_audit_integrity([read[0], read[3]])
+    assert (found["sequence_gaps"], found["gaps"], found["ok"]) == ([(1, 4)], 1, False)
+    found = verify_audit_integrity([*read[:3], {**read[3], "payload": {"n": 1}}])
+    assert (found["bad_signature"], found["ok"]) == (1, False)
+
+
+def test_forged_record_does_not_hide_that_others_were_left_out(
+    state_directory: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read = records(4, monkeypatch)
+    bare = {name: value for name, value in read[1].items() if name != "sig"}
+    found = verify_audit_integrity([read[0], {**bare, "seq": 3}, read[3]])
+    assert (found["missing_sig"], found["sequence_gaps"], found["ok"]) == (1, [(1, 4)], False)
+
+
+def test_records_that_were_signed_elsewhere_are_not_ok_without_their_secret(tmp_path: Path) -> None:
+    signed = Journal(tmp_path / "other", b"a secret")
+    signed.append([entry(1), entry(2)])
+    found = verify_audit_integrity(list(signed.records()))
+    assert (found["unverifiable_signed"], found["psk_present"], found["ok"]) == (2, False, False)
+    plain = [{"event": "emergency_stop", "peer_id": "arm-1", "payload": {}, "seq": seq} for seq in (1, 2)]
+    assert verify_audit_integrity(plain)["ok"]
+    assert verify_audit_integrity([*plain, {"seq": True}])["torn"] == 1
+
+
+@pytest.mark.parametrize(
+    ("given", "named"), [("text", "records must be"), ({}, "records must be"), ([1], r"records\[0\] must")]
+)
+def test_records_that_are_no_list_of_objects_are_refused(given: Any, named: str) -> None:
+    with pytest.raises(ValidationError, match=named):
+        verify_audit_integrity(given)
+
+
+def test_path_of_the_log_follows_the_setting(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("STRANDS_MESH_AUDIT_DIR", str(tmp_path / "elsewhere"))
+    assert audit_log_path() == tmp_path / "elsewhere" / NAME
+    assert not audit_log_path().parent.exists()
 
 
 def test_a_record_without_a_signature_is_missing_one_where_a_key_is_set(journal: Journal) -> None:

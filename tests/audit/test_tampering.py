@@ -167,7 +167,7 @@ def test_mismatch_that_the_writer_sees_is_one_signed_record(journal: Journal) ->
     alarms = [each for each in journal.records() if each["event"] == BROKEN]
     assert len(alarms) == 1
     assert "cut from" in alarms[0]["payload"]["why"]
-    assert journal.signature_valid(alarms[0])
+    assert journal.seal.valid(alarms[0])
     found = check(journal)
     assert (found["tampered"], found["ok"]) == (1, False)
 

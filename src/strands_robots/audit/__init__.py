@@ -29,10 +29,10 @@ from typing import Any
 from strands_robots import settings
 from strands_robots.audit.head import Anchor, log_id
 from strands_robots.audit.journal import AUDIT_PEER, BROKEN, NAME, AuditEntry, Journal, storable
-from strands_robots.audit.verification import WITNESS, compare, stated_head, verify, witnessed
+from strands_robots.audit.verification import WITNESS, compare, stated_head, verify, verify_records, witnessed
 from strands_robots.state_files import make_private, state_dir
 from strands_robots.stop_log import stop_logger
-from strands_robots.utils import shown
+from strands_robots.utils import ValidationError, shown
 
 logger = stop_logger(__name__)
 
@@ -49,6 +49,11 @@ def audit_directory() -> Path:
     """``STRANDS_MESH_AUDIT_DIR``, else the directory of the robot's state."""
     stated = settings.raw("STRANDS_MESH_AUDIT_DIR")
     return Path(stated).expanduser() if stated else state_dir()
+
+
+def audit_log_path() -> Path:
+    """Return the file that events are appended to; it need not exist yet."""
+    return audit_directory() / NAME
 
 
 def log_safety_event(event_type: str, peer_id: str, payload: dict[str, Any]) -> None:
@@ -134,18 +139,26 @@ def compare_with_witnesses(files: Sequence[Path]) -> tuple[int, list[dict[str, A
     return compare(_journals(_journal_key())[0], files)
 
 
-def verify_audit_integrity() -> dict[str, Any]:
-    """Check the audit of this machine.
+def verify_audit_integrity(records: list[dict[str, Any]] | None = None) -> dict[str, Any]:
+    """Check the audit of this machine, or records that were read from one.
 
     Counts ``total``, ``signed``, ``verified``, ``bad``, ``missing``, ``gaps``, ``torn``, ``broken``, ``tampered``,
     ``replaced``, the list ``breaks`` that says where, ``head``, and ``ok``; see
     :func:`strands_robots.audit.verification.verify`. ``kept`` are the records that are never rotated out. What could
     not be verified is not ok: signed records without their secret, and records of this process that the disk has not
-    taken.
+    taken. Beside them: ``bad_signature`` (as ``bad``), ``missing_sig`` (as ``missing``), ``unverifiable_signed``
+    (signed, and no secret here), ``psk_present``, and ``sequence_gaps``, the first hundred jumps as pairs of numbers.
+
+    Args:
+        records: check these alone, such as the lines of a file from another machine, by the secret that is set here:
+            signatures and numbers, without chain, head and anchor. None: the audit on the disk, all of it.
 
     Raises:
         OSError: the files cannot be read, or another process keeps them locked.
+        ValidationError: ``records`` is no list of objects.
     """
+    if records is not None:
+        return verify_records(_checked_records(records), _journal_key()[1])
     written = flush_audit(FLUSH_S)
     key = _journal_key()
     found = verify_both(*_journals(key), keyed=key[1] is not None)
@@ -153,6 +166,15 @@ def verify_audit_integrity() -> dict[str, Any]:
         found["breaks"].append({"where": "end", "why": NOT_ON_DISK})
         found["ok"] = False
     return found
+
+
+def _checked_records(records: object) -> list[dict[str, Any]]:
+    if not isinstance(records, list | tuple):
+        raise ValidationError(f"records must be a list of records, not {shown(records)}.")
+    for index, each in enumerate(records):
+        if not isinstance(each, dict):
+            raise ValidationError(f"records[{index}] must be an object, not {shown(each)}.")
+    return list(records)
 
 
 _Key = tuple[Path, bytes | None]

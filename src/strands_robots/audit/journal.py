@@ -165,9 +165,10 @@ class Journal:
         """True when the numbers of these files have no gap."""
         return list(files) == [*(self._rotated(number) for number in range(len(files) - 1, 0, -1)), self.path]
 
-    def signature_valid(self, record: dict[str, Any]) -> bool:
-        """True when the key made the record's ``sig``."""
-        return self._seal.valid(record)
+    @property
+    def seal(self) -> Seal:
+        """Signature of the records."""
+        return self._seal
 
     @contextlib.contextmanager
     def snapshot(self) -> Iterator[LogSnapshot]:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from strands_robots.audit.head import Anchor, Head, log_id
+from strands_robots.audit.head import Anchor, Head, Seal, log_id
 from strands_robots.audit.journal import BROKEN, Journal, LogSnapshot, anchor_mismatches, parse, replaced
 from strands_robots.utils import field_values
 
@@ -34,7 +34,57 @@ class Findings:
     broken: int = 0
     tampered: int = 0
     replaced: int = 0
+    sequence_gaps: list[tuple[int, int]] = field(default_factory=list)
     breaks: list[dict[str, Any]] = field(default_factory=list)
+
+    def gap(self, where: str, peer: str, before: int, after: int) -> None:
+        """Count a jump in a peer's numbers; the first hundred are listed as pairs."""
+        self.gaps += 1
+        if len(self.sequence_gaps) < BREAKS_SHOWN:
+            self.sequence_gaps.append((before, after))
+        self.note(where, f"{peer} went from {before} to {after}")
+
+    def facts(self, record: Mapping[str, Any], where: str) -> None:
+        """Count what a record itself says: that the log was changed, or facts lost."""
+        payload = record.get("payload")
+        if record.get("event") == BROKEN:
+            self.tampered += 1
+            self.note(where, f"the writer found: {payload.get('why') if isinstance(payload, dict) else payload}")
+        if replaced(payload):
+            self.replaced += 1
+            self.note(where, FACTS_REPLACED)
+
+    def signature(self, record: Mapping[str, Any], where: str, seal: Seal) -> bool:
+        """Count a record's signature; False for one that the key did not make."""
+        if "sig" not in record:
+            if seal.keyed:
+                self.missing += 1
+                self.note(where, "not signed")
+            return not seal.keyed
+        self.signed += 1
+        if not seal.keyed:
+            return False
+        valid = seal.valid(record)
+        if valid:
+            self.verified += 1
+        else:
+            self.bad += 1
+            self.note(where, "the signature does not hold")
+        return valid
+
+    def result(self, head: str, *, keyed: bool, ok: bool) -> dict[str, Any]:
+        """Return the counts; some of them have a second, longer name."""
+        if self.signed and not keyed:
+            self.note(SIGNATURES, f"{self.signed} signed records were not verified: there is no secret here")
+        return {
+            **{name: getattr(self, name) for name in self.__slots__},
+            "bad_signature": self.bad,
+            "missing_sig": self.missing,
+            "unverifiable_signed": 0 if keyed else self.signed,
+            "psk_present": keyed,
+            "head": head,
+            "ok": ok,
+        }
 
     def note(self, where: str, why: str) -> None:
         """Remember a break; beyond the first hundred only the counts go on."""
@@ -61,10 +111,36 @@ def verify(journal: Journal, *, keyed: bool) -> dict[str, Any]:
         return _Check(journal, snapshot, keyed=keyed).run()
 
 
+def verify_records(records: Sequence[Mapping[str, Any]], key: bytes | None) -> dict[str, Any]:
+    """Check the signatures and the numbers of records that were read before.
+
+    The result is that of :func:`verify`; ``head`` is *unread*, because chain, head and anchor are the file's. A record
+    that is not verified does not count for the numbers: a forged one cannot hide that others were left out.
+    """
+    found, seal = Findings(total=len(records)), Seal(key)
+    seqs: dict[str, int] = {}
+    for index, record in enumerate(records, 1):
+        where, peer, seq = f"record {index}", record.get("peer_id"), record.get("seq")
+        found.facts(record, where)
+        if not found.signature(record, where, seal):
+            continue
+        if not isinstance(peer, str) or not isinstance(seq, int) or isinstance(seq, bool):
+            found.torn += 1
+            found.note(where, "no writer wrote this record")
+            continue
+        before = seqs.get(peer)
+        if before is not None and seq != before + 1:
+            found.gap(where, peer, before, seq)
+        seqs[peer] = seq if before is None else max(before, seq)
+    return found.result("unread", keyed=seal.keyed, ok=found.whole(keyed=seal.keyed))
+
+
 class _Check:
     def __init__(self, journal: Journal, snapshot: LogSnapshot, *, keyed: bool) -> None:
         self._journal = journal
         self._snapshot, self._announced = _acknowledged(snapshot, journal.path)
+        # A log without a key here is not verified, whatever its journal has.
+        self._seal = journal.seal if keyed else Seal(None)
         self._keyed = keyed
         self._found = Findings()
         self._seqs: dict[str, int] = {}
@@ -96,11 +172,8 @@ class _Check:
         standing = self._standing(head, reached, last, anchored=anchored)
         for each in head.breaks if head is not None else ():
             found.tampered += not self._tampering_seen(each)
-        if found.signed and not self._keyed:
-            found.note(SIGNATURES, f"{found.signed} signed records were not verified: there is no secret here")
-        counts = {name: getattr(found, name) for name in Findings.__slots__}
         whole = found.whole(keyed=self._keyed) and standing in (("ok",) if self._keyed else ("ok", "missing"))
-        return {**counts, "head": standing, "ok": whole}
+        return found.result(standing, keyed=self._keyed, ok=whole)
 
     @staticmethod
     def _follows(record: dict[str, Any], last: str | None, head: Head | None) -> bool:
@@ -122,33 +195,10 @@ class _Check:
             found.note(where, "does not continue the record before it")
         expected = self._seqs.get(peer)
         if expected is not None and record["seq"] != expected + 1:
-            found.gaps += 1
-            found.note(where, f"{peer} went from {expected} to {record['seq']}")
+            found.gap(where, peer, expected, record["seq"])
         self._seqs[peer] = record["seq"]
-        if record.get("event") == BROKEN:
-            found.tampered += 1
-            payload = record.get("payload")
-            found.note(where, f"the writer found: {payload.get('why') if isinstance(payload, dict) else payload}")
-        if replaced(record.get("payload")):
-            found.replaced += 1
-            found.note(where, FACTS_REPLACED)
-        self._signature(record, where)
-
-    def _signature(self, record: dict[str, Any], where: str) -> None:
-        found = self._found
-        if "sig" not in record:
-            if self._keyed:
-                found.missing += 1
-                found.note(where, "not signed")
-            return
-        found.signed += 1
-        if not self._keyed:
-            return
-        if self._journal.signature_valid(record):
-            found.verified += 1
-        else:
-            found.bad += 1
-            found.note(where, "the signature does not hold")
+        found.facts(record, where)
+        found.signature(record, where, self._seal)
 
     def _tampering_seen(self, record: dict[str, Any]) -> bool:
         """True when the record of a break that the head names is still in the log."""
