@@ -211,6 +211,11 @@ _declare(
     # Robots.
     Setting("STRANDS_CONTROL_HZ", "number", "50", "Control loop rate of a rollout.", 1, 2000),
     Setting("STRANDS_ROBOT_MESH_DC", "text", "auto", "Device Connect for the robot_mesh tool: off leaves it out."),
+    Setting("REACHY_HOST", "text", "", "Host or host:port of a Reachy Mini where none is named. Unset: found by mDNS."),
+    Setting("REACHY_PORT", "integer", "8000", "Port of REACHY_HOST where that has none.", 1, 65535),
+    Setting("REACHY_DAEMON_TOKEN", "text", "", "Bearer token that a gateway before a Reachy Mini's daemon asks for."),
+    Setting("REACHY_DAEMON_TLS", "boolean", "false", "Dial the daemon of a Reachy Mini by HTTPS and WSS."),
+    Setting("REACHY_DAEMON_TLS_INSECURE", "boolean", "false", "With REACHY_DAEMON_TLS: do not check its certificate."),
     Setting("STRANDS_STATE_DIR", "path", "", "Directory for grants, lockouts and keys. Unset: ~/.strands_robots."),
     Setting("STRANDS_TAGS", "list", "", "Tags of the robots of this process, by which callers choose robots."),
     # The calling side.

@@ -12,7 +12,7 @@ from fixtures.reachy_daemon.body import recorded
 from strands_robots.drivers.reachy import connection
 from strands_robots.drivers.reachy.connection import Feed
 from strands_robots.drivers.reachy.links import DaemonInfo, WebSocketLink, ZenohLink, key_prefix, make_link
-from strands_robots.drivers.reachy.rest import DaemonFaultError, DaemonUnreachableError
+from strands_robots.drivers.reachy.rest import DaemonFaultError, DaemonUnreachableError, warn_once
 from strands_robots.drivers.reachy.target import HeadPose, Target
 from strands_robots.utils import ValidationError
 
@@ -159,3 +159,18 @@ def test_zenoh_link_uses_a_given_session_and_leaves_it_open(monkeypatch: pytest.
     assert (session.subscribers, session.closed) == ({}, False)
     with pytest.raises(DaemonUnreachableError, match="closed"):
         link.send_cmd({})
+
+
+def test_zenoh_link_says_that_no_setting_encrypts_it(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    warn_once.cache_clear()
+    older = DaemonInfo.of({"version": "1.4.1"})
+    make_link(older, "127.0.0.1", 8000, prefix="reachy_mini")
+    assert not caplog.records
+    monkeypatch.setenv("REACHY_DAEMON_TLS", "1")
+    for _ in range(2):
+        make_link(older, "127.0.0.1", 8000, prefix="reachy_mini")
+    assert [each.getMessage() for each in caplog.records] == [
+        "The daemon at 127.0.0.1 speaks Zenoh, which no REACHY_DAEMON_ setting encrypts or authenticates."
+    ]

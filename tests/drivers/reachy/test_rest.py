@@ -12,6 +12,7 @@ from fixtures.reachy_daemon.body import recorded
 
 from strands_robots.drivers.reachy.rest import (
     BackendDownError,
+    DaemonAccess,
     DaemonBusyError,
     DaemonError,
     DaemonFaultError,
@@ -21,6 +22,7 @@ from strands_robots.drivers.reachy.rest import (
     RestClient,
     api,
     url_host,
+    warn_once,
 )
 from strands_robots.utils import ValidationError
 
@@ -29,6 +31,7 @@ HERE = "http://127.0.0.1:8000"
 RECORDED = [each for each in recorded("daemon_1.13.0_lite.json")["rest"] if each["status"] >= 400]
 KINDS = {
     400: DaemonRefusedError,
+    401: DaemonRefusedError,
     403: DaemonRefusedError,
     404: DaemonNotFoundError,
     405: DaemonRefusedError,
@@ -65,7 +68,7 @@ def test_recorded_error_raises_its_kind_with_the_status(exchange: dict[str, Any]
 
 
 @respx.mock
-@pytest.mark.parametrize("status", [403, 405, 409, 418, 502])
+@pytest.mark.parametrize("status", [401, 403, 405, 409, 418, 502])
 def test_other_error_statuses_raise_with_the_daemons_message(status: int) -> None:
     respx.route().mock(return_value=httpx.Response(status, json={"detail": "Daemon is busy."}))
     with pytest.raises(KINDS.get(status, DaemonFaultError), match="Daemon is busy"):
@@ -159,3 +162,51 @@ def test_answer_out_of_bounds_is_a_fault_and_not_parsed(size: int, why: str) -> 
     respx.get(f"{HERE}/x").mock(return_value=httpx.Response(200, content=LONG[:size]))
     with pytest.raises(DaemonFaultError, match=why):
         RestClient("127.0.0.1").get("/x")
+
+
+@respx.mock
+def test_token_is_a_bearer_header_and_tls_another_scheme(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("REACHY_DAEMON_TOKEN", "secret")
+    plain = respx.get(f"{HERE}/x").mock(return_value=httpx.Response(200, json=[]))
+    RestClient("127.0.0.1").get("/x")
+    assert plain.calls.last.request.headers["authorization"] == "Bearer secret"
+    monkeypatch.setenv("REACHY_DAEMON_TLS", "on")
+    encrypted = respx.get("https://head.example:8000/x").mock(return_value=httpx.Response(200, json=[]))
+    RestClient("head.example").get("/x")
+    assert encrypted.calls.last.request.headers["authorization"] == "Bearer secret"
+    monkeypatch.delenv("REACHY_DAEMON_TOKEN")
+    RestClient("head.example").get("/x")
+    assert "authorization" not in encrypted.calls.last.request.headers
+
+
+def test_token_in_the_clear_warns_once_except_on_loopback(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    warn_once.cache_clear()
+    monkeypatch.setenv("REACHY_DAEMON_TOKEN", "secret")
+    for host in ("127.0.0.1", "localhost", "[::1]"):
+        RestClient(host)
+    assert not caplog.records
+    for _ in range(2):
+        RestClient("192.168.7.7")
+    assert [each.getMessage() for each in caplog.records] == [
+        "REACHY_DAEMON_TOKEN is sent to 192.168.7.7 unencrypted, where others can read it; set REACHY_DAEMON_TLS."
+    ]
+    monkeypatch.setenv("REACHY_DAEMON_TLS", "1")
+    RestClient("192.168.7.8")
+    assert len(caplog.records) == 1
+
+
+def test_token_that_no_header_can_carry_is_refused_without_being_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("REACHY_DAEMON_TOKEN", "geheim-ü")
+    with pytest.raises(ValidationError, match="REACHY_DAEMON_TOKEN") as refused:
+        RestClient("127.0.0.1")
+    assert "geheim" not in str(refused.value)
+    assert "REACHY_DAEMON_TOKEN" in api("127.0.0.1", 8000, "/x")["error"]
+
+
+def test_misspelt_switch_encrypts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("REACHY_DAEMON_TLS", "ture")
+    assert DaemonAccess.stated("127.0.0.1").tls
+    monkeypatch.setenv("REACHY_DAEMON_TLS_INSECURE", "ture")
+    assert not DaemonAccess.stated("127.0.0.1").insecure

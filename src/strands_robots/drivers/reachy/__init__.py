@@ -6,10 +6,12 @@ Third parties are loaded on use.
 from __future__ import annotations
 
 import ipaddress
+import re
 import threading
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
+from strands_robots import settings
 from strands_robots.utils import ValidationError, missing_extra, number
 
 if TYPE_CHECKING:
@@ -74,6 +76,15 @@ def _discovered(name: str, info: Any) -> DiscoveredDaemon:
     return DiscoveredDaemon(name.removesuffix("." + SERVICE), addresses[0], int(info.port))
 
 
+def _stated(api_port: int) -> tuple[str, int]:
+    """Return host and port of the environment; an empty host where it has none."""
+    stated = settings.raw("REACHY_HOST")
+    if settings.is_set("REACHY_PORT"):
+        api_port = settings.integer("REACHY_PORT")
+    with_port = re.fullmatch(r"([^:]+|\[.+\]):(\d+)", stated)
+    return (with_port[1], int(with_port[2])) if with_port else (stated, api_port)
+
+
 def make_reachy(
     host: str = "",
     *,
@@ -85,7 +96,7 @@ def make_reachy(
     """Return a driver for ``host``, or for the one Reachy Mini that announces itself.
 
     Args:
-        host: bare hostname or IP literal; empty to discover it.
+        host: bare hostname or IP literal; empty for that of ``REACHY_HOST``, and where that is unset to discover it.
         api_port: TCP port of the daemon, when ``host`` is given.
         within_s: seconds to listen.
         driver: the class to make; :class:`ReachyDriver` by default.
@@ -95,6 +106,8 @@ def make_reachy(
         ValidationError: none or several were found, or an argument is out of its domain.
     """
     make = driver or __getattr__("ReachyDriver")
+    if not host:
+        host, api_port = _stated(api_port)
     if host:
         return cast("ReachyDriver", make(host, api_port=api_port, **options))
     daemons = discover(within_s)

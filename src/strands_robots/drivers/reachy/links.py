@@ -22,10 +22,12 @@ from typing import Any, Protocol
 from strands_robots.bounded_json import SMALL_BYTES, json_object
 from strands_robots.drivers.reachy.rest import (
     CONNECT_S,
+    DaemonAccess,
     DaemonFaultError,
     DaemonUnreachableError,
     checked_host,
     url_host,
+    warn_once,
 )
 from strands_robots.drivers.reachy.target import Target
 from strands_robots.stop_log import stop_logger
@@ -59,7 +61,8 @@ def open_socket(stack: contextlib.ExitStack, host: str, api_port: int, path: str
         from websockets.sync.client import connect  # noqa: PLC0415 - the same
     except ImportError as exc:
         raise missing_extra("Reachy Mini", "reachy") from exc
-    url = f"ws://{url_host(host)}:{api_port}{path}"
+    access = DaemonAccess.stated(host)
+    url = f"{access.url('ws', api_port)}{path}"
     try:
         return stack.enter_context(
             connect(
@@ -72,6 +75,8 @@ def open_socket(stack: contextlib.ExitStack, host: str, api_port: int, path: str
                 open_timeout=CONNECT_S,
                 close_timeout=0.5,
                 proxy=None,
+                ssl=access.context,
+                additional_headers=access.headers,
             )
         )
     except (OSError, WebSocketException) as exc:
@@ -371,6 +376,9 @@ def make_link(
     """Return the link for a daemon, not yet open; ``transport`` may override it."""
     kind = info.link if transport == "auto" else transport
     if kind == "zenoh":
+        access = DaemonAccess.stated(host)
+        if session is None and (access.tls or access.token):
+            warn_once(f"The daemon at {host} speaks Zenoh, which no REACHY_DAEMON_ setting encrypts or authenticates.")
         return ZenohLink(host, info.prefix(prefix), session=session, zenoh_port=zenoh_port)
     return WebSocketLink(
         host, api_port, full_target=info.since(FULL_TARGET_SINCE), can_stop=info.since(STOP_MOVE_SINCE)

@@ -3,7 +3,8 @@
 Each kind of failure has an error of its own.
 
 Importable with the standard library alone; ``httpx`` is loaded by the first request. The daemon has no
-authentication: every client that reaches its port controls the motors.
+authentication: every client that reaches its port controls the motors. What a gateway in front of it asks for is a
+:class:`DaemonAccess`.
 
 It may hang, so the answer to a stop is waited for on a thread of the round, never on that of the halt. A second stop is
 sent beside the first one, which may wait for ever.
@@ -20,17 +21,29 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, field
-from functools import partial
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
+from strands_robots import settings
 from strands_robots.bounded_json import OutOfBoundsError, json_object, parsed
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.stop_log import stop_logger
 from strands_robots.threads import ReadyThreads
-from strands_robots.utils import ValidationError, choice, dial_host_error, missing_extra, number, port, shown
+from strands_robots.utils import (
+    ValidationError,
+    choice,
+    dial_host_error,
+    is_loopback_host,
+    missing_extra,
+    number,
+    port,
+    shown,
+)
 
 if TYPE_CHECKING:
     import httpx
+
+logger = stop_logger(__name__)
 
 CONNECT_S = 2.0
 READ_S = 5.0
@@ -54,7 +67,7 @@ class DaemonUnreachableError(DaemonError):
 
 
 class DaemonRefusedError(DaemonError):
-    """400, 403, 405 or 422: the request itself is not accepted."""
+    """400, 401, 403, 405 or 422: the request itself is not accepted."""
 
 
 class DaemonNotFoundError(DaemonError):
@@ -75,6 +88,7 @@ class BackendDownError(DaemonError):
 
 _KINDS: dict[int, type[DaemonError]] = {
     400: DaemonRefusedError,
+    401: DaemonRefusedError,
     403: DaemonRefusedError,
     404: DaemonNotFoundError,
     405: DaemonRefusedError,
@@ -90,6 +104,72 @@ def checked_host(value: object) -> str:
     if reason is not None:
         raise ValidationError(reason)
     return str(value)
+
+
+@lru_cache(maxsize=64)
+def warn_once(warning: str) -> None:
+    """Log a warning the first time in this process."""
+    logger.warning("%s", warning)
+
+
+@lru_cache(maxsize=2)
+def tls_context(insecure: bool) -> ssl.SSLContext:
+    """Return the context of every encrypted connection to a daemon.
+
+    Made once: reading the system's certificates would cost a stop its first 50 ms.
+    """
+    context = ssl.create_default_context()
+    if insecure:
+        context.check_hostname = False
+        context.verify_mode = ssl.CERT_NONE
+    return context
+
+
+@dataclass(frozen=True, slots=True)
+class DaemonAccess:
+    """Bearer token and encryption of the requests to one host."""
+
+    host: str
+    token: str = field(default="", repr=False)
+    tls: bool = False
+    insecure: bool = False
+
+    @classmethod
+    def stated(cls, host: str) -> DaemonAccess:
+        """Return what the environment states; warn of what protects nothing.
+
+        Raises:
+            ValidationError: ``REACHY_DAEMON_TOKEN`` cannot be sent in a header.
+        """
+        token = settings.raw("REACHY_DAEMON_TOKEN")
+        if not token.isascii() or not token.isprintable():
+            raise ValidationError("REACHY_DAEMON_TOKEN must be printable ASCII; what it is set to is not.")
+        tls = settings.boolean("REACHY_DAEMON_TLS", safe=True)
+        insecure = tls and settings.boolean("REACHY_DAEMON_TLS_INSECURE")
+        if token and not tls and not is_loopback_host(host.strip("[]")):
+            warn_once(
+                f"REACHY_DAEMON_TOKEN is sent to {host} unencrypted, where others can read it; set REACHY_DAEMON_TLS."
+            )
+        if insecure:
+            warn_once(f"REACHY_DAEMON_TLS_INSECURE: whoever answers at {host} is taken for the daemon.")
+        return cls(host, token, tls, insecure)
+
+    @property
+    def headers(self) -> dict[str, str]:
+        """Headers that every request carries."""
+        return {"Authorization": f"Bearer {self.token}"} if self.token else {}
+
+    @property
+    def context(self) -> ssl.SSLContext | None:
+        """Context of a TLS connection; None for one in the clear."""
+        return tls_context(self.insecure) if self.tls else None
+
+    def url(self, scheme: str, api_port: int) -> str:
+        """Return the URL of the daemon: ``http`` or ``ws``, with an s where encrypted.
+
+        A certificate is made out to a name, so behind TLS a name is dialled as it is.
+        """
+        return f"{scheme}s://{self.host}:{api_port}" if self.tls else f"{scheme}://{url_host(self.host)}:{api_port}"
 
 
 def url_host(host: str) -> str:
@@ -122,7 +202,7 @@ class RestClient:
         longest: bytes of an answer beyond which it is not read.
 
     Raises:
-        ValidationError: a host or port that cannot be dialled.
+        ValidationError: a host or port that cannot be dialled, or a token that cannot be sent.
     """
 
     def __init__(
@@ -130,6 +210,9 @@ class RestClient:
     ) -> None:
         self.host = checked_host(host)
         self.port = port("api_port", api_port)
+        self._access = DaemonAccess.stated(self.host)
+        # The daemon itself speaks plain HTTP, which needs no certificates.
+        self._context = self._access.context or ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
         self._read_s, self._longest = read_s, longest
         self._lock = threading.Lock()
         self._pool: _Pool | None = None
@@ -197,12 +280,11 @@ class RestClient:
         httpx = _httpx()
         fresh = _Pool(
             httpx.Client(
-                base_url=f"http://{url_host(self.host)}:{self.port}",
+                base_url=self._access.url("http", self.port),
                 timeout=httpx.Timeout(self._read_s, connect=CONNECT_S),
                 # An answer is read up to its bound, which nothing that was compressed keeps.
-                headers={"Accept-Encoding": "identity"},
-                # The daemon speaks plain HTTP: reading the system's certificates would cost a stop its first 50 ms.
-                verify=ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT),
+                headers={"Accept-Encoding": "identity", **self._access.headers},
+                verify=self._context,
                 # A robot is on the local network: a proxy of the environment is not asked.
                 trust_env=False,
             ),
@@ -286,8 +368,6 @@ def _detail(status: int, body: bytes) -> str:
         detail = f"{location}: {detail[0].get('msg', '')}"
     return f"{status} {detail[:DETAIL_MAX] if isinstance(detail, str) else shown(detail)}"
 
-
-logger = stop_logger(__name__)
 
 ROUNDS_MAX = 8
 """Rounds that may wait for the daemon at once. A further stop waits for the first that returns."""
