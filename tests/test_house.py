@@ -29,6 +29,7 @@ FLOORS: list[set[str]] = [
         "tags",
         "utils",
         "bounded_json",
+        "plug_ins",
         "state_files",
         "stop_log",
         "agent_tool",

@@ -15,6 +15,7 @@ from typing import Any
 from strands_robots._mesh_switch import mesh_env_request
 from strands_robots.contract import adapt, put_away
 from strands_robots.envelope import is_error, text_of
+from strands_robots.plug_ins import PlugIn, PlugIns, takes
 from strands_robots.safety.scope import own_cell
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.tags import own_tags
@@ -27,6 +28,15 @@ HARDWARE_OPTIONS = ("control_hz", "joint_ranges", "stop_level", "rest_pose", "mo
 
 DETECTOR = "detector"
 """Option of a real robot that is set on it: an :class:`~strands_robots.kinematics.objects.ObjectDetector`."""
+
+LEROBOT = "lerobot:"
+"""Prefix of the name of a LeRobot type, those of its plug-ins among them: always real."""
+
+PLUG_INS = PlugIns("robot", ("so100", "so101", "rover", "so100_follower", "so101_follower", "reachy_mini"))
+"""Robots of other packages; each is a callable that takes keyword options and returns a robot."""
+
+_DEVICE = ("connect", "disconnect", "get_observation", "send_action")
+"""Methods of LeRobot's robot interface, by which a device is known."""
 
 NO_SUCH_MODEL = "NO_SUCH_MODEL"
 """Error code for a simulated robot whose model is unknown or cannot be loaded."""
@@ -54,7 +64,8 @@ class Networked:
         peer, self.mesh = self.mesh, None
         if peer is not None:
             peer.stop()
-        return super().cleanup()  # type: ignore[misc]  # the robot class is the next base
+        own = getattr(super(), "cleanup", None)
+        return own() if callable(own) else adapt(self).halt("cleanup").envelope()
 
 
 def Robot(  # the factory reads as the class it stands for
@@ -73,8 +84,10 @@ def Robot(  # the factory reads as the class it stands for
     Args:
         name: in simulation a model: ``so100``, ``so101``, ``rover``, the path of an MJCF or URDF file, or a
             ``robot_descriptions`` name. Real: a LeRobot robot type, such as ``so100_follower`` or ``so100``, or
-            ``reachy_mini``.
-        mode: ``sim`` (MuJoCo, moving in real time) or ``real`` (a LeRobot device, connected without calibration).
+            ``reachy_mini``. ``lerobot:NAME`` is a LeRobot type in any mode, of its plug-ins too. Or a robot of
+            another package, by its entry point (:mod:`strands_robots.plug_ins`).
+        mode: ``sim`` (MuJoCo, moving in real time) or ``real`` (a LeRobot device, connected without calibration). A
+            robot of another package gets it as its option ``mode`` where it has one.
         tool_name: its name on a network; the robot's name by default.
         peer_id: its id on the networks.
         mesh: True joins the native mesh now, False never; None asks ``STRANDS_MESH``.
@@ -88,7 +101,8 @@ def Robot(  # the factory reads as the class it stands for
             LeRobot configuration of the robot, such as ``port="/dev/ttyACM0"`` and ``id="left"``, with ``cameras`` as
             dictionaries and ``calibration`` (a file or its content; LeRobot's file of the id by default).
             ``reachy_mini``: ``host`` (by default searched on the local network) and the arguments of
-            ``ReachyDriver``.
+            ``ReachyDriver``. Another package's: those of its callable, and for a device with LeRobot's robot
+            interface those of ``real``.
 
     Raises:
         ValidationError: an unknown name (the message lists similar ones) or an option outside its domain.
@@ -103,15 +117,31 @@ def Robot(  # the factory reads as the class it stands for
     if cell is not None:
         own_cell(cell)
     stated = None if tags is None else own_tags(tags)
-    robot = _simulated(name, tool_name, options) if kind == "sim" else _real(name, tool_name, options)
+    plug_in = PLUG_INS.get(name)
+    lerobot = isinstance(name, str) and name.startswith(LEROBOT)
+    if plug_in is not None:
+        robot = _of_package(plug_in, kind, tool_name, options)
+    elif kind == "real" or lerobot:
+        robot = _real(name.removeprefix(LEROBOT), tool_name, options)
+    else:
+        robot = _simulated(name, tool_name, options)
     robot.peer_id, robot.cell, robot.tags = peer_id, cell, stated
     if mesh or (mesh is None and mesh_env_request()):
         try:
-            robot.mesh = _join_mesh(robot, peer_id, "sim" if kind == "sim" else "robot")
+            hardware = kind == "real" or lerobot or plug_in is not None
+            robot.mesh = _join_mesh(robot, peer_id, "robot" if hardware else "sim")
         except BaseException:
             robot.cleanup()
             raise
     return robot
+
+
+def counts_as_hardware(name: str) -> bool:
+    """Return True for a robot that is real hardware in any mode; nothing is imported.
+
+    A robot of another package may move anything, so it needs the operator's approval in its own simulation, too.
+    """
+    return name == "reachy_mini" or name.startswith(LEROBOT) or PLUG_INS.get(name) is not None
 
 
 def run(
@@ -201,17 +231,44 @@ def _simulated(name: str, tool_name: str | None, options: dict[str, Any]) -> Any
     return simulation
 
 
+def _of_package(plug_in: PlugIn, mode: str, tool_name: str | None, options: dict[str, Any]) -> Any:
+    """Make a robot of another package: a device of LeRobot's kind, or an object."""
+    factory = plug_in.load()
+    if takes(factory, "mode"):
+        options["mode"] = mode
+    # What the package does not take itself is for the robot that its device is made to.
+    own = {key: options.pop(key) for key in (*HARDWARE_OPTIONS, DETECTOR) if key in options and not takes(factory, key)}
+    body = plug_in.make(**options)
+    if all(callable(getattr(body, each, None)) for each in _DEVICE) and not callable(getattr(body, "start_task", None)):
+        return _of_device(plug_in.name, body, tool_name, own)
+    if own:
+        raise ValidationError(f"{plug_in} has no option {', '.join(own)}.")
+    try:
+        body.__class__ = _networked(body.__class__)
+    except TypeError as exc:
+        raise ValidationError(f"{plug_in} must make an object of a class of its own, not {shown(body)}.") from exc
+    named = tool_name or ("" if getattr(body, "tool_name_str", None) else _label(plug_in.name))
+    if named:
+        body.tool_name_str = named
+    return body
+
+
 def _real(name: str, tool_name: str | None, options: dict[str, Any]) -> Any:
     if name == "reachy_mini":
         return _reachy(tool_name, options)
-    from strands_robots.hardware import HardwareRobot  # noqa: PLC0415 - real hardware only
-    from strands_robots.hardware.lerobot_device import make_device  # noqa: PLC0415 - as above
+    from strands_robots.hardware.lerobot_device import make_device  # noqa: PLC0415 - real hardware only
 
-    own = {key: options.pop(key) for key in HARDWARE_OPTIONS if key in options}
-    detector = options.pop(DETECTOR, None)
+    own = {key: options.pop(key) for key in (*HARDWARE_OPTIONS, DETECTOR) if key in options}
+    return _of_device(name, make_device(name, options), tool_name, own)
+
+
+def _of_device(name: str, device: Any, tool_name: str | None, own: dict[str, Any]) -> Any:
+    """Make a connected robot of a device that has LeRobot's robot interface."""
+    from strands_robots.hardware import HardwareRobot  # noqa: PLC0415 - real hardware only
+
+    detector = own.pop(DETECTOR, None)
     if detector is not None and not callable(getattr(detector, "detect", None)):
         raise ValidationError(f"detector must have detect(frames), which {shown(detector)} has not.")
-    device = make_device(name, options)
     robot = _construct(_networked(HardwareRobot), device, tool_name=tool_name or _label(name), **own)
     try:
         robot.connect()

@@ -34,11 +34,15 @@ from pathlib import Path
 from typing import Any, Protocol, Self, TextIO
 
 from strands_robots.errors import StrandsRobotsError
+from strands_robots.plug_ins import PlugIns
 from strands_robots.policies.base import Action, Ranges, checked_action, limited, numbers, speeds_across
 from strands_robots.policies.decoding import read_json
 from strands_robots.utils import ValidationError, mapping, missing_extra, number, shown
 
 logger = logging.getLogger(__name__)
+
+PLUG_INS = PlugIns("teleoperator", ("keyboard", "gamepad"))
+"""Leaders of other packages; each is a callable that takes keyword options and returns a leader."""
 
 GIVE_UP_S = 0.5
 """Longest time without a usable frame; after it the teleoperation ends with an error and the follower stops."""

@@ -12,7 +12,7 @@ from fixtures.mesh_robots import Arm, World
 from fixtures.waiting import eventually
 from tests.mesh.peers import Fleet
 
-from strands_robots import policies
+from strands_robots import plug_ins
 from strands_robots.mesh.security import ValidationError, validate_command
 from strands_robots.mesh.transport.memory import MemoryTransport
 from strands_robots.safety.authorization import Grants
@@ -365,7 +365,7 @@ def test_a_plug_ins_policy_is_known_on_the_wire(peers: Fleet, monkeypatch: pytes
     refused = console.send("sim-1", start, timeout=20)
     assert refused["error"].startswith("validation: policy_provider must be one of")
     entry = EntryPoint("house_made", "house:Made", "strands_robots.policies")
-    monkeypatch.setattr(policies, "entry_points", lambda group: [entry])
+    monkeypatch.setattr(plug_ins, "entry_points", lambda group: [entry])
     registered_providers.cache_clear()
     try:
         assert console.send("sim-1", start, timeout=20)["result"]["status"] == "success"

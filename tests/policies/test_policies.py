@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from fixtures.bodies import ScriptedPolicy
 
-from strands_robots import policies
+from strands_robots import plug_ins, policies
 from strands_robots.policies import create_policy, policy_names, resolve_provider
 from strands_robots.utils import MissingExtraError, ValidationError
 
@@ -48,9 +48,9 @@ def test_unknown_option_is_refused() -> None:
 
 
 def test_plug_in_is_found_by_its_entry_point(monkeypatch: pytest.MonkeyPatch) -> None:
-    entry = EntryPoint("dreamer", "tests.policies.test_policies:plug_in", policies.ENTRY_POINT_GROUP)
-    wrong = EntryPoint("wrong", "builtins:dict", policies.ENTRY_POINT_GROUP)
-    monkeypatch.setattr(policies, "entry_points", lambda group: [entry, wrong])
+    entry = EntryPoint("dreamer", "tests.policies.test_policies:plug_in", policies.PLUG_INS.group)
+    wrong = EntryPoint("wrong", "builtins:dict", policies.PLUG_INS.group)
+    monkeypatch.setattr(plug_ins, "entry_points", lambda group: [entry, wrong])
     assert policy_names()[6:] == ("dreamer", "wrong")
     monkeypatch.setattr(EntryPoint, "load", lambda self: plug_in if self.name == "dreamer" else dict)
     assert create_policy("dreamer", policy_port=3).act({}) == {"policy_port": 3}

@@ -72,6 +72,15 @@ print("rendered with", BACKEND or "the default OpenGL")
 """
 
 
+# Foreign code, which may hang or end its process.
+_LOAD = """
+import sys
+from importlib.metadata import entry_points
+[entry.load() for entry in entry_points(group=sys.argv[1]) if entry.name == sys.argv[2]]
+"""
+_LOAD_S = 30.0
+
+
 class Mark(StrEnum):
     """Severity of a finding; only ``broken`` is required and does not work."""
 
@@ -117,7 +126,7 @@ def examine(network: Network) -> list[Finding]:
     link, found = _link_of(network)
     of_link = (_meeting_port, _listened, _dialled, _certificates)
     before: tuple[Callable[[], Iterator[Finding]], ...] = (_installation, _packages)
-    after = (_multicast, _credentials, _stop_senders, _rendering, _state, _robot_keys)
+    after = (_multicast, _credentials, _stop_senders, _rendering, _state, _robot_keys, _plug_ins)
     return [
         *(finding for check in before for finding in check()),
         *found,
@@ -356,6 +365,41 @@ def _robot_keys() -> Iterator[Finding]:
             yield Finding(f"key of {name}", Mark.WARN, identity, "its answers are not signed until this is mended")
         else:
             yield Finding(f"key of {name}", Mark.OK, f"fingerprint {identity.fingerprint}")
+
+
+def _plug_ins() -> Iterator[Finding]:
+    """Load each robot, teleoperator and policy of another package in a process of its own."""
+    from strands_robots import policies, robot, teleoperators  # noqa: PLC0415 - no other check needs them
+    from strands_robots.hardware.lerobot_device import lerobot_plug_ins  # noqa: PLC0415 - as above
+
+    for stated in (robot.PLUG_INS, teleoperators.PLUG_INS, policies.PLUG_INS):
+        for name, why in stated.refused().items():
+            yield Finding(f"{stated.kind} {name}", Mark.WARN, why, "uninstall the package that you do not mean")
+        for name in stated.names():
+            plug_in = None if name in stated.refused() else stated.get(name)
+            if plug_in is None:
+                continue
+            if problem := _load_problem(stated.group, name):
+                said = f"{plug_in.package} cannot be loaded: {problem}"
+                yield Finding(f"{stated.kind} {name}", Mark.WARN, said, f"mend or uninstall {plug_in.package}")
+            else:
+                yield Finding(f"{stated.kind} {name}", Mark.OK, plug_in.package)
+    for package in lerobot_plug_ins():
+        yield Finding("LeRobot plug-in", Mark.OK, f"{package}, loaded when its type is asked for")
+
+
+def _load_problem(group: str, name: str) -> str:
+    """Return why a plug-in cannot be loaded, or nothing."""
+    command = [sys.executable, "-c", _LOAD, group, name]
+    try:
+        tried = subprocess.run(
+            command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=_LOAD_S, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return f"not loaded within {_LOAD_S:g} s"
+    if tried.returncode == 0:
+        return ""
+    return (tried.stderr.strip() or f"it ended its process with {tried.returncode}").splitlines()[-1]
 
 
 def _version(name: str) -> str | None:

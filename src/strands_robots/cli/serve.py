@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import gc
+import json
+import math
 import os
 import shlex
 import signal
 import sys
 import threading
+import tomllib
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, replace
@@ -33,7 +36,16 @@ from strands_robots.policies.profiles import load_profiles
 from strands_robots.safety.authorization import listed, motion_refusal
 from strands_robots.safety.sightings import DuplicateDeviceError
 from strands_robots.tags import own_tags
-from strands_robots.utils import ValidationError, identifier, number, own_device_id, redacted, shown, text
+from strands_robots.utils import (
+    ValidationError,
+    identifier,
+    number,
+    optional_module,
+    own_device_id,
+    redacted,
+    shown,
+    text,
+)
 
 if TYPE_CHECKING:
     from device_connect_edge.drivers import DeviceDriver
@@ -177,7 +189,9 @@ def serve(
     screen: Screen,
     network: Network,
     *,
-    robot: Annotated[str, typer.Argument(help="Such as so100, or an MJCF or URDF file.")],
+    robot: Annotated[
+        str, typer.Argument(help="Such as so100, an MJCF or URDF file, lerobot:TYPE, or a robot of another package.")
+    ],
     peer_id: Annotated[str | None, typer.Option("--peer-id", help="Its id on the network, without dots.")] = None,
     mode: Annotated[
         str | None, typer.Option("--mode", help="sim or real; real by itself with a serial port, and for reachy_mini.")
@@ -196,6 +210,9 @@ def serve(
     options: Annotated[
         list[str] | None,
         typer.Option("--set", help="An option of the robot, such as port=/dev/ttyACM0.", metavar="KEY=VALUE"),
+    ] = None,
+    config: Annotated[
+        Path | None, typer.Option("--config", help="File of the robot's options: .json, .toml or LeRobot's .yaml.")
     ] = None,
     rpc_allow: Annotated[str | None, _allow("--rpc-allow", "Callers that may move it: globs, or 'anonymous'.")] = None,
     estop_allow: Annotated[str | None, _allow("--estop-allow", "Sources whose emergency stop counts: globs.")] = None,
@@ -275,17 +292,20 @@ def serve(
     if network.mesh:
         network.use_mesh()
     link = None if network.mesh else network.link()
-    from strands_robots.robot import Robot  # noqa: PLC0415 - heavy, and needed by this command alone
+    from strands_robots.robot import LEROBOT, Robot, counts_as_hardware  # noqa: PLC0415 - heavy, and needed by this command alone
 
     limit = None if speed_limit is None else number("--speed-limit", speed_limit, above=0, high=SPEED_MAX)
     given = {"host": host, "port": serial_port, "speed_limit": limit}
-    chosen = assignments(options or []) | {name: value for name, value in given.items() if value is not None}
+    stated = {} if config is None else options_of_file(config, robot)
+    chosen = stated | assignments(options or []) | {name: value for name, value in given.items() if value is not None}
     if emulated and (robot not in EMULATED or serial_port is not None or mode == "sim"):
         raise ValidationError(f"--emulated is for a real {' or '.join(EMULATED)} without a serial port.")
-    mode = mode or ("real" if emulated or serial_port is not None or robot == "reachy_mini" else "sim")
+    always_real = robot == "reachy_mini" or robot.startswith(LEROBOT)
+    mode = mode or ("real" if emulated or serial_port is not None or always_real else "sim")
     if serial_port is not None and mode == "sim":
         raise ValidationError(f"--mode must be real with the serial port {serial_port}, not sim.")
-    chosen |= _arm_options(mode, model, detector)
+    peer_type = "real" if counts_as_hardware(robot) else mode
+    chosen |= _arm_options(peer_type, model, detector)
     loading = [] if policies is None else warm_profiles()
     if loading:
         screen.say(f"Loading the policies {', '.join(loading)}.")
@@ -294,13 +314,13 @@ def serve(
             from strands_robots.hardware.emulated import emulated_arm  # noqa: PLC0415 - as above
 
             chosen = stack.enter_context(emulated_arm()) | chosen
-        body = Robot(robot, mode="real" if robot == "reachy_mini" else mode, **chosen)
+        body = Robot(robot, mode="real" if always_real else mode, **chosen)
         cleanup = getattr(body, "cleanup", None)
         if callable(cleanup):
             stack.callback(cleanup)
         stack.enter_context(record_robot(screen, body, peer_id or str(body.tool_name_str), record, record_cameras))
         if link is None:
-            served = _on_mesh(screen, network, body, peer_id, mode)
+            served = _on_mesh(screen, network, body, peer_id, peer_type)
         else:
             served = _on_device_connect(screen, network, link, body, peer_id)
         _serve(screen, body, served, piped=until_stdin_closes)
@@ -311,6 +331,57 @@ def _added(given: str | None, setting: str, entries: Sequence[str]) -> str:
     before = settings.raw(setting) if given is None else given
     named = [each.strip() for each in (before or "").split(",")]
     return ",".join(dict.fromkeys([*filter(None, named), *entries]))
+
+
+def options_of_file(path: Path, robot: str) -> dict[str, Any]:
+    """Read the options of ``robot`` from a .json, .toml or .yaml file.
+
+    It holds a mapping, or one under ``robot``. LeRobot's own configuration of a robot is such a file; its ``type`` must
+    be the robot that is served.
+
+    Raises:
+        ValidationError: the file cannot be read, is no mapping, or is of another type.
+    """
+    try:
+        source = path.expanduser().read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as exc:
+        raise ValidationError(f"--config {shown(str(path))} cannot be read: {exc}.") from exc
+    try:
+        content = _parsed(path, source)
+    except ValueError as exc:
+        raise ValidationError(f"--config {shown(str(path))} cannot be read: {' '.join(str(exc).split())}.") from exc
+    options = content.get("robot", content) if isinstance(content, dict) else None
+    if not isinstance(options, dict):
+        raise ValidationError(f"--config {shown(str(path))} must have a robot's options by name.")
+    kind = options.pop("type", None)
+    if kind not in (None, robot, robot.partition(":")[2]):
+        raise ValidationError(f"--config {shown(str(path))} is for the type {shown(kind)}, not for {robot}.")
+    _check_names_and_numbers(path, options)
+    return options
+
+
+def _check_names_and_numbers(path: Path, value: object) -> None:
+    """Refuse keys that are no text, NaN and infinities, at any depth."""
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ValidationError(f"--config {shown(str(path))} must have finite numbers, not {value}.")
+    for key in value if isinstance(value, dict) else ():
+        if not isinstance(key, str):
+            raise ValidationError(f"--config {shown(str(path))} must have names as keys, not {shown(key)}.")
+    for each in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
+        _check_names_and_numbers(path, each)
+
+
+def _parsed(path: Path, source: str) -> object:
+    """Parse by the ending of the name; raise :class:`ValueError` where it cannot."""
+    if path.suffix == ".toml":
+        return tomllib.loads(source)
+    if path.suffix not in (".yaml", ".yml"):
+        return json.loads(source)
+    yaml = optional_module("yaml", what="A .yaml file", extra="lerobot")
+    try:
+        return yaml.safe_load(source)
+    except yaml.YAMLError as exc:
+        raise ValueError(str(exc)) from exc
 
 
 def _arm_options(mode: str, model: Path | None, detector: str | None) -> dict[str, Any]:
@@ -352,10 +423,10 @@ def _serve(screen: Screen, body: Any, served: AbstractContextManager[str], *, pi
 
 
 @contextmanager
-def _on_mesh(screen: Screen, network: Network, body: Any, peer_id: str | None, mode: str) -> Iterator[str]:
+def _on_mesh(screen: Screen, network: Network, body: Any, peer_id: str | None, peer_type: str) -> Iterator[str]:
     with ExitStack() as joined:
         try:
-            mesh = joined.enter_context(mesh_peer(body, peer_id, mode))
+            mesh = joined.enter_context(mesh_peer(body, peer_id, peer_type))
         except DuplicateDeviceError as exc:
             raise CliError(f"The robot is not on the network: {exc}") from exc
         except CliError as exc:

@@ -22,7 +22,7 @@ from strands_robots.envelope import is_error, text_of
 from strands_robots.errors import NoAnswerError, NoSuchRobotError, RefusalError
 from strands_robots.policies.base import Ranges
 from strands_robots.safety.stopping import StopVerdict
-from strands_robots.teleoperators import FULL_RANGES_PER_S, LeaderPolicy
+from strands_robots.teleoperators import FULL_RANGES_PER_S, PLUG_INS, LeaderPolicy
 from strands_robots.utils import ValidationError, identifier, number
 
 if TYPE_CHECKING:
@@ -82,7 +82,9 @@ def teleop(
     *,
     leader: Annotated[
         str,
-        typer.Argument(help="keyboard, gamepad, a recording (.csv, .parquet, .mcap), or TYPE@PORT of a leader arm."),
+        typer.Argument(
+            help="keyboard, gamepad, a recording (.csv, .parquet, .mcap), TYPE@PORT of an arm, or another package's."
+        ),
     ],
     follower: Annotated[
         str, typer.Argument(help="TYPE@PORT of a real arm, a model in simulation, mesh:PEER, or none to --publish.")
@@ -389,25 +391,33 @@ def _connected_leader(leader: str, robot: Any, options: dict[str, Any]) -> Itera
     Raises:
         ConnectionError: a leader arm cannot be connected.
     """
+    from strands_robots.robot import LEROBOT  # noqa: PLC0415 - heavy, and needed by these commands alone
+
     if leader in _MANUAL:
         from strands_robots.teleoperators import GamepadLeader, KeyboardLeader  # noqa: PLC0415 - as above
 
         body = robot.body()
         present = body.get_joints()
         start = {key: present[key] for key in body.bounds if key in present}
-        made = KeyboardLeader if leader == "keyboard" else GamepadLeader
-        with made(start, body.bounds) as source:
+        manual = KeyboardLeader if leader == "keyboard" else GamepadLeader
+        with manual(start, body.bounds) as source:
             yield source
         return
     kind, at, port = leader.partition("@")
-    if not at:
+    stated = {**options, "port": port} if at else options
+    plug_in = PLUG_INS.get(kind)
+    made = None if plug_in is None else plug_in.make(**stated)
+    if made is not None and not callable(getattr(made, "connect", None)):
+        yield made
+        return
+    if made is None and not at:
         yield _recorded_leader(Path(leader))
         return
     from strands_robots.hardware import LeaderArm  # noqa: PLC0415 - real arms only
     from strands_robots.hardware.lerobot_device import make_device  # noqa: PLC0415
 
     with ExitStack() as stack:
-        arm = LeaderArm(make_device(kind, {**options, "port": port}, "leader"))
+        arm = LeaderArm(make_device(kind.removeprefix(LEROBOT), stated, "leader") if made is None else made)
         try:
             stack.enter_context(arm)
         except Exception as exc:

@@ -42,11 +42,19 @@ def lerobot_module(name: str) -> ModuleType:
     Raises:
         ModuleNotFoundError: LeRobot, or something the module really needs, is not installed.
     """
+    with lerobot_imports():
+        return importlib.import_module(name)
+
+
+@contextmanager
+def lerobot_imports() -> Iterator[None]:
+    """Let what runs inside import LeRobot's drivers, also where torch is missing."""
     with LEROBOT_IMPORTS:
         if not light():
-            return importlib.import_module(name)
+            yield
+            return
         with _standing_in():
-            return importlib.import_module(name)
+            yield
 
 
 @contextmanager

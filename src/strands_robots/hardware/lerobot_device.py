@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from strands_robots.hardware._compat import drop, forget_input, lerobot_module, light
+from strands_robots.hardware._compat import drop, forget_input, lerobot_imports, lerobot_module, light
 from strands_robots.hardware.device_facts import check_port
 from strands_robots.utils import ValidationError, alike, mapping, missing_extra, shown, whole
 
@@ -293,6 +293,12 @@ def make_device(name: str, options: Mapping[str, Any], role: Role = "follower", 
     known: dict[str, Any] = getattr(devices, registry).get_known_choices()
     kind = name if name in known else f"{name}_{role}"
     if kind not in known:
+        broken = _register_plug_in(str(name), role, lambda: getattr(devices, registry).get_known_choices())
+        known = getattr(devices, registry).get_known_choices()
+        kind = name if name in known else kind
+        if kind not in known and broken:
+            raise ValidationError(f"LeRobot's plug-in for {shown(name)} cannot be loaded: {broken}.")
+    if kind not in known:
         similar = alike(str(name), known)
         hint = f"near it: {', '.join(similar)}" if similar else f"known: {', '.join(sorted(known))}"
         raise ValidationError(f"name must be a LeRobot {role} type, not {shown(name)}; {hint}.")
@@ -316,7 +322,11 @@ def make_device(name: str, options: Mapping[str, Any], role: Role = "follower", 
         config = known[kind](**fields)
     except (TypeError, ValueError) as exc:
         raise ValidationError(f"the options {sorted(fields)} do not configure {kind}: {exc}.") from exc
-    device = getattr(devices, factory)(config)
+    with lerobot_imports():  # a plug-in's class is imported here
+        try:
+            device = getattr(devices, factory)(config)
+        except ValueError as exc:
+            raise ValidationError(f"{kind} cannot be made: {' '.join(str(exc).split())}.") from exc
     if calibrated or calibration is not None:
         calibrate_from(device, calibration, name=name, role=role)
     return device
@@ -333,6 +343,33 @@ def _register_all(devices: Any) -> None:
             logger.debug("%s is not available: %s", module.name, exc)
 
 
+def _register_plug_in(name: str, role: Role, known: Callable[[], Mapping[str, Any]]) -> str:
+    """Import LeRobot's plug-ins until one registers ``name``.
+
+    The package of that name is the first. LeRobot finds them by the prefix of their import name. Which types a
+    package has is known once it is imported.
+
+    Returns:
+        Errors of the packages that could not be imported; empty once the name is registered.
+    """
+    prefix = {"follower": "lerobot_robot_", "leader": "lerobot_teleoperator_"}[role]
+    likely = prefix + name.removesuffix(f"_{role}").replace("-", "_")
+    broken = []
+    for package in sorted(lerobot_plug_ins(prefix), key=lambda each: (not each.startswith(likely), each)):
+        try:
+            lerobot_module(package)
+        except Exception as exc:  # noqa: BLE001 - a package of a stranger raises what it likes
+            broken.append(f"{package}: {type(exc).__name__}: {' '.join(str(exc).split())}".rstrip("."))
+        if name in known():
+            return ""
+    return "; ".join(broken)
+
+
+def lerobot_plug_ins(prefix: str = "lerobot_") -> list[str]:
+    """Return the import names of LeRobot's installed plug-ins; nothing is imported."""
+    return sorted(each.name for each in pkgutil.iter_modules() if each.name.startswith(prefix))
+
+
 def _cameras(given: object) -> dict[str, Any]:
     made = {}
     for name, camera in mapping("cameras", given).items():
@@ -341,8 +378,10 @@ def _cameras(given: object) -> dict[str, Any]:
             continue
         fields = dict(camera)
         kind = str(fields.pop("type", "opencv"))
+        plug_in = f"lerobot_camera_{kind}"
+        module = plug_in if plug_in in lerobot_plug_ins() else f"lerobot.cameras.{_CAMERA_MODULES.get(kind, kind)}"
         try:
-            lerobot_module(f"lerobot.cameras.{_CAMERA_MODULES.get(kind, kind)}")
+            lerobot_module(module)
         except ImportError as exc:
             raise ValidationError(f"cameras[{name!r}] is of the type {kind!r}, which is not available: {exc}.") from exc
         try:

@@ -5,18 +5,15 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable
 from importlib import import_module
-from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 from urllib.parse import urlsplit
 
+from strands_robots.plug_ins import PlugIns, takes
 from strands_robots.policies.base import Action, Policy, Ranges
 from strands_robots.policies.profiles import Profile, profiles
 from strands_robots.utils import ValidationError, alike, shown
 
 __all__ = ["ALIASES", "Action", "Policy", "Ranges", "create_policy", "policy_names", "resolve_provider"]
-
-ENTRY_POINT_GROUP = "strands_robots.policies"
-"""Each entry is a callable that takes keyword options and returns a :class:`Policy`."""
 
 ALIASES = {"lerobot": "lerobot_local"}
 
@@ -29,6 +26,9 @@ _BUILT_IN = {
     "lerobot_local": ("strands_robots.policies.lerobot_local", "LeRobotPolicy"),
 }
 
+PLUG_INS = PlugIns("policy", {*_BUILT_IN, *ALIASES})
+"""Each is a callable that takes keyword options and returns a :class:`Policy`."""
+
 
 def policy_names() -> tuple[str, ...]:
     """Return the names of all providers, then those of the operator's profiles."""
@@ -37,7 +37,7 @@ def policy_names() -> tuple[str, ...]:
 
 def provider_names() -> tuple[str, ...]:
     """Return the names of all providers: built-in ones first, then plug-ins."""
-    return (*_BUILT_IN, *(name for name in sorted(_plug_ins()) if name not in _BUILT_IN))
+    return (*_BUILT_IN, *PLUG_INS.names())
 
 
 def resolve_provider(provider: object) -> str:
@@ -70,7 +70,7 @@ def create_policy(provider: str, **options: Any) -> Policy:
     factory = policy_factory(name)
     if not options.get("policy_port"):
         options.pop("policy_port", None)
-    elif not _takes(factory, "policy_port"):
+    elif not takes(factory, "policy_port"):
         wanted = shown(options["policy_port"])
         raise ValidationError(f"policy_port must be 0 for policy_provider {name}, which asks no server, not {wanted}.")
     try:
@@ -126,14 +126,7 @@ def policy_factory(name: str) -> Callable[..., Any]:
         module, attribute = _BUILT_IN[name]
         built_in: Callable[..., Any] = getattr(import_module(module), attribute)
         return built_in
-    plug_in: Callable[..., Any] = _plug_ins()[name].load()
-    return plug_in
-
-
-def _takes(factory: Callable[..., Any], option: str) -> bool:
-    parameters = inspect.signature(factory).parameters.values()
-    return any(p.name == option or p.kind is p.VAR_KEYWORD for p in parameters)
-
-
-def _plug_ins() -> dict[str, EntryPoint]:
-    return {entry.name: entry for entry in entry_points(group=ENTRY_POINT_GROUP)}
+    plug_in = PLUG_INS.get(name)
+    if plug_in is None:
+        raise ValidationError(f"policy_provider must be one of {', '.join(provider_names())}, not {shown(name)}.")
+    return plug_in.load()
