@@ -7,7 +7,8 @@ from typing import Any
 import pytest
 from fixtures.toy_robots import ToyRobot, ToyWorld
 
-from strands_robots.contract import adapt, behind_contract, holds_robots, robots_in, task_runs
+from strands_robots.adapted import adapt, behind_contract
+from strands_robots.contract import holds_robots, robots_in, task_runs
 from strands_robots.envelope import Envelope, success
 from strands_robots.serving.robot_verbs import takes_tasks
 from strands_robots.serving.stops import OneRobot

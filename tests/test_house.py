@@ -39,7 +39,7 @@ FLOORS: list[set[str]] = [
         "threads",
         "certificates",
     },
-    {"safety", "audit", "contract", "verb_declaration", "verb_parameters"},
+    {"safety", "audit", "adapted", "contract", "verb_declaration", "verb_parameters"},
     {"arm_mixin", "kinematics", "policies", "teleop_mixin", "teleoperators", "recording"},
     {
         "hardware",
@@ -57,8 +57,8 @@ FLOORS: list[set[str]] = [
     {"cli", "tools", "mcp", "dashboard", "evaluation", "robot", "http_access"},
 ]
 
-ASKS_KINDS = {"contract"}
-"""The module that asks of which kind a robot is."""
+ASKS_KINDS = {"adapted", "contract"}
+"""The modules that ask of which kind a robot is."""
 
 NAMES_NO_NETWORK = ("mcp", "cli.mcp")
 """Faces of every network at once, which reach them through the fleet."""
@@ -197,7 +197,7 @@ def test_no_two_files_or_folders_beside_each_other_import_each_other() -> None:
     assert not [way for way in pairs if way[::-1] in pairs]
 
 
-def test_only_the_contract_asks_of_which_kind_a_robot_is() -> None:
+def test_only_contract_and_adapter_ask_of_which_kind_a_robot_is() -> None:
     asking = set()
     for module, path in MODULES.items():
         for node in nodes_of(path):

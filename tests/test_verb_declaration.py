@@ -12,7 +12,7 @@ from fixtures.barista import Barista, Careless, Stubborn
 from fixtures.waiting import eventually
 
 from strands_robots import Domain, Permit, verb
-from strands_robots.contract import adapt
+from strands_robots.adapted import adapt
 from strands_robots.safety.gate import MotionRefused, gate_of
 from strands_robots.utils import ValidationError
 from strands_robots.verb_declaration import declared_verbs

@@ -1,8 +1,8 @@
 """Robot contract as types, and the adapter of foreign robots.
 
 Networks, tools and the command line reach a robot only through these protocols. A robot of ours implements
-:class:`TaskRobot` or :class:`WorldRobot`; any other object with ``start_task``, ``stop_task``,
-``get_task_status`` and ``get_features`` is wrapped by :func:`adapt`.
+:class:`TaskRobot` or :class:`WorldRobot`; any other object is wrapped by :func:`adapt`, best one with ``start_task``,
+``stop_task``, ``get_task_status`` and ``get_features``: what it lacks is refused by name.
 """
 
 from __future__ import annotations
@@ -10,31 +10,18 @@ from __future__ import annotations
 import inspect
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from functools import partial
 from types import FunctionType, MethodType
 from typing import TYPE_CHECKING, Any, Generic, Literal, ParamSpec, Protocol, TypeVar, runtime_checkable
 
-from strands_robots import settings
-from strands_robots.envelope import Envelope, error, success
-from strands_robots.safety.gate import MotionGate, MotionRefused, MotionRequest, VerbCall, gate_of
+from strands_robots.envelope import Envelope, error
+from strands_robots.safety.gate import MotionGate, MotionRequest, VerbCall, gate_of
 from strands_robots.safety.stop_targets import Haltable as Haltable  # noqa: PLC0414 - part of the contract
-from strands_robots.safety.stop_targets import RobotWrapper, halted_with_verbs
 from strands_robots.safety.stop_targets import body_of as body_of  # noqa: PLC0414 - part of the contract
-from strands_robots.safety.stopping import (
-    PendingVerdict,
-    StopVerdict,
-    grade,
-    halt_each,
-    halts_in_parts,
-    json_blocks,
-    read_verdict,
-)
 from strands_robots.stop_log import stop_logger
-from strands_robots.utils import IdentityMap, ValidationError, shown
-from strands_robots.verb_declaration import declared_verbs
+from strands_robots.utils import IdentityMap
 
 if TYPE_CHECKING:
     from typing_extensions import TypeIs
@@ -54,9 +41,6 @@ RUNNING = frozenset({"running", "starting", "connecting", "busy"})
 
 AT_REST = frozenset({"idle", "completed", "stopped", "error"})
 """Values of ``task_status`` of a robot whose task moves nothing; any other value is unknown."""
-
-STATUS_SHARE = 0.5
-"""Part of the halt deadline for which the status may go on saying that the task runs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,75 +201,16 @@ class WorldRobot(Haltable, Protocol):
 Robot = TaskRobot | WorldRobot
 """A robot that a network can serve."""
 
-JointReader = Callable[[Any], Mapping[str, float]]
-"""Reads a robot's joints, by name in its own unit; empty where it has none. Raises what the robot raises."""
+
+def has_gate(robot: object) -> bool:
+    """Return True for a robot with a gate of ours; a test double has any attribute."""
+    return isinstance(getattr(robot, "gate", None), MotionGate)
 
 
-class ForeignRobot(Protocol):
-    """Least robot that :func:`adapt` makes fit: four verbs and their answers.
-
-    Further keys are passed on. A robot with a ``halt(reason)`` of its own is halted by that, and one with a
-    ``stop_teleoperate()`` by that as well; both answer as :meth:`stop_task` does.
-    """
-
-    def start_task(
-        self, instruction: str, *, policy_provider: str, duration: float, policy_port: int
-    ) -> Mapping[str, Any]:
-        """Start and return at once: ``status`` success, or error with ``reason``."""
-
-    def stop_task(self) -> Mapping[str, Any] | None:
-        """Stop: ``status`` is ``success`` or ``error``; ``stopped`` false did not stop.
-
-        None leaves it to :meth:`get_task_status`, which is read after every stop; anything else is unknown.
-        """
-
-    def get_task_status(self) -> Mapping[str, Any]:
-        """``task_status`` of :data:`AT_REST` or :data:`RUNNING`; all else is unknown."""
-
-    def get_features(self) -> Mapping[str, Any]:
-        """``observation_features`` and ``action_features``, as data."""
-
-
-_TASK_VERBS = {
-    "start_task": "(instruction, policy_provider, duration, policy_port) -> {'status': 'success' or 'error'}",
-    "stop_task": "() -> {'status': 'success' or 'error'}",
-    "get_task_status": f"() -> {{'task_status': {', '.join(sorted(AT_REST | RUNNING))}}}",
-    "get_features": "() -> {'observation_features': {}, 'action_features': {}}",
-}
-
-
-def adapt(robot: Any, joints: JointReader | None = None) -> TaskRobot:
-    """Return ``robot`` when it fits :class:`TaskRobot`, else a wrapper that does.
-
-    Args:
-        robot: what is to fit: a :class:`ForeignRobot` at least.
-        joints: reads the joints of a robot that has no ``get_state`` of its own; without it those are none.
-
-    Raises:
-        ValidationError: ``robot`` lacks one of start_task, stop_task, get_task_status, get_features, and declares no
-            verb of its own.
-    """
-    if isinstance(robot, TaskRobot):
-        return robot
-    missing = [verb for verb in _TASK_VERBS if not callable(getattr(robot, verb, None))]
-    # What a robot with verbs of its own lacks is bridged: it may have no tasks at all, and none that no stop ends.
-    endless = "start_task" not in missing and not stops_motions(robot)
-    if missing and (endless or not declared_verbs(robot)):
-        shapes = "; ".join(f"{verb}{_TASK_VERBS[verb]}" for verb in missing)
-        raise ValidationError(
-            f"robot must have {', '.join(_TASK_VERBS)}, or verbs of its own declared by @verb; {shown(robot)} lacks "
-            f"{', '.join(missing)}. Expected: {shapes}."
-        )
-    return AdaptedRobot(robot, joints)
-
-
-def behind_contract(robot: Any, joints: JointReader | None = None) -> Robot:
-    """Return a world as it is, and any other robot as :func:`adapt` makes it fit.
-
-    Raises:
-        ValidationError: as :func:`adapt`.
-    """
-    return robot if holds_robots(robot) else adapt(robot, joints)
+def stated_name(robot: object, usual: str = "robot") -> str:
+    """Return a robot's ``tool_name_str`` where that is a text, else the usual name."""
+    stated = getattr(robot, "tool_name_str", "")
+    return stated if isinstance(stated, str) and stated else usual
 
 
 _worlds: IdentityMap[bool] = IdentityMap()
@@ -296,7 +221,7 @@ def holds_robots(robot: object) -> TypeIs[WorldRobot]:
     if not callable(getattr(robot, "list_robots", None)):
         return False
     # Asked for every heartbeat and command; to check the whole contract takes 20 us.
-    return _worlds.get(robot) or (isinstance(robot, WorldRobot) and _worlds.of(robot, lambda: True))
+    return _worlds.get(robot) or (isinstance(robot, WorldRobot) and has_gate(robot) and _worlds.of(robot, lambda: True))
 
 
 def robots_in(robot: object) -> list[str]:
@@ -386,250 +311,3 @@ def put_away(robot: Any) -> Callable[[], None]:
     gate, latch = gate_of(body_of(robot)), _PutAway()
     gate.attach(latch)
     return lambda: gate.detach(latch)
-
-
-class _Shared:
-    """State that all wrappers of one foreign robot share, on every network."""
-
-    def __init__(self) -> None:
-        self.reading = threading.Lock()
-        self.read: tuple[float, Joints] | None = None
-        self._calls: set[object] = set()
-
-    @property
-    def called(self) -> bool:
-        """A verb that moves or stops the robot is under way."""
-        return bool(self._calls)
-
-    @contextmanager
-    def calling(self) -> Iterator[None]:
-        """Mark the time of such a verb; wait for no other call, it may be a stop."""
-        call = object()
-        self._calls.add(call)
-        try:
-            yield
-        finally:
-            self._calls.discard(call)
-
-
-_known: IdentityMap[_Shared] = IdentityMap()
-
-
-def stops_motions(robot: object) -> bool:
-    """Return True for a robot with a ``halt`` or a ``stop_task``."""
-    return any(callable(getattr(robot, name, None)) for name in ("halt", "stop_task"))
-
-
-class AdaptedRobot(RobotWrapper):
-    """Foreign robot behind the contract; its own optional verbs are used."""
-
-    def __init__(self, robot: Any, joints: JointReader | None = None) -> None:
-        self.wrapped = robot
-        self._read_joints = joints
-        usual = "robot" if callable(getattr(robot, "start_task", None)) else type(robot).__name__.lower()
-        self.tool_name_str: str = str(getattr(robot, "tool_name_str", "") or usual)
-        self._shared = _known.of(robot, _Shared)
-        self.gate = gate_of(robot)
-
-    def start_task(
-        self,
-        instruction: str,
-        policy_provider: str = "mock",
-        duration: float = 30.0,
-        policy_port: int = 0,
-        *,
-        request: MotionRequest | None = None,
-    ) -> Envelope:
-        start = getattr(self.wrapped, "start_task", None)
-        if not callable(start):
-            return error(f"{self.tool_name_str} runs no tasks; it has verbs of its own.")
-        busy = self.gate.under_way.name
-        if busy:
-            return error(f"start_task is refused: {busy} of {self.tool_name_str} has not returned.")
-        try:
-            permit = self.gate.permit("start_task", request)
-            permit.wait()
-            permit.check()
-        except MotionRefused as refused:
-            return refused.envelope
-        with self._shared.calling():
-            task = {"policy_provider": policy_provider, "duration": duration, "policy_port": policy_port}
-            answer: Envelope = for_request(permit.request, start)(instruction, **task)
-        if not permit.valid:
-            # The stop came while the robot was starting, and may have found nothing to stop.
-            permit.begin()
-            again = self.halt("halted while it started")
-            end = "and was stopped again" if again.stopped else "and DID NOT STOP AGAIN"
-            return error(f"start_task is refused: {self.tool_name_str} was halted while it started, {end}.")
-        return answer
-
-    def stop_task(self) -> Envelope:
-        """Stop the task; the robot's own answer where its status does not contradict it."""
-        stop = getattr(self.wrapped, "stop_task", None)
-        if self.gate.under_way or not callable(stop):
-            return self.halt("stop_task").envelope()
-        with self._shared.calling():
-            answer: Envelope | None = stop()
-        verdict = read_verdict(_StatusAfter(self, {"task": answer}))
-        return answer if answer is not None and verdict.stopped else verdict.envelope()
-
-    def get_task_status(self) -> Envelope:
-        """Return the robot's own status; while a verb of its own runs, that."""
-        own = getattr(self.wrapped, "get_task_status", None)
-        verb = self.gate.under_way.name
-        if callable(own):
-            answer: Envelope = own()
-            if not verb or not isinstance(answer, Mapping) or _task_status(answer) in RUNNING:
-                return answer
-        if not verb:
-            return success("Nothing runs.", task_status="idle")
-        return success(f"{verb} runs.", task_status="running", instruction=verb, verb=verb)
-
-    def get_features(self) -> Envelope:
-        """Return the robot's own features, or none."""
-        own = getattr(self.wrapped, "get_features", None)
-        if not callable(own):
-            return success("It states no features.", observation_features={}, action_features={})
-        answer: Envelope = own()
-        return answer
-
-    def get_state(self) -> Envelope:
-        """Return the robot's own state, else its joints, ``joints_age_s`` and task.
-
-        While its task runs, or it is being started or stopped, its joints are not read: it drives its bus itself, and
-        does not know of our turns on it. They are then those of the last read, and ``joints_error`` says so.
-        """
-        own = getattr(self.wrapped, "get_state", None)
-        if callable(own):
-            answer: Envelope = own()
-            return answer
-        # One at a time, so that one that waited looks anew at what the robot does. No stop ever waits for this.
-        with self._shared.reading:
-            task = _facts(self.get_task_status())
-            problem = self._refresh(_task_status(task) or "")
-            read_at, joints = self._shared.read or (None, {})
-        fields: dict[str, Any] = {"joints": dict(joints), "task": task}
-        fields["joints_age_s"] = None if read_at is None else round(time.monotonic() - read_at, 4)
-        if problem:
-            fields["joints_error"] = problem
-        return success(problem or f"{len(joints)} joints.", **fields)
-
-    def subscribe(self, observer: Observer) -> Unsubscribe:
-        subscribe = getattr(self.wrapped, "subscribe", None)
-        if callable(subscribe):
-            unsubscribe: Unsubscribe = subscribe(observer)
-            return unsubscribe
-        return lambda: None
-
-    @halts_in_parts
-    def halt(self, reason: str = "") -> StopVerdict:
-        """The robot's own ``halt`` where it has one, else its task and its teleoperation.
-
-        Its status is read afterwards: a robot that says that its task runs has not stopped, whatever it answered.
-        """
-        began = time.monotonic()
-        deadline = began + settings.number("STRANDS_HALT_DEADLINE_S")
-        verdict = halted_with_verbs(self, lambda: self.halt_here(reason, deadline), deadline)
-        return replace(verdict, elapsed_ms=(time.monotonic() - began) * 1000)
-
-    def halt_here(self, reason: str, deadline: float) -> StopVerdict | PendingVerdict:
-        """Ask everything to stop, and leave the answers and the status to be read."""
-        self.gate.revoke()
-        with self._shared.calling():
-            own = getattr(self.wrapped, "halt", None)
-            if callable(own):
-                answers = {self.tool_name_str: _answer(lambda: own(reason))}
-            else:
-                parts = {"task": "stop_task", "teleoperation": "stop_teleoperate"}
-                stops = {name: getattr(self.wrapped, verb, None) for name, verb in parts.items()}
-                answers = {name: _answer(stop) for name, stop in stops.items() if callable(stop)}
-        # Where there is none, its verbs return when their permits are void, which the stop executor waits for.
-        return _StatusAfter(self, answers) if answers else StopVerdict()
-
-    def _refresh(self, status: str) -> str:
-        """Read the joints unless a call is disturbed; else return the reason."""
-        if self._read_joints is None:
-            return ""
-        busy = "it is being started or stopped" if self._shared.called else "its task runs" if status in RUNNING else ""
-        if busy:
-            known = self._shared.read
-            # A robot without joints has none that could be old.
-            none = known is not None and not known[1]
-            return "" if none else f"The joints are those of the last read: {busy}."
-        began = time.monotonic()
-        try:
-            self._shared.read = (began, dict(self._read_joints(self.wrapped)))
-        except Exception as exc:  # noqa: BLE001 - a bus raises what it likes; the answer says what
-            return f"The joints could not be read: {type(exc).__name__}: {exc}"
-        return ""
-
-
-class _StatusAfter(PendingVerdict):
-    """Answers of a foreign robot to a stop, and its status after them.
-
-    Args:
-        answers: by what was asked to stop; the status may contradict the first.
-    """
-
-    def __init__(self, robot: AdaptedRobot, answers: Mapping[str, object]) -> None:
-        super().__init__(time.monotonic() + STATUS_SHARE * settings.number("STRANDS_HALT_DEADLINE_S"))
-        self._robot, self._answers = robot, answers
-        self._main = next(iter(answers))
-        self._name = robot.tool_name_str
-
-    def known(self) -> StopVerdict | None:
-        refused = grade(self._answers[self._main]).stopped is False
-        has_status = callable(getattr(self._robot.wrapped, "get_task_status", None))
-        return None if has_status and not refused else self._verdict(self._answers[self._main])
-
-    def read(self) -> str | None:
-        try:
-            return _task_status(self._robot.wrapped.get_task_status())
-        except Exception:
-            logger.exception("%s: its status could not be read after a stop.", self._name)
-            return None
-
-    def judged(self, reading: object, *, last: bool) -> StopVerdict | None:
-        answer = self._answers[self._main]
-        if reading in RUNNING:
-            if not last:
-                return None
-            return self._verdict(
-                error(f"its get_task_status says {reading} after the stop, which answered {shown(answer)}")
-            )
-        if reading not in AT_REST:
-            # Text is an unknown answer to a stop.
-            return self._verdict("task_status is none of idle, stopped, completed, error, running")
-        return self._verdict(success("Stopped.", stopped=True) if answer is None else answer)
-
-    def unread(self, why: str) -> StopVerdict:
-        return StopVerdict(not_stopped={self._main: f"{why}: its stop has returned, its status has not"})
-
-    def _verdict(self, main: object) -> StopVerdict:
-        answers = {**self._answers, self._main: main}
-        return halt_each({name: partial(_given, answer) for name, answer in answers.items()})
-
-
-def _task_status(answer: object) -> str | None:
-    """Return the ``task_status`` of an answer, beside its content or inside it."""
-    facts = [answer, *json_blocks(answer)] if isinstance(answer, Mapping) else []
-    words = [fact["task_status"] for fact in facts if isinstance(fact.get("task_status"), str)]
-    return words[0].lower() if words else None
-
-
-def _answer(stop: Callable[[], object]) -> object:
-    try:
-        return stop()
-    except Exception as exc:  # noqa: BLE001 - whatever a stop raises is graded
-        return exc
-
-
-def _given(answer: object) -> object:
-    """Return the answer to a stop; as text None, which would mean that nothing moved."""
-    return shown(answer) if answer is None else answer
-
-
-def _facts(answer: object) -> dict[str, Any]:
-    """Return the fields of an envelope; none for any other answer."""
-    facts = answer if isinstance(answer, Mapping) else {}
-    return {key: value for key, value in facts.items() if key not in ("status", "content")}

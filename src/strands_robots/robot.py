@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from strands_robots._mesh_switch import mesh_env_request
-from strands_robots.contract import adapt, put_away
+from strands_robots.adapted import behind_contract
+from strands_robots.contract import put_away
 from strands_robots.envelope import is_error, text_of
 from strands_robots.plug_ins import PlugIn, PlugIns, takes
 from strands_robots.safety.scope import own_cell
@@ -65,7 +66,7 @@ class Networked:
         if peer is not None:
             peer.stop()
         own = getattr(super(), "cleanup", None)
-        return own() if callable(own) else adapt(self).halt("cleanup").envelope()
+        return own() if callable(own) else behind_contract(self).halt("cleanup").envelope()
 
 
 def Robot(  # the factory reads as the class it stands for
@@ -179,7 +180,7 @@ def run(
         own_device_id("peer_id", peer_id)
     if not {"messaging_url", "messaging_backend", "link"} & network.keys():
         network["link"] = usual_link(network.get("tenant"))
-    body: Any = robot if callable(getattr(robot, "halt", None)) else adapt(robot)
+    body: Any = robot if callable(getattr(robot, "halt", None)) else behind_contract(robot)
     verdict: StopVerdict = StopVerdict()
     # A user who waits for Ctrl-C reads the terminal, whatever the program does about logging.
     report: Callable[[str], None] = partial(print, file=sys.stderr, flush=True) if until is None else logger.info

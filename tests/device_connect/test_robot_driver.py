@@ -7,7 +7,9 @@ import math
 import threading
 import time
 from itertools import pairwise
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 from fixtures.driver_bench import DriverBench, drive
@@ -293,9 +295,27 @@ async def test_any_object_with_the_four_verbs_is_a_robot() -> None:
         assert (state["joints"], state["task"]) == ({"a": 1.5}, {"task_status": "idle"})
 
 
-def test_an_object_that_is_no_robot_is_refused_by_what_it_lacks() -> None:
-    with pytest.raises(ValidationError, match="start_task"):
-        RobotDeviceDriver(object())
+def test_plain_value_is_refused_as_a_robot() -> None:
+    with pytest.raises(ValidationError, match="robot must be an object"):
+        RobotDeviceDriver("so100")
+
+
+@pytest.mark.parametrize("double", [object(), SimpleNamespace(tool_name_str="x"), MagicMock()])
+async def test_partial_robot_joins_and_is_refused_by_name(
+    double: object, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("DEVICE_CONNECT_RPC_ALLOW", "operator")
+    driver = RobotDeviceDriver(double)
+    offered = {function.name for function in driver.functions}
+    partial = not isinstance(double, MagicMock)
+    assert ("execute" not in offered and "getFeatures" not in offered) is partial
+    async with DriverBench(driver) as bench:
+        stopped = await bench.call("stop")
+        assert (stopped["status"], stopped["stopped"]) == ("error", False if partial else None)
+        for verb in ("execute", "getStatus", "getFeatures"):
+            arguments = {"instruction": "wave"} if verb == "execute" else {}
+            assert (await bench.call(verb, **arguments))["status"] == "error"
+    assert ("bench-1 cannot be stopped" in caplog.text) is partial
 
 
 async def test_a_foreign_robot_that_tells_nothing_has_its_tasks_told_all_the_same() -> None:

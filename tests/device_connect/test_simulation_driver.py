@@ -247,6 +247,16 @@ async def test_state_names_the_running_policies(world: ToyWorld) -> None:
         assert bench.runtime.status["availability"] == "busy"
 
 
-def test_an_object_that_is_no_world_is_refused_by_what_it_lacks() -> None:
-    with pytest.raises(ValidationError, match="list_robots"):
-        SimulationDeviceDriver(object())
+def test_plain_value_is_refused_as_a_world() -> None:
+    with pytest.raises(ValidationError, match="robot must be an object"):
+        SimulationDeviceDriver("scene.xml")
+
+
+async def test_partial_world_joins_and_is_refused_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DEVICE_CONNECT_RPC_ALLOW", "operator")
+    driver = SimulationDeviceDriver(object())
+    assert {function.name for function in driver.functions}.isdisjoint({"execute", "step", "reset", "getFeatures"})
+    async with DriverBench(driver) as bench:
+        assert (await bench.call("stop"))["not_stopped"] == ["simulation"]
+        assert "exposes no get_state" in (await bench.call("getStatus"))["reason"]
+        assert (await bench.call("step"))["status"] == "error"

@@ -10,7 +10,7 @@ import pytest
 from fixtures.doubted_robots import DOUBTS, DoubtedRobot
 from fixtures.waiting import eventually
 
-from strands_robots.contract import adapt
+from strands_robots.adapted import adapt
 from strands_robots.safety.stop_executor import STUCK_MAX, StopExecutor
 from strands_robots.safety.stopping import StopVerdict
 

@@ -13,8 +13,8 @@ from fixtures.recording_robot import RecordingRobot
 from fixtures.toy_robots import ToyWorld
 from fixtures.waiting import eventually
 
+from strands_robots.adapted import AdaptedRobot
 from strands_robots.audit import read_audit_log
-from strands_robots.contract import AdaptedRobot
 from strands_robots.envelope import is_error
 from strands_robots.safety import plane as plane_module
 from strands_robots.safety import reporting

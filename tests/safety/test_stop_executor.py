@@ -15,7 +15,7 @@ import pytest
 from fixtures.devices import RecordingDevice
 from fixtures.waiting import eventually
 
-from strands_robots.contract import AdaptedRobot
+from strands_robots.adapted import AdaptedRobot
 from strands_robots.hardware import HardwareRobot
 from strands_robots.safety.gate import MotionGate
 from strands_robots.safety.stop_executor import RESERVE, StopExecutor, stop_executor

@@ -15,7 +15,7 @@ from fixtures.pan_tilt import ArmDevice, PanTilt
 from fixtures.toy_robots import ToyRobot
 from fixtures.waiting import eventually
 
-from strands_robots.contract import adapt
+from strands_robots.adapted import adapt
 from strands_robots.envelope import RefusalReason, Refused, error, success
 from strands_robots.hardware import HardwareRobot
 from strands_robots.safety.authorization import Approval, Grants, Leave, digest

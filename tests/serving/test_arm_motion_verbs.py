@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from fixtures.toy_robots import ToyRobot
 
-from strands_robots.contract import adapt
+from strands_robots.adapted import adapt
 from strands_robots.serving.arm_verbs import ARM_MOTION_VERBS, WORLD_MOTION_VERBS
 from strands_robots.serving.verbs import Kind
 from strands_robots.simulation import Simulation

@@ -12,7 +12,7 @@ from fixtures.ros_memory import MemoryLink
 from fixtures.toy_robots import ToyRobot, ToyWorld
 
 from strands_robots import Permit, Simulation, verb
-from strands_robots.contract import AdaptedRobot, adapt
+from strands_robots.adapted import AdaptedRobot, adapt
 from strands_robots.drivers.reachy import ReachyDriver
 from strands_robots.drivers.ros.ros_bridge import RosBridgedRobot
 from strands_robots.envelope import success

@@ -16,7 +16,7 @@ from fixtures.pan_tilt import ArmDevice, BarePanTilt, PanTilt
 from fixtures.ros_memory import MemoryLink
 from fixtures.toy_robots import ToyRobot, ToyWorld
 
-from strands_robots.contract import adapt
+from strands_robots.adapted import adapt
 from strands_robots.device_connect.robot_driver import MobileBaseDeviceDriver
 from strands_robots.drivers.reachy import ReachyDriver
 from strands_robots.drivers.ros.mobile_base import MobileBaseRobot

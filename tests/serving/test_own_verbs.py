@@ -11,7 +11,7 @@ import pytest
 from fixtures.barista import Barista, Careless, Stubborn
 
 from strands_robots import Permit, verb
-from strands_robots.contract import adapt
+from strands_robots.adapted import adapt
 from strands_robots.envelope import success, text_of
 from strands_robots.serving.offered_verbs import answer_of, own_verbs
 from strands_robots.serving.pipeline import Command, Pipeline, Result

@@ -21,12 +21,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from strands_robots import settings
+from strands_robots.adapted import adapt
 from strands_robots.cli.app import assignments, parse_ports
 from strands_robots.cli.network import Network, mesh_peer
 from strands_robots.cli.output import CliError, Screen
 from strands_robots.cli.readiness import mesh_port_problem, mesh_problems, shortcomings
 from strands_robots.cli.record import record_robot
-from strands_robots.contract import adapt, put_away
+from strands_robots.contract import put_away
 from strands_robots.envelope import text_of
 from strands_robots.fleet.adapter import SOURCE
 from strands_robots.fleet.device_connect.config import described

@@ -18,6 +18,7 @@ from device_connect_edge.drivers.decorators import get_rpc_source_device
 from device_connect_edge.types import DeviceIdentity, DeviceStatus, EventDef, FunctionDef
 
 from strands_robots import settings
+from strands_robots.adapted import warn_endless
 from strands_robots.contract import Haltable, Robot, RolloutEvent, Unsubscribe, observe
 from strands_robots.device_connect._compat import CollectedOnce, Runtime, describe_anew, emit, observed, on, rpc
 from strands_robots.device_connect.device_stops import DeviceStops, SafetyRegistration, stops_of
@@ -88,10 +89,10 @@ def stated_type(robot: object, usual: str) -> str:
     """Return the ``device_type`` that a robot states for itself, else the usual one.
 
     Raises:
-        ValidationError: it states something else than a short text.
+        ValidationError: it states a text that is too long.
     """
     stated = getattr(robot, "device_type", None)
-    return usual if stated is None else text("device_type", stated, longest=100)
+    return usual if not isinstance(stated, str) else text("device_type", stated, longest=100)
 
 
 def enveloped(verb: str, answer: object) -> Envelope:
@@ -456,6 +457,7 @@ class RobotDriver(CollectedOnce):
         opened = self.authorization.opened()
         if opened is not None:
             logger.warning("%s is real hardware, and callers that are not named may move it: %s.", self.peer_id, opened)
+        warn_endless(self.robot, self.peer_id)
         if self._stops_are_shared:
             await stops_of(self.runtime.link).join(self)
         await self.reports.read()

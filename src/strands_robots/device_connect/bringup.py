@@ -22,7 +22,8 @@ from device_connect_edge.drivers import DeviceDriver
 from device_connect_edge.messaging import MessagingError
 
 from strands_robots import settings
-from strands_robots.contract import body_of, holds_robots
+from strands_robots.adapted import behind_contract
+from strands_robots.contract import body_of, holds_robots, stated_name
 from strands_robots.device_connect._compat import Runtime
 from strands_robots.device_connect.backends import LinkConfig
 from strands_robots.device_connect.backends.base import NoResponderError
@@ -114,7 +115,7 @@ async def init_device_connect(  # noqa: PLR0917 - the documented signature
     """Serve a robot or a simulation; returns when it can be discovered and called.
 
     Args:
-        robot: a simulation, a robot, any object that ``contract.adapt`` accepts, or a ready ``DeviceDriver``.
+        robot: a simulation, a robot, any object that ``adapted.adapt`` accepts, or a ready ``DeviceDriver``.
         peer_id: its id on the network, without dots; ``<tool_name>-<8 hex>`` by default.
         peer_type: ``robot`` or ``sim``; settles what an object is that could be either.
         messaging_url: ``nats://host:port`` or ``tcp/host:port``, or several with commas; the environment's by default.
@@ -313,11 +314,13 @@ def driver_for(robot: Any, peer_type: str) -> DeviceDriver:
     """Return the driver of ``robot``, by its class, else by ``peer_type``.
 
     Raises:
-        ValidationError: ``sim`` for a robot that is none, or a robot that lacks what its driver needs.
+        ValidationError: ``sim`` for a robot that is none, or a plain value in place of a robot.
     """
     if isinstance(robot, DeviceDriver):
         return robot
-    driver = _driver_by_class(robot)
+    # A test double has every attribute, and is what the caller says.
+    either = peer_type == "sim" and callable(getattr(robot, "list_robots", None))
+    driver = None if either else _driver_by_class(robot)
     if driver is None:
         return SimulationDeviceDriver(robot) if peer_type == "sim" else RobotDeviceDriver(robot)
     if peer_type == "sim" and not isinstance(driver, SimulationDeviceDriver):
@@ -338,15 +341,15 @@ def _driver_by_class(robot: Any) -> DeviceDriver | None:
     simulation = getattr(sys.modules.get("strands_robots.simulation"), "Simulation", None)
     if isinstance(simulation, type) and isinstance(robot, simulation):
         return SimulationDeviceDriver(robot)
-    if holds_robots(robot) and not callable(getattr(robot, "start_task", None)):
+    if not callable(getattr(robot, "start_task", None)) and holds_robots(behind_contract(robot)):
         return SimulationDeviceDriver(robot)
     return None
 
 
 def default_id(robot: Any) -> str:
     """Return ``<tool_name>-<8 hex>``, with dashes for characters no id can have."""
-    name = getattr(robot, "tool_name_str", "") or getattr(robot, "device_type", "")
-    clean = re.sub(r"[^A-Za-z0-9_-]+", "-", str(name))[:100].strip("-_") or "robot"
+    name = stated_name(robot, "") or getattr(robot, "device_type", "")
+    clean = re.sub(r"[^A-Za-z0-9_-]+", "-", name if isinstance(name, str) else "")[:100].strip("-_") or "robot"
     return f"{clean}-{secrets.token_hex(4)}"
 
 

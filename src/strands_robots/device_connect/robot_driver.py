@@ -6,8 +6,9 @@ import time
 from collections.abc import Mapping
 from typing import Any, ClassVar, Optional
 
+from strands_robots.adapted import adapt
 from strands_robots.bus_access import read_joints
-from strands_robots.contract import RUNNING, RolloutEvent, adapt, body_of
+from strands_robots.contract import RUNNING, RolloutEvent, body_of
 from strands_robots.device_connect._compat import Labels, emit
 from strands_robots.device_connect.base_driver import RobotDriver, stated_type
 from strands_robots.device_connect.telemetry import Activity, rollout_fields
@@ -22,7 +23,8 @@ class RobotDeviceDriver(RobotDriver):
     """A robot arm or vehicle that runs tasks by instruction. Start one with execute, end it with stop.
 
     Args:
-        robot: a :class:`~strands_robots.contract.TaskRobot`, or any object that ``contract.adapt`` makes one.
+        robot: a :class:`~strands_robots.contract.TaskRobot`, or any object: ``adapted.adapt`` makes it one, and what
+            it lacks is refused by name.
     """
 
     device_type = "strands_robot"

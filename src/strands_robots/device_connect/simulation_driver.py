@@ -7,6 +7,7 @@ from operator import eq
 from typing import Any, ClassVar, Optional
 
 from strands_robots import settings
+from strands_robots.adapted import adapt_world
 from strands_robots.contract import Haltable, RolloutEvent
 from strands_robots.device_connect._compat import Labels, emit
 from strands_robots.device_connect.base_driver import RobotDriver, stated_type
@@ -15,7 +16,7 @@ from strands_robots.envelope import Envelope, fields_of
 from strands_robots.policies.base import plain_numbers
 from strands_robots.safety.authorization import Approval, Authorization
 from strands_robots.safety.stopping import StopVerdict
-from strands_robots.serving.robot_verbs import WORLD_VERBS, served_world, world_stop_answer
+from strands_robots.serving.robot_verbs import WORLD_VERBS, world_stop_answer
 from strands_robots.serving.stops import WorldStop, robot_stop
 from strands_robots.serving.verbs import Verb
 
@@ -27,7 +28,7 @@ class SimulationDeviceDriver(RobotDriver):
     """A simulated world with one or more robots. Start a policy with execute, end all of them with stop.
 
     Args:
-        sim: a :class:`~strands_robots.contract.WorldRobot`.
+        sim: a :class:`~strands_robots.contract.WorldRobot`, or any object; what it lacks is refused by name.
     """
 
     device_type = "strands_sim"
@@ -43,7 +44,7 @@ class SimulationDeviceDriver(RobotDriver):
         authorization: Authorization | None = None,
         approval: Approval | None = None,
     ) -> None:
-        world = served_world(sim)
+        world = adapt_world(sim)
         super().__init__(world, hardware=hardware, authorization=authorization, approval=approval)
         self.world = world
         self.device_type = stated_type(sim, self.device_type)

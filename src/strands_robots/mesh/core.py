@@ -13,7 +13,8 @@ from typing import Any
 
 from strands_robots import settings
 from strands_robots._mesh_switch import mesh_env_request
-from strands_robots.contract import body_of, holds_robots
+from strands_robots.adapted import warn_endless
+from strands_robots.contract import body_of, holds_robots, stated_name
 from strands_robots.mesh import session, topics
 from strands_robots.mesh.commands import CommandReceiver, SenderCheck, execute_on, pong
 from strands_robots.mesh.input_receiver import InputReceiver, InputSide, TeleopReceivers, join
@@ -106,7 +107,7 @@ class Mesh(SensorLoopsMixin):
 
     Raises:
         ValueError: ``peer_id`` is no identifier, a reserved word or the name of another robot of this process,
-            ``peer_type`` is no text, or ``robot`` is no robot.
+            ``peer_type`` is no text, or ``robot`` is a plain value, such as a name.
     """
 
     def __init__(self, robot: Any, peer_id: str, peer_type: str = "robot", *, parts: Parts | None = None) -> None:
@@ -281,6 +282,7 @@ class Mesh(SensorLoopsMixin):
             self._report_states(self.robot.gate)
         else:
             every("describe", rates["presence"].rate_hz, self._presence.refresh)
+        warn_endless(self.robot, peer)
         if self.children is not None:
             every("children", rates["presence"].rate_hz, self.children.refresh)
             every("children's presence", rates["presence"].rate_hz, self.children.announce, quick=True)
@@ -626,8 +628,7 @@ def _default_id(robot: Any) -> str:
     thing = settings.raw("STRANDS_IOT_THING_NAME")
     if thing and settings.raw("STRANDS_MESH_BACKEND").lower() in ("iot", "bridge"):
         return thing  # the broker's policy pins this peer's topics to its client id
-    word = str(getattr(robot, "tool_name_str", "") or "robot")
-    safe = re.sub(r"[^A-Za-z0-9._-]", "-", word).lstrip("._-")[:100] or "robot"
+    safe = re.sub(r"[^A-Za-z0-9._-]", "-", stated_name(robot)).lstrip("._-")[:100] or "robot"
     return f"{safe}-{secrets.token_hex(4)}"
 
 

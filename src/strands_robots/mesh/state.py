@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
+from strands_robots.adapted import lacks
 from strands_robots.contract import RUNNING, Robot, RolloutEvent, Unsubscribe, body_of, holds_robots, robots_in
 from strands_robots.envelope import is_error, text_of
 from strands_robots.errors import StrandsRobotsError
@@ -180,12 +181,15 @@ class Description:
         if world is not None:
             fields["world"] = True
             fields.update(self._field("sim_robots", lambda: {"sim_robots": world.list_robots()}))
-            fields.update(self._field("task_status", lambda: _world_status(world.list_policies_running())))
-            fields.update(self._field("features", lambda: _world_features(_checked(world.get_features()))))
+            if "list_policies_running" not in lacks(world):
+                fields.update(self._field("task_status", lambda: _world_status(world.list_policies_running())))
+            if "get_features" not in lacks(world):
+                fields.update(self._field("features", lambda: _world_features(_checked(world.get_features()))))
             return fields
         device = body_of(robot)
-        if arm is not None:
+        if arm is not None and "get_task_status" not in lacks(arm):
             fields.update(self._field("task_status", lambda: _status(_checked(arm.get_task_status()))))
+        if arm is not None and "get_features" not in lacks(arm):
             fields.update(self._field("features", lambda: _features(_checked(arm.get_features()))))
         fields.update(self._field("connected", lambda: _typed(device, "connected", "is_connected", bool)))
         fields.update(self._field("hw", lambda: _typed(device, "hw", "hardware_name", str)))

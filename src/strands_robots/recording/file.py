@@ -17,7 +17,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO, Self
 
-from strands_robots.contract import RolloutEvent, Unsubscribe, behind_contract, holds_robots, observe
+from strands_robots.adapted import behind_contract
+from strands_robots.contract import RolloutEvent, Unsubscribe, holds_robots, observe
 from strands_robots.envelope import text_of
 from strands_robots.policies.base import numbers
 from strands_robots.policies.decoding import decode_json
@@ -438,7 +439,7 @@ class RobotRecording:
     and counted in the event ``samplesSkipped``.
 
     Args:
-        robot: behind the contract, or an object that :func:`~strands_robots.contract.adapt` makes fit.
+        robot: behind the contract, or an object that :func:`~strands_robots.adapted.adapt` makes fit.
         recorder: entered, made with ``joints_of_events=False``.
         device: name of the robot in the recording.
         frames: takes its pictures; None for none.

@@ -12,7 +12,8 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-from strands_robots.contract import body_of, holds_robots, stops_motions
+from strands_robots.adapted import lacks, no_tasks, stops_motions
+from strands_robots.contract import body_of, holds_robots
 from strands_robots.envelope import Envelope, error, fields_of, is_error, jsonable, success, text_of, uncarried
 from strands_robots.safety.gate import MotionRequest
 from strands_robots.serving.advertised import VERBS, RobotDescription
@@ -48,7 +49,7 @@ def tasks_refused(robot: Any, verb: Verb, name: str) -> str | None:
     """
     if POLICY_PROVIDER.name not in verb.by_name or holds_robots(robot) or _offers(robot, verb, None):
         return None
-    return f"{name} runs no tasks; it has verbs of its own."
+    return no_tasks(robot, name)
 
 
 def unoffered(robot: Any, verb: Verb, name: str) -> str | None:
@@ -109,6 +110,8 @@ def _arm_verbs(robot: Any) -> frozenset[str] | None:
 def _offers(robot: Any, verb: Verb, arm: frozenset[str] | None) -> bool:
     if arm is not None and verb.name in ARM_MOTION_VERBS:
         return verb.name in arm
+    if verb.method in lacks(robot):
+        return False
     if verb.suits is not None:
         try:
             return verb.suits(robot)

@@ -14,6 +14,7 @@ from functools import partial
 from types import MappingProxyType
 from typing import Any
 
+from strands_robots.adapted import lacks, task_status_of
 from strands_robots.contract import (
     SETTLE,
     Robot,
@@ -158,7 +159,9 @@ def _awaited_end(  # noqa: PLR0917 - one call, for the length of run_to_end
     while not ends and holds_robots(robot) and time.monotonic() < last:
         time.sleep(POLL_S)
     if not ends:
-        return {**started, "state": "unknown"} if holds_robots(robot) else robot.get_task_status()
+        if holds_robots(robot) or "get_task_status" in lacks(robot):
+            return {**started, "state": "unknown"}
+        return robot.get_task_status()
     end = ends[-1]
     facts = {"state": end.state, "task_status": end.state, "step_count": end.step, "elapsed_s": end.elapsed_s}
     if end.state == "error":
@@ -177,10 +180,12 @@ def status(robot: Robot, arguments: Arguments) -> Envelope:
     """Return the task of a robot, or the policies that run in a world."""
     if not holds_robots(robot):
         return robot.get_task_status()
-    running = robot.list_policies_running()
+    running, task_status = robot.list_policies_running(), task_status_of(robot)
+    if task_status == "unknown":
+        return error(f"{robot.tool_name_str} exposes no list_policies_running.", task_status=task_status)
     return success(
         f"{len(running)} of {len(robot.list_robots())} robots run a policy.",
-        task_status="running" if running else "idle",
+        task_status=task_status,
         robots=robot.list_robots(),
         policies=running,
         **{name: getattr(robot, name)() for name in ("failed_policies", "outcomes") if hasattr(robot, name)},
@@ -237,12 +242,19 @@ PEER_VERBS = table(
             Kind.MOTION,
             WORLD_VERBS["step"].summary,
             (_optional("steps", int, "Physics steps to take, 1 to 10000", between(1, 10_000)),),
+            method="step",
             begin=step_world,
             suits=is_world,
             of_world=True,
         ),
         _peer_verb(
-            "reset", Kind.MOTION, WORLD_VERBS["reset"].summary, begin=reset_world, suits=is_world, of_world=True
+            "reset",
+            Kind.MOTION,
+            WORLD_VERBS["reset"].summary,
+            method="reset",
+            begin=reset_world,
+            suits=is_world,
+            of_world=True,
         ),
         _peer_verb("teleop_status", Kind.READ, "Read the counters of every input stream.", suits=_follows),
         _peer_verb(

@@ -8,15 +8,9 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+from strands_robots.adapted import behind_contract, lacks, task_status_of
 from strands_robots.bus_access import read_joints
-from strands_robots.contract import (
-    Robot,
-    WorldRobot,
-    behind_contract,
-    body_of,
-    for_request,
-    holds_robots,
-)
+from strands_robots.contract import Robot, WorldRobot, body_of, for_request, holds_robots
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.ros.gate import Approved
 from strands_robots.safety.gate import MotionRequest
@@ -43,33 +37,14 @@ from strands_robots.serving.verbs import (
 from strands_robots.utils import DURATION_MAX_S, ValidationError, duration, number, shown, text
 from strands_robots.verb_parameters import Parameter
 
-WORLD_MEMBERS = (
-    *("tool_name_str", "gate", "halt", "subscribe", "list_robots", "start_policy", "stop_policy"),
-    *("list_policies_running", "get_state", "get_features", "step", "reset"),
-)
-"""The members that make an object a world."""
-
 
 def served(robot: Any) -> Robot:
     """Return ``robot`` behind its contract.
 
     Raises:
-        ValidationError: it is neither a world nor a robot that :func:`~strands_robots.contract.adapt` makes fit.
+        ValidationError: it is a plain value, such as a name.
     """
     return behind_contract(robot, read_joints)
-
-
-def served_world(robot: Any) -> WorldRobot:
-    """Return ``robot``, which has to be a world.
-
-    Raises:
-        ValidationError: naming the members that it lacks.
-    """
-    if holds_robots(robot):
-        return robot
-    lacking = [name for name in WORLD_MEMBERS if not hasattr(robot, name)]
-    needs = ", ".join(WORLD_MEMBERS)
-    raise ValidationError(f"a simulation must have {needs}; {shown(robot)} lacks {', '.join(lacking)}.")
 
 
 def robot_of(world: WorldRobot, name: str | None, *, first: bool = False) -> str:
@@ -124,8 +99,7 @@ def reset_world(robot: Robot, arguments: Arguments, request: MotionRequest | Non
 
 
 def _world_status(world: WorldRobot, arguments: Arguments) -> Envelope:
-    running = world.list_policies_running()
-    return {**world.get_state(), "task_status": "running" if running else "idle"}
+    return {**world.get_state(), "task_status": task_status_of(world)}
 
 
 def release_torque(robot: Robot, arguments: Arguments) -> Envelope:
@@ -146,7 +120,7 @@ def releases_torque(robot: Any) -> bool:
 def takes_tasks(robot: Any) -> bool:
     """Return True for a robot that follows policies, and a world with one in it."""
     if holds_robots(robot):
-        return bool(robot.list_robots())
+        return bool(robot.list_robots()) and "start_policy" not in lacks(robot)
     body = body_of(robot)
     return callable(getattr(body, "start_task", None)) and getattr(body, "takes_tasks", True) is not False
 
@@ -238,6 +212,7 @@ WORLD_VERBS = table(
             "Step physics by hand, as fast as it computes.",
             (N_STEPS,),
             returns="sim_time, step_count",
+            method="step",
             begin=step_world,
             suits=is_world,
             critical=False,
@@ -247,6 +222,7 @@ WORLD_VERBS = table(
             "reset",
             Kind.MOTION,
             "Halt everything and put the world back to its initial state.",
+            method="reset",
             begin=reset_world,
             suits=is_world,
             critical=False,

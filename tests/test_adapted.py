@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 from fixtures.devices import BlindDevice
 
+from strands_robots.adapted import AdaptedRobot, adapt, adapt_world, behind_contract, lacks, warn_endless
 from strands_robots.bus_access import bus_lock, read_joints
-from strands_robots.contract import AdaptedRobot, TaskRobot, adapt, for_request, put_away
+from strands_robots.contract import TaskRobot, for_request, holds_robots, put_away
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.safety.gate import MotionGate, MotionRequest, answered
 from strands_robots.safety.stopping import StopVerdict, grade
@@ -61,10 +64,123 @@ def test_a_robot_that_fits_is_given_back_as_it_is() -> None:
     assert adapt(robot) is robot
 
 
-@pytest.mark.parametrize("thing", [None, 5, "arm", object(), []])
-def test_object_that_is_no_robot_is_refused_by_the_verbs_it_lacks(thing: object) -> None:
-    with pytest.raises(ValidationError, match="lacks start_task"):
-        adapt(thing)
+@pytest.mark.parametrize("value", [None, 5, "so100", [], {}, Foreign, pytest])
+def test_plain_value_is_refused_as_a_robot(value: object) -> None:
+    for make in (adapt, adapt_world, behind_contract):
+        with pytest.raises(ValidationError, match="robot must be an object with start_task"):
+            make(value)
+
+
+def only(*verbs: str) -> Any:
+    """A double with these verbs, which succeed."""
+    return SimpleNamespace(**{verb: lambda *_, **__: success("Done.", task_status="idle") for verb in verbs})
+
+
+PARTIAL = {
+    "nothing": (object(), False),
+    "a name": (SimpleNamespace(tool_name_str="x"), False),
+    "start_task": (only("start_task"), False),
+    "stop_task": (only("stop_task"), True),
+    "a mock": (MagicMock(), None),
+    "start_policy": (only("list_robots", "start_policy"), False),
+}
+
+
+@pytest.mark.parametrize(("robot", "stopped"), PARTIAL.values(), ids=PARTIAL)
+@pytest.mark.parametrize("make", [adapt, adapt_world], ids=["robot", "world"])
+def test_partial_robot_is_stopped_or_says_that_it_was_not(make: Any, robot: Any, stopped: bool | None) -> None:
+    assert make(robot).halt("test").stopped is stopped
+
+
+@pytest.mark.parametrize("verb", ["start_task", "get_task_status", "get_features"])
+def test_verb_that_a_robot_lacks_is_refused_by_name(verb: str) -> None:
+    arguments = ("wave",) if verb == "start_task" else ()
+    answer = getattr(adapt(SimpleNamespace(tool_name_str="x")), verb)(*arguments)
+    assert answer["status"] == "error"
+    assert answer["reason"] == f"x exposes no {verb}."
+
+
+def test_robot_without_a_way_to_halt_names_it_in_every_stop() -> None:
+    robot = adapt(SimpleNamespace(tool_name_str="x", stop_teleoperate=lambda: success("Ended.")))
+    verdict = robot.halt()
+    assert "neither stop_task nor halt" in verdict.not_stopped["x"]
+    assert verdict.halted == ("teleoperation",)
+    assert robot.stop_task()["stopped"] is False
+
+
+def test_robot_without_a_way_to_halt_is_warned_of_once(caplog: pytest.LogCaptureFixture) -> None:
+    double = only("start_task")
+    for name in ("arm-1", "arm-2"):
+        warn_endless(adapt(double), name)
+    warn_endless(adapt(only("stop_task")), "arm-3")
+    (warning,) = caplog.messages
+    assert warning.startswith("arm-1 cannot be stopped: it exposes neither stop_task nor halt")
+
+
+def test_stop_that_comes_later_counts() -> None:
+    double = only("start_task")
+    robot = adapt(double)
+    double.stop_task = lambda: success("Stopped.")
+    assert robot.halt().stopped is True
+    assert "stop_task" not in lacks(robot)
+
+
+def test_double_with_every_attribute_is_wrapped() -> None:
+    double = MagicMock()
+    assert isinstance(adapt(double).gate, MotionGate)
+    assert not holds_robots(double)
+    assert holds_robots(adapt_world(double))
+    assert adapt_world(double).list_robots() == []
+
+
+class World:
+    """A simulation of others', with two robots."""
+
+    def __init__(self) -> None:
+        self.calls: list[str] = []
+
+    def list_robots(self) -> list[str]:
+        return ["left", "right"]
+
+    def start_policy(self, robot_name: str, **policy: Any) -> Envelope:
+        self.calls.append(f"start {robot_name} {policy['policy_provider']}")
+        return success("Started.")
+
+    def stop_policy(self, robot_name: str) -> Envelope:
+        self.calls.append(f"stop {robot_name}")
+        return success("Stopped.") if robot_name == "left" else error("it hangs")
+
+
+def test_world_of_others_is_stopped_robot_by_robot() -> None:
+    foreign = World()
+    world = behind_contract(foreign)
+    assert holds_robots(world)
+    verdict = world.halt()
+    assert (verdict.halted, list(verdict.not_stopped)) == (("left",), ["right"])
+    assert world.start_policy("left", "wave")["status"] == "success"
+    assert foreign.calls == ["stop left", "stop right", "start left mock"]
+    for lacking in (world.get_state(), world.get_features(), world.step(), world.reset()):
+        assert "simulation exposes no " in lacking["reason"]
+
+
+def test_locked_world_of_others_is_never_asked_to_move() -> None:
+    foreign = World()
+    world = adapt_world(foreign)
+    world.gate.attach(Locked())
+    assert "locked" in world.start_policy("left", "wave")["reason"]
+    assert foreign.calls == []
+
+
+def test_halt_while_a_world_of_others_starts_stops_it_again() -> None:
+    class Slow(World):
+        def start_policy(self, robot_name: str, **policy: Any) -> Envelope:
+            world.halt("meanwhile")
+            return super().start_policy(robot_name, **policy)
+
+    foreign = Slow()
+    world = adapt_world(foreign)
+    assert "was halted meanwhile, and DID NOT STOP AGAIN" in world.start_policy("left", "wave")["reason"]
+    assert foreign.calls[-2:] == ["stop left", "stop right"]
 
 
 def test_a_locked_foreign_robot_is_never_asked_to_move() -> None:
@@ -179,17 +295,6 @@ def test_an_own_halt_is_checked_by_the_status_as_well(monkeypatch: pytest.Monkey
     robot = telling(RUNS, None)
     robot.wrapped.halt = lambda reason: StopVerdict(("arm",))
     assert robot.halt().stopped is False
-
-
-def test_a_refusal_at_registration_says_which_answers_are_expected() -> None:
-    class Mute:
-        def start_task(self) -> None: ...
-        def get_features(self) -> None: ...
-
-    with pytest.raises(ValidationError, match="lacks stop_task, get_task_status") as refused:
-        adapt(Mute())
-    assert "{'task_status': busy, completed, " in str(refused.value)
-    assert "stop_task() -> {'status': 'success' or 'error'}" in str(refused.value)
 
 
 @pytest.mark.parametrize("answer", [success("Stopped.", stopped=False), error("no"), {"running": True}])
