@@ -161,7 +161,7 @@ def test_a_motion_that_is_stale_or_ahead_is_refused(peers: Fleet, shift: float) 
         ({"action": "fly"}, "validation: "),
         ({"action": "execute"}, "validation: "),
         ({"action": "start", "policy_provider": "mock", "duration": True}, "validation: duration"),
-        ({"action": "step", "steps": 2.0}, "validation: steps"),
+        ({"action": "step", "steps": 2.5}, "validation: steps"),
     ],
 )
 def test_a_command_out_of_bounds_is_answered_with_the_reason(peers: Fleet, command: object, says: str) -> None:
@@ -170,6 +170,39 @@ def test_a_command_out_of_bounds_is_answered_with_the_reason(peers: Fleet, comma
     assert reply["type"] == "error"
     assert reply["error"].startswith(says)
     assert reply["responder_id"] == "arm-1"
+
+
+UNREAD = ("durration", "n_step", "embodiment", "fast_mode", "trust_remote_code", "server_address")
+
+
+@pytest.mark.parametrize("name", UNREAD)
+def test_a_motion_with_a_field_that_no_peer_reads_is_refused_by_name_and_moves_nothing(peers: Fleet, name: str) -> None:
+    world = World("left")
+    peers.join(world, "sim-1", "sim")
+    transport = peers.transports["sim-1"]
+    for action in ("start", "execute"):
+        command = {"action": action, "instruction": "wave", "policy_provider": "mock", name: 1}
+        (reply,) = ask(peers, transport, "sim-1", {"turn_id": action, "command": command})
+        assert reply["type"] == "error"
+        assert f"it has no {name}" in reply["error"]
+    assert not world.list_policies_running()
+
+
+def test_a_motion_takes_what_peers_of_0_5_3_send_with_it(peers: Fleet) -> None:
+    world = World("left")
+    peers.join(world, "sim-1", "sim")
+    fields = {"turn_id": "t1", "sender_id": "console", "policy_host": "localhost", "duration": 300.0}
+    command = {"action": "start", "instruction": "wave", "policy_provider": "mock", **fields, "world_update": None}
+    (reply,) = ask(peers, peers.transports["sim-1"], "sim-1", {"command": command})
+    assert reply["result"]["status"] == "success", reply
+    assert world.list_policies_running()
+
+
+@pytest.mark.parametrize("action", ["status", "features", "state", "stop", "ping", "teleop_status", "teleop_stop"])
+def test_reads_and_stops_ignore_a_field_that_they_do_not_have(peers: Fleet, action: str) -> None:
+    peers.join(World("left"), "sim-1", "sim")
+    (reply,) = ask(peers, peers.transports["sim-1"], "sim-1", {"command": {"action": action, "durration": 1}})
+    assert reply["type"] == "response", reply
 
 
 @pytest.mark.parametrize("sender", ["", "*", "a/b", "**", None, 7])

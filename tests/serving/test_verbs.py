@@ -19,7 +19,7 @@ from strands_robots.mesh.security import validate_command
 from strands_robots.serving.arm_verbs import ARM_MOTION_VERBS, PICTURE_VERBS
 from strands_robots.serving.control_leases import CONTROL_VERBS
 from strands_robots.serving.peer_verbs import KINDS, PEER_VERBS
-from strands_robots.serving.robot_verbs import TASK_VERBS
+from strands_robots.serving.robot_verbs import TASK_VERBS, WORLD_VERBS
 from strands_robots.serving.verbs import REQUIRED, Kind, Parameter, Verb
 from strands_robots.tools import robot_mesh
 from strands_robots.utils import ValidationError, whole
@@ -103,14 +103,89 @@ def test_every_kind_of_robot_has_its_motions_on_the_mesh_as_on_device_connect(ki
         assert list(PEER_VERBS[name].by_name) == list(driver.verbs[name].by_name), name
 
 
-def test_the_mesh_fills_in_defaults_and_drops_what_an_action_does_not_have() -> None:
-    command = {"action": "start", "policy_provider": "mock", "speed": 3, "robot_name": None}
+def test_the_mesh_fills_in_defaults_and_leaves_out_what_is_none() -> None:
+    command = {"action": "start", "policy_provider": "mock", "robot_name": None}
     assert validate_command(command) == {
         "action": "start",
         "policy_provider": "mock",
         "duration": 30.0,
         "policy_host": "localhost",
     }
+
+
+MISREAD = {
+    "durration": 0.5,
+    "n_step": 3,
+    "embodiment": "so100",
+    "fast_mode": True,
+    "trust_remote_code": True,
+    "server_address": "localhost:8080",
+    "model_path": "act",
+    "policy_host_": "localhost",
+    "": 1,
+    "a b\n": 1,
+}
+"""Fields that would change a motion, and that no verb of ours reads."""
+
+TASKS = [PEER_VERBS["execute"], PEER_VERBS["start"], TASK_VERBS["execute"]]
+
+
+@pytest.mark.parametrize("verb", TASKS, ids=["mesh execute", "mesh start", "Device Connect execute"])
+@pytest.mark.parametrize("name", MISREAD)
+def test_a_field_that_a_motion_does_not_read_is_refused_by_name(verb: Verb, name: str) -> None:
+    with pytest.raises(ValidationError) as refused:
+        verb.checked({"instruction": "wave", "policy_provider": "mock", name: MISREAD[name]})
+    assert f"it has no {name if name.isidentifier() else repr(name)}" in str(refused.value)
+
+
+@pytest.mark.parametrize("verb", [*PEER_VERBS.values(), *TASK_VERBS.values()], ids=lambda verb: verb.name)
+def test_every_motion_refuses_what_it_does_not_read_and_no_read_or_stop_does(verb: Verb) -> None:
+    given = {each.name: "" for each in verb.parameters if each.default is REQUIRED} | {"durration": 0.5}
+    if verb.kind is Kind.MOTION:
+        with pytest.raises(ValidationError, match="durration"):
+            verb.checked(given)
+    elif verb.kind is Kind.READ:
+        assert "durration" not in verb.checked(given)
+    elif verb.kind is Kind.STOP:
+        assert "durration" not in verb.readable(given)[0]
+
+
+@pytest.mark.parametrize(("name", "meant"), [("durration", "duration"), ("n_step", "n_steps")])
+def test_the_refusal_says_which_argument_may_have_been_meant(name: str, meant: str) -> None:
+    with pytest.raises(ValidationError, match=rf"{name} \(did you mean {meant}\?\)"):
+        PEER_VERBS["start"].checked({"policy_provider": "mock", name: 1})
+
+
+def test_a_thousand_unknown_arguments_make_a_short_refusal() -> None:
+    many = {f"speed_{number}": 1 for number in range(1000)}
+    with pytest.raises(ValidationError, match="and 995 more") as refused:
+        PEER_VERBS["start"].checked({"policy_provider": "mock", **many})
+    assert len(str(refused.value)) < 1000
+
+
+@pytest.mark.parametrize(
+    "sent",
+    [
+        {"_dc_meta": {"source_device": "console"}},
+        {"turn_id": "t-1", "sender_id": "console", "action": "execute"},
+        {"world_update": None, "model_path": None},
+        {"policy_host": "localhost"},
+    ],
+    ids=lambda sent: next(iter(sent)),
+)
+def test_a_motion_takes_the_fields_that_frameworks_and_peers_of_0_5_3_send(sent: dict[str, Any]) -> None:
+    for verb in TASKS:
+        checked = verb.checked({"instruction": "wave", "policy_provider": "mock", **sent})
+        assert checked["duration"] == 30.0
+        assert checked.keys() <= verb.by_name.keys()
+
+
+def test_a_step_of_0_5_3_without_a_number_is_one_step_on_both_networks() -> None:
+    assert WORLD_VERBS["step"].checked({"steps": 1})["n_steps"] == 1
+    with pytest.raises(ValidationError, match=r"no steps \(did you mean n_steps\?\)"):
+        WORLD_VERBS["step"].checked({"steps": 10})
+    with pytest.raises(ValidationError, match="no steps"):
+        WORLD_VERBS["step"].checked({"steps": True})
 
 
 GO = Verb(

@@ -188,6 +188,9 @@ class RobotDriver(CollectedOnce):
             return await self._stop(verb, params)
         ours = own is not None or (function_name in self.built_verbs and not (observable and observed(self)))
         if verb is None or not ours:
+            if verb is not None:
+                caller = {name: params.pop(name) for name in ("source_device",) if name in params}
+                params = {**verb.read(params), **caller}
             problem = verb and verb.unfit(params.keys() - {"source_device"})
             return error(problem) if problem else await super().invoke(function_name, **params)
         caller = params.pop("source_device", None)

@@ -193,7 +193,7 @@ def status(robot: Robot, arguments: Arguments) -> Envelope:
 
 
 def _peer_verb(name: str, kind: Kind, summary: str, parameters: tuple[Parameter, ...] = (), **carried_out: Any) -> Verb:
-    return Verb(name, kind, summary, parameters, drops_unknown=True, **carried_out)
+    return Verb(name, kind, summary, parameters, leaves_out=True, **carried_out)
 
 
 def _follows(robot: Robot) -> bool:
@@ -210,7 +210,7 @@ def _of_reachy(verb: Verb) -> Verb:
             return error(f"{verb.name}: this robot is no Reachy Mini.")
         return verb.call(body, arguments, request)()
 
-    return replace(verb, drops_unknown=True, begin=begin, suits=lambda robot: isinstance(body_of(robot), ReachyDriver))
+    return replace(verb, leaves_out=True, begin=begin, suits=lambda robot: isinstance(body_of(robot), ReachyDriver))
 
 
 _COMMON = {"getStatus", "resume", "releaseTorque", *CONTROL_VERBS}
@@ -270,7 +270,7 @@ PEER_VERBS = table(
         ),
         release_torque_verb(
             _optional("motor_ids", str, MOTOR_IDS.meaning, MOTOR_IDS.check),
-            drops_unknown=True,
+            leaves_out=True,
             method="release_torque",
             run=release_torque,
             suits=releases_torque,
@@ -279,10 +279,10 @@ PEER_VERBS = table(
         _peer_verb("ping", Kind.READ, "Answer that the peer is there."),
         _peer_verb("describe", Kind.READ, "Describe the verbs of the robot, with parameters.", returns="functions"),
         *(
-            for_robot(verb, _PEER_ROBOT, drops_unknown=True)
+            for_robot(verb, _PEER_ROBOT, leaves_out=True)
             for verb in (*ARM_MOTION_VERBS.values(), *CONTROL_VERBS.values())
         ),
-        *(replace(verb, drops_unknown=True) for verb in (*PICTURE_VERBS.values(), DRIVE, NAVIGATE_TO)),
+        *(replace(verb, leaves_out=True) for verb in (*PICTURE_VERBS.values(), DRIVE, NAVIGATE_TO)),
         *_REACHY,
     ]
 )

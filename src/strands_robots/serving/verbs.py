@@ -6,16 +6,28 @@ Device Connect makes its RPC methods and their schemas from these descriptions, 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import partial
+from types import MappingProxyType
 from typing import Any
 
 from strands_robots.contract import for_request
 from strands_robots.safety.gate import MotionRequest
 from strands_robots.safety.lockout import is_epoch
-from strands_robots.utils import DURATION_MAX_S, ValidationError, duration, identifier, number, shown, text, whole
+from strands_robots.utils import (
+    DURATION_MAX_S,
+    ValidationError,
+    alike,
+    duration,
+    identifier,
+    number,
+    shown,
+    text,
+    whole,
+)
 from strands_robots.verb_parameters import JSON_TYPES, REQUIRED, Check, Parameter, checked_arguments
 
 Arguments = Mapping[str, Any]
@@ -96,6 +108,27 @@ NONCE = Parameter(
 """Of the read that shows lockouts: an answer that was recorded before fits no other question."""
 
 
+ROUTING = frozenset({"action", "turn_id", "sender_id", "target_id", "timestamp", "sig", "source_device", "_dc_meta"})
+"""Fields by which networks and frameworks carry a command; no verb reads them."""
+
+SENT_UNASKED: Mapping[str, object] = MappingProxyType({"policy_host": "localhost", "steps": 1})
+"""Fields that the 0.5 releases add to a command, with the value that is so without them."""
+
+
+UNKNOWN_MAX = 5
+"""Unknown arguments that a refusal names."""
+
+_WORD = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,63}\Z")
+
+
+def _says_nothing(name: str, value: object) -> bool:
+    """Return True for a field that a command may bring, and no verb needs to read."""
+    if value is None or name in ROUTING:
+        return True
+    unasked = SENT_UNASKED.get(name)
+    return unasked is not None and type(value) is type(unasked) and value == unasked
+
+
 @dataclass(frozen=True)
 class Verb:
     """One thing that a caller may ask of a robot.
@@ -109,8 +142,8 @@ class Verb:
         run: a function that calls it, or acts in place of it. A verb with neither is the network peer's own.
         begin: the same for a verb that may begin a motion; it gets the command's request besides.
         critical: False for a motion that no bystander has to fear.
-        drops_unknown: arguments that it does not have, or that are None, are left out instead of refused, and an
-            optional one that was not given stays out: the mesh's wire has it so.
+        leaves_out: arguments that are None are left out instead of refused, and an optional one that was not given
+            stays out: the mesh's wire has it so.
         lasts: it is answered when the motion has ended, so it takes no turn from motions that are only started.
         urgent: it takes energy away, and waits for no read and no motion.
         while_locked: it works under a lockout; caller and operator are asked as for any motion.
@@ -132,7 +165,7 @@ class Verb:
     begin: Begin | None = None
     suits: Suits | None = None
     critical: bool = True
-    drops_unknown: bool = False
+    leaves_out: bool = False
     lasts: bool = False
     urgent: bool = False
     while_locked: bool = False
@@ -153,7 +186,7 @@ class Verb:
         object.__setattr__(self, "share", self._share())
         object.__setattr__(self, "leased", self.kind is Kind.MOTION and not self.while_locked)
         if self.leased and all(each.name != LEASE_ID for each in self.parameters):
-            more = [replace(each, default=None) if self.drops_unknown else each for each in OF_THE_LEASE]
+            more = [replace(each, default=None) if self.leaves_out else each for each in OF_THE_LEASE]
             object.__setattr__(self, "parameters", (*self.parameters, *more))
         object.__setattr__(self, "by_name", {each.name: each for each in self.parameters})
         object.__setattr__(self, "_defaults", {each.name: each.default for each in self.parameters})
@@ -188,8 +221,30 @@ class Verb:
 
     def _unfit(self, unknown: list[str], missing: list[str]) -> str:
         takes = ", ".join(name for name in self.by_name if name not in LEASE_NAMES) or "no parameters"
-        problem = f"it has no {', '.join(unknown)}" if unknown else f"{', '.join(missing)} is missing"
-        return f"{self.name} takes {takes}: {problem}."
+        if not unknown:
+            return f"{self.name} takes {takes}: {', '.join(missing)} is missing."
+        more = f" and {len(unknown) - UNKNOWN_MAX} more" if len(unknown) > UNKNOWN_MAX else ""
+        return f"{self.name} takes {takes}: it has no {', '.join(map(self._meant, unknown[:UNKNOWN_MAX]))}{more}."
+
+    def _meant(self, name: str) -> str:
+        """Return an unknown name with the one that its sender may have meant."""
+        meant = alike(name, (each for each in self.by_name if each not in LEASE_NAMES), 1)
+        stated = name if _WORD.match(name) else shown(name)
+        return f"{stated} (did you mean {meant[0]}?)" if meant else stated
+
+    def read(self, given: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Return the arguments without those that mean nothing to it.
+
+        What would change a motion stays, to be refused: a misspelled duration would move the robot for 30 s. Reads
+        ignore what they do not have, and every verb the fields of the frameworks and those of a value that only says
+        what is so without them.
+        """
+        known = self.by_name
+        if given.keys() <= known.keys():
+            return given
+        if self.kind is Kind.READ or (self.leaves_out and self.kind is not Kind.MOTION):
+            return {name: value for name, value in given.items() if name in known}
+        return {name: value for name, value in given.items() if name in known or not _says_nothing(name, value)}
 
     def checked(self, given: Mapping[str, Any]) -> dict[str, Any]:
         """The arguments in their domains, defaults filled in.
@@ -197,10 +252,11 @@ class Verb:
         Raises:
             ValidationError: naming the first argument that is unknown, missing or outside its domain.
         """
-        if self.drops_unknown:
-            given = {name: value for name, value in given.items() if name in self.by_name and value is not None}
+        given = self.read(given)
+        if self.leaves_out:
+            given = {name: value for name, value in given.items() if value is not None}
         arguments = {**self._defaults, **checked_arguments(self.by_name, given, self._unfit)}
-        return {name: value for name, value in arguments.items() if value is not None or not self.drops_unknown}
+        return {name: value for name, value in arguments.items() if value is not None or not self.leaves_out}
 
     def readable(self, given: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
         """Return the arguments of a stop that can be read, and a note on the others.
@@ -217,7 +273,7 @@ class Verb:
                 arguments[each.name] = each.check(each.name, value if isinstance(value, str | int | float) else "\0")
             except ValidationError:
                 unread.append(f"{each.name} is not readable, so everything is stopped")
-        if not self.drops_unknown:
+        if not self.leaves_out:
             unread.append(unknown_arguments(len(given) - sum(name in given for name in self.by_name)))
         return arguments, "; ".join(filter(None, unread))
 

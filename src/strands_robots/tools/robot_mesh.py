@@ -49,10 +49,21 @@ OWN_BYTES = 16_000
 """Size of what the list of robots says on one robot's own verbs."""
 
 
-def _readable_stop(given: dict[str, Any]) -> dict[str, Any]:
-    """Return the input of a stop as the tool's schema has it."""
+INPUTS = ("action", "target", "instruction", "policy_provider", "duration", "verb", "arguments")
+
+
+def _readable(given: dict[str, Any]) -> dict[str, Any]:
+    """Return input as the tool's schema has it.
+
+    What it does not have is an argument of the verb, which a motion refuses by name, instead of left out.
+    """
     if given.get("action") not in STOPS:
-        return given
+        more = {name: value for name, value in given.items() if name not in INPUTS and value is not None}
+        stated = given.get("arguments")
+        if not more or not isinstance(stated, dict | None):
+            return given
+        known = {name: value for name, value in given.items() if name in INPUTS}
+        return {**known, "arguments": {**more, **(stated or {})}}
     texts = {name: given[name] for name in ("target", "instruction") if given.get(name) is not None}
     arguments = given.get("arguments")
     return {
@@ -62,7 +73,7 @@ def _readable_stop(given: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-@partial(fitted, fit=_readable_stop)
+@partial(fitted, fit=_readable)
 @tool
 def robot_mesh(
     action: str,
@@ -109,9 +120,10 @@ def robot_mesh(
             given = mapping("arguments", {} if arguments is None else arguments)
             return _with_image(_asked(lambda there: _called(there, robot, name, given)))
         if asked == "tell":
-            given = {"instruction": instruction, "policy_provider": policy_provider, "duration": duration}
-            task = TASK_VERBS["execute"].checked(given)
-            wanted = {name: task[name] for name in ("instruction", "policy_provider", "duration")}
+            task = {"instruction": instruction, "policy_provider": policy_provider, "duration": duration}
+            given = {**task, **mapping("arguments", {} if arguments is None else arguments)}
+            checked = TASK_VERBS["execute"].checked(given)
+            wanted = {name: checked[name] for name in checked if name in given}
             return _asked(lambda there: _started(there, robot, wanted))
     except ValidationError as refused:
         return error(str(refused))

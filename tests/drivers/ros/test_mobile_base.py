@@ -230,6 +230,16 @@ def test_tools_have_the_robots_name_and_describe_every_parameter(made: Made) -> 
             assert not parameter["description"].startswith("Parameter")
 
 
+def test_agent_that_misspells_an_argument_of_drive_is_refused_by_name_and_stops_all_the_same(made: Made) -> None:
+    link = MemoryLink()
+    drive, stop, status, _ = made(link, odom_topic="/odom").tools
+    given = {"linear": 0.2, "angular": 0.0, "duration": 1.0, "durration": 0.1}
+    with pytest.raises(ValidationError, match=r"drive_rover takes linear, angular, duration.*durration"):
+        drive.stream({"toolUseId": "1", "name": "drive_rover", "input": given}, {})
+    for tool in (stop, status):
+        tool.stream({"toolUseId": "1", "name": tool.tool_name, "input": {"durration": 0.1}}, {})
+
+
 class CutOff(MemoryLink):
     """A Ctrl-C comes right after a message of this number, counted from 1, went out."""
 

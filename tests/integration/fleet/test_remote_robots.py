@@ -21,6 +21,8 @@ from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
 from strands_robots.mesh import init_mesh
 from strands_robots.mesh.session import clear_peers
 
+UNREAD = ("durration", "n_step", "embodiment", "fast_mode", "trust_remote_code", "server_address")
+
 
 @dataclass
 class Site:
@@ -118,6 +120,19 @@ class TestOnEachNetwork:
             site.arm.acquire_control(ttl_s=10**9)
         with pytest.raises(errors.ArgumentsError, match="finite"):
             site.arm.acquire_control(ttl_s=float("nan"))
+
+    @pytest.mark.parametrize("name", UNREAD)
+    def test_unread_argument_of_a_motion_is_refused_by_name(self, site: Site, name: str) -> None:
+        for verb in ("execute", "start", "execute") if site.network == MESH else ("execute", "execute"):
+            task = {"instruction": "wave", "duration": 300.0, "policy_provider": "mock", name: 1}
+            with pytest.raises(errors.ArgumentsError, match=name):
+                site.arm.call(verb, **task)
+        assert site.arm.status()["task_status"] == "idle"
+        assert not site.toy.writes
+
+    def test_unread_argument_of_a_read_or_a_stop_is_ignored(self, site: Site) -> None:
+        assert site.arm.call("getStatus", durration=1)["task_status"] == "idle"
+        assert site.arm.call("stop", durration=1)["status"] == "success"
 
     def test_unknown_verb_is_refused_with_similar_names(self, site: Site) -> None:
         with pytest.raises(errors.UnknownVerbError, match="acquireControl"):

@@ -55,6 +55,28 @@ def test_agent_finds_drives_and_stops_a_robot(world: ToyWorld) -> None:
     assert world.writes
 
 
+@pytest.mark.parametrize("where", ["among its inputs", "in its arguments"])
+def test_agent_that_misspells_the_duration_moves_nothing_and_reads_which_word_it_meant(
+    world: ToyWorld, where: str
+) -> None:
+    tell = {"action": "tell", "target": "toys", "instruction": "wave"}
+    call = {"action": "call", "target": "toys", "verb": "execute", "arguments": {"instruction": "wave"}}
+    if where == "among its inputs":
+        misspelled = [{**tell, "durration": 1}, {**call, "durration": 1}]
+    else:
+        misspelled = [{**tell, "arguments": {"durration": 1}}]
+        misspelled += [{**call, "arguments": {"instruction": "wave", "durration": 1}}]
+    for answer in results(*misspelled):
+        assert answer["status"] == "error"
+        assert "durration (did you mean duration?)" in str(answer["content"])
+    assert not world.writes
+
+
+def test_agents_read_and_stop_with_an_input_that_the_tool_does_not_have(world: ToyWorld) -> None:
+    answers = results({"action": "status", "target": "toys", "x": 1}, {"action": "stop", "target": "toys", "x": 1})
+    assert [each["status"] for each in answers] == ["success"] * 2
+
+
 def test_emergency_stop_halts_and_locks_every_robot_by_name(world: ToyWorld) -> None:
     wave = {"action": "tell", "target": "toys", "instruction": "wave", "duration": 300}
     answers = results(wave, {"action": "emergency_stop", "instruction": "smoke"}, wave)

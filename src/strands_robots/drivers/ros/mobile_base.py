@@ -270,13 +270,15 @@ class MobileBaseRobot:
 
         The ``drive`` tool needs a duration and returns at once, so that an agent can stop the drive that it began.
         """
-        from strands_robots.agent_tool import tool  # noqa: PLC0415 - strands is loaded when it is used
+        from strands_robots.agent_tool import strict, tool  # noqa: PLC0415 - strands is loaded when it is used
 
         suffix = tool_suffix(self.node_name)
-        return [
-            tool(name=f"{verb}_{suffix}", description=description, context=True)(_without_request(method))
+        made = {
+            verb: tool(name=f"{verb}_{suffix}", description=description, context=True)(_without_request(method))
             for verb, (method, description) in self.agent_verbs().items()
-        ]
+        }
+        # A stop is refused for nothing, and a read ignores what it does not have.
+        return [each if verb in ("stop", "status", *self.reads) else strict(each) for verb, each in made.items()]
 
     @property
     def holding(self) -> bool:
