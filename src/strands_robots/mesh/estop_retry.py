@@ -73,7 +73,7 @@ class ScopedStop:
     def command(self, peer: str) -> dict[str, Any]:
         """Return the command that stops a peer, and locks all but 0.5 releases."""
         plain = {"action": "stop"}
-        return plain if peer in self.context.registry.older() else {**plain, ESTOP: dict(self.body)}
+        return plain if self.context.registry.is_older(peer) else {**plain, ESTOP: dict(self.body)}
 
     def send(self, seconds: float, on_answers: Callable[[Replies], None], remembers: Remembers) -> Replies:
         """Send the stop until all have answered; ``widened`` where nobody in it is there."""

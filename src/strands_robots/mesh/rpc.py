@@ -35,6 +35,12 @@ REPLIES_MAX = 4096
 PURPOSES = {"status": Purpose.LOCKOUT_STATE, "resume": Purpose.RESUME_ANSWER, "stop": Purpose.STOP_VERDICT}
 """Actions whose answer a robot signs, with the purpose of the signature."""
 
+OURS: Mapping[str, frozenset[str]] = {"status": frozenset({"nonce"}), "teleop_stop": frozenset({"source_peer_id"})}
+"""Fields of reads that 0.5 releases do not know, by action."""
+
+EVERY_PEER = "all"
+"""Stands for the target of a broadcast."""
+
 _NO_ID = frozenset("/*$?#")
 LOOK_S = 0.02
 REPEAT_S = 0.5
@@ -144,7 +150,7 @@ class Requester:
                 none, and until then the command is sent to each of them again twice a second. A peer's result
                 replaces an error of it.
         """
-        prepared = self._prepare("all", command, timeout)
+        prepared = self._prepare(EVERY_PEER, command, timeout)
         if isinstance(prepared, str):
             logger.warning("broadcast: %s", prepared)
             return []
@@ -327,7 +333,20 @@ class Requester:
             return f"validation: {exc}"
         if not _NO_ID.isdisjoint(target) or target in RESERVED_IDS:
             return f"target must be a peer id, not {shown(target)}."
-        return target, clean, seconds
+        return target, self._read_by(target, clean), seconds
+
+    def _read_by(self, target: str, command: dict[str, Any]) -> dict[str, Any]:
+        """Return a read without the fields that a 0.5 release would refuse it for.
+
+        They go to peers alone that have announced themselves as ours; a broadcast reaches every peer.
+        """
+        new = OURS.get(command["action"])
+        registry = self._context.registry
+        if new is None or new.isdisjoint(command):
+            return command
+        if registry.knows_ours(target) or (target == EVERY_PEER and not registry.older()):
+            return command
+        return {name: value for name, value in command.items() if name not in new}
 
     def _own_command(self, target: str, command: object) -> dict[str, Any] | None:
         """Return the command of a robot's own verb; None for any other.

@@ -67,7 +67,10 @@ def attribute(bound: str | None, sample: Sample) -> Attribution:
 
 @dataclass(frozen=True, slots=True)
 class PeerInfo:
-    """One row; ``since`` and ``seen`` time its first and last heartbeat."""
+    """One row; ``since`` and ``seen`` time its first and last heartbeat.
+
+    ``older`` is a peer of a 0.5 release.
+    """
 
     peer_id: str
     peer_type: str
@@ -78,6 +81,7 @@ class PeerInfo:
     certificate: tuple[str, str] | None = None
     gone: bool = False
     since: float = 0.0
+    older: bool = False
 
     def living(self, now: float) -> bool:
         """True while the peer counts as there."""
@@ -93,7 +97,12 @@ class PeerInfo:
             "hostname": self.hostname,
             "age": round(age, 3),
             "reachable": self.living(now),
+            **({"older": True} if self.older else {}),
         }
+
+
+OURS_ANNOUNCE = frozenset({"robot_kind", "locked"})
+"""Fields of the heartbeat of a robot of ours that no 0.5 release has."""
 
 
 class PeerRegistry:
@@ -151,7 +160,11 @@ class PeerRegistry:
                 if known.living(now):
                     session = session if session is not None else known.session
                     certificate = certificate if certificate is not None else known.certificate
-            row = PeerInfo(peer_id, peer_type, hostname, now, dict(caps), session, certificate, since=since)
+            # One of ours whose token is not here yet is known by what its heartbeat says.
+            is_old = older and OURS_ANNOUNCE.isdisjoint(caps)
+            row = PeerInfo(
+                peer_id, peer_type, hostname, now, dict(caps), session, certificate, since=since, older=is_old
+            )
             self._rows[peer_id] = row
             if older:
                 self._older.add(peer_id)
@@ -209,6 +222,15 @@ class PeerRegistry:
         now = self._clock()
         with self._lock:
             return sorted(peer for peer in self._older if self._rows[peer].living(now))
+
+    def is_older(self, peer_id: str) -> bool:
+        """Return True for a peer of a 0.5 release, however long it is silent."""
+        return peer_id in self._older
+
+    def knows_ours(self, peer_id: str) -> bool:
+        """Return True for a peer known to read what 0.5 releases refuse."""
+        row = self._row(peer_id)
+        return row is not None and not row.older
 
     def session_of(self, peer_id: str) -> str | None:
         row = self._row(peer_id)

@@ -98,6 +98,7 @@ _PEER_POLICY = (
     _optional("target_velocity", list, "Goal velocity: at most 16 numbers", vector(16)),
     _PEER_ROBOT,
 )
+_NONCE = replace(NONCE, default=None)
 _SOURCE = Parameter("source_peer_id", str, "Peer that leads", identifier)
 _PEER_ASSERTION = _optional("assertion", dict, ASSERTION.meaning, ASSERTION.check)
 _DEVICE = _optional("device_name", str, "The leader's device; leader where left out", identifier)
@@ -222,7 +223,7 @@ _REACHY = tuple(
 
 PEER_VERBS = table(
     [
-        _peer_verb("status", Kind.READ, "Read the task, or the policies that run in a world.", (NONCE,), run=status),
+        _peer_verb("status", Kind.READ, "Read the task, or the policies that run in a world.", (_NONCE,), run=status),
         _peer_verb("stop", Kind.STOP, "Stop the robot, or the named robot of a world.", (_PEER_ROBOT,)),
         _peer_verb("features", Kind.READ, GET_FEATURES.summary, method="get_features"),
         _peer_verb("state", Kind.READ, GET_STATE.summary, method="get_state"),

@@ -56,6 +56,7 @@ from strands_robots.fleet.mesh.peers import (
     has_robot,
     in_reach,
     is_in_reach,
+    is_older,
 )
 from strands_robots.fleet.mesh.stops import (
     MeshController,
@@ -360,6 +361,8 @@ class MeshNetwork:
 
     async def describe_async(self, robot: str, within: float) -> FoundRobot:
         """Return the peer as it describes itself, an older one by its kind."""
+        if self._mesh is not None and is_older(self._mesh.get_peer(robot)):
+            return replace(self.known(robot), functions=self.announced_functions(robot))
         try:
             functions = (await self.call_async(robot, "describe", {}, within)).get("functions")
         except UnknownVerbError:

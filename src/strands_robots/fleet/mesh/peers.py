@@ -101,7 +101,12 @@ LIST_S, LISTED_AT_ONCE = 1.0, 32
 
 
 def functions_of(mesh: Mesh, peer: str, seconds: float) -> list[Any] | None:
-    """Return the functions that a peer describes; None if it does not."""
+    """Return the functions that a peer describes; None if it does not.
+
+    A peer of a 0.5 release is not asked: it refuses the question.
+    """
+    if is_older(mesh.get_peer(peer)):
+        return None
     result = mesh.send(peer, {"action": "describe"}, seconds).get("result")
     functions = result.get("functions") if isinstance(result, Mapping) else None
     return functions if isinstance(functions, list) else None
@@ -123,12 +128,28 @@ def functions_of_each(mesh: Mesh, peers: Collection[str]) -> dict[str, list[Any]
     return found
 
 
+def is_older(row: Mapping[str, Any] | None) -> bool:
+    """Return True for a peer of a 0.5 release."""
+    return row is not None and row.get("older") is True
+
+
+OLDER_ACTIONS = (
+    *("status", "stop", "features", "state", "execute", "start", "step", "reset", "resume", "ping"),
+    *("teleop_status", "teleop_receive", "teleop_stop"),
+)
+"""Actions of 0.5 releases."""
+
+OLDER_LACK = frozenset({"nonce", "lease_id", "lease_ttl_s"})
+"""Arguments of these that they refuse."""
+
+
 def functions_of_kind(row: Mapping[str, Any], usual: str = "") -> list[Any]:
     """Return the functions of a peer by its presence alone.
 
     Args:
         row: its presence.
-        usual: the kind where it states none that is known; without one it has its own verbs alone.
+        usual: the kind where it states none that is known; without one it has its own verbs alone. A peer of a 0.5
+            release has no leases, and fewer actions.
     """
     from strands_robots.serving.peer_verbs import KINDS, PEER_VERBS  # noqa: PLC0415 - loaded when it is used
     from strands_robots.serving.verbs import described  # noqa: PLC0415 - as above
@@ -136,7 +157,12 @@ def functions_of_kind(row: Mapping[str, Any], usual: str = "") -> list[Any]:
     kind, own = row.get("robot_kind"), row.get("own_verbs")
     actions = KINDS.get(kind if isinstance(kind, str) else "", KINDS.get(usual, ()))
     named = [{"name": name, "labels": {"own": "true"}} for name in own] if isinstance(own, list) else []
-    return [*(described(PEER_VERBS[name]) for name in actions), *named]
+    older = is_older(row)
+    functions = [described(PEER_VERBS[name]) for name in actions if name in OLDER_ACTIONS or not older]
+    for each in functions if older else ():
+        known = each["parameters"]["properties"].items()
+        each["parameters"]["properties"] = {name: stated for name, stated in known if name not in OLDER_LACK}
+    return [*functions, *named]
 
 
 LOAD_MAX = 1000.0
