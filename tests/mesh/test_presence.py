@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -22,6 +24,8 @@ from strands_robots.mesh.transport import bridge as bridges
 from strands_robots.mesh.transport.bridge import BridgeTransport
 from strands_robots.mesh.transport.memory import MemoryBus, MemoryTransport
 from strands_robots.mesh.wire_identity import Identity
+from strands_robots.safety.orders import StopOrder, new_epoch
+from strands_robots.utils import ValidationError
 
 
 def heartbeat(peers: Fleet, peer: str, **fields: Any) -> dict[str, Any]:
@@ -317,3 +321,53 @@ def test_peer_that_fails_to_join_releases_the_session(peers: Fleet, monkeypatch:
     first.start()
     assert first.alive
     first.close()
+
+
+def test_id_of_a_peer_that_was_never_started_is_free_for_another_robot(peers: Fleet) -> None:
+    other, parts = peers.parts("arm-1"), peers.parts("arm-1")
+    forgotten = Mesh(Arm(), "arm-1", parts=replace(other, plane=parts.plane))
+    joined = Mesh(Arm(), "arm-1", parts=parts)
+    peers.meshes += [forgotten, joined]
+    joined.start()
+    assert joined.alive
+    with pytest.raises(ValidationError, match=r"arm-1.*taken by another robot"):
+        forgotten.start()
+    assert not forgotten.alive
+    with pytest.raises(ValidationError, match=r"arm-1.*taken by another robot"):
+        Mesh(Arm(), "arm-1", parts=parts)
+    assert joined.alive
+
+
+def test_id_is_free_again_after_a_join_that_failed(peers: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+    parts = peers.parts("arm-1")
+    for problem in (lambda: None, refuse):
+        failed = Mesh(Arm(), "arm-1", parts=replace(parts, acquire=problem))
+        peers.meshes.append(failed)
+        with suppress(TransportError):
+            failed.start()
+        assert not failed.alive
+    with monkeypatch.context() as broken:
+        broken.setattr(peers.transports["arm-1"], "declare_subscriber", lambda *_: refuse())
+        failed = Mesh(Arm(), "arm-1", parts=parts)
+        with pytest.raises(TransportError):
+            failed.start()
+    joined = Mesh(Arm(), "arm-1", parts=parts)
+    peers.meshes.append(joined)
+    joined.start()
+    assert joined.alive
+
+
+def refuse() -> Any:
+    raise TransportError("no link")
+
+
+def test_id_of_a_locked_robot_stays_its_own_though_it_never_joined(peers: Fleet) -> None:
+    parts = peers.parts("arm-1")
+    locked = Mesh(Arm(), "arm-1", parts=parts)
+    peers.meshes.append(locked)
+    assert parts.plane is not None
+    parts.plane.emergency_stop(StopOrder(new_epoch(), "console", "smoke"))
+    assert locked.lockout_epoch is not None
+    with pytest.raises(ValidationError, match="taken by another robot"):
+        Mesh(Arm(), "arm-1", parts=parts)
+    assert locked.lockout_epoch is not None

@@ -122,6 +122,7 @@ class Mesh(SensorLoopsMixin):
         key = _safety_key(self.robot, self.peer_id, keep=self._parts.keep)
         # A locked robot that leaves the mesh stays on the safety plane: to leave and join again must not unlock it.
         self._adapter = SafetyAdapter(self.peer_id, self.robot, key, self._parts.plane, self._parts.cell)
+        self._adapter.idle()
         self._compose()
 
     def _compose(self) -> None:
@@ -229,7 +230,7 @@ class Mesh(SensorLoopsMixin):
             if transport is None:
                 return
             try:
-                self._adapter.open()
+                self._adapter.open(joins=True)
                 self._adapter.serve(session.network())
                 self._begin(transport)
             except BaseException:

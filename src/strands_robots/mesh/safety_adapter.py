@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
@@ -22,6 +23,7 @@ from strands_robots.safety.statements import LockoutAnnouncer, with_lockout_stat
 from strands_robots.safety.stop_targets import Stoppable
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.stop_log import stop_logger
+from strands_robots.utils import ValidationError
 
 logger = stop_logger(__name__)
 
@@ -29,6 +31,12 @@ REPORT_S = 2.0
 """Seconds besides the halt deadline in which the plane reports, its lockout file included."""
 
 VerdictWaiter = Callable[[], StopVerdict | None]
+
+
+_idle: dict[tuple[SafetyPlane, str], set[SafetyAdapter]] = {}
+"""Adapters on a plane whose peer is not on the mesh, by its id."""
+
+_idle_lock = threading.Lock()
 
 
 class NoRobot:
@@ -96,14 +104,44 @@ class SafetyAdapter:
         """Return what signs for this peer."""
         return self.identity
 
-    def open(self) -> None:
+    def open(self, *, joins: bool = False) -> None:
         """Register this peer's robot; twice is once.
+
+        Args:
+            joins: it keeps its name from now on, until :meth:`leave`.
 
         Raises:
             ValidationError: another robot of this process has this name.
         """
-        if self._entry is None:
-            self._entry = self._plane.register(self._peer_id, self._robot, key=self._key, cell=self._cell)
+        at = self._plane, self._peer_id
+        with _idle_lock:
+            if self._entry is None:
+                try:
+                    self._entry = self._registered()
+                except ValidationError:
+                    others = _idle.get(at, set())
+                    if not others or any(each.epochs() for each in others):
+                        raise
+                    for each in [*others]:
+                        each._close()
+                    self._entry = self._registered()
+            if joins:
+                self._no_longer_idle()
+
+    def idle(self) -> None:
+        """Let another robot have the name, unless this one is locked, until it joins."""
+        with _idle_lock:
+            if self._entry is not None:
+                _idle.setdefault((self._plane, self._peer_id), set()).add(self)
+
+    def _registered(self) -> Registered:
+        return self._plane.register(self._peer_id, self._robot, key=self._key, cell=self._cell)
+
+    def _no_longer_idle(self) -> None:
+        others = _idle.get((self._plane, self._peer_id), set())
+        others.discard(self)
+        if not others:
+            _idle.pop((self._plane, self._peer_id), None)
 
     def epochs(self) -> tuple[str, ...]:
         """The epochs that lock this robot, oldest first; empty while it may move."""
@@ -161,6 +199,7 @@ class SafetyAdapter:
         network, self._network = self._network, None
         if network is not None:
             sightings().leave(network, self._peer_id)
+        self.idle()
 
     def lockouts(self) -> list[dict[str, Any]]:
         """Return each lockout with its source, reason and time."""
@@ -239,6 +278,11 @@ class SafetyAdapter:
 
     def close(self) -> None:
         """Take this peer's robot off the plane; twice is once."""
+        with _idle_lock:
+            self._close()
+
+    def _close(self) -> None:
+        self._no_longer_idle()
         entry, self._entry = self._entry, None
         if entry is not None:
             entry.close()
