@@ -516,3 +516,18 @@ def test_a_foreign_robot_without_joints_has_none_that_could_be_old() -> None:
     assert robot.get_state()["joints"] == {}
     foreign.get_task_status = lambda: success("Told.", task_status="running")  # type: ignore[method-assign]
     assert "joints_error" not in robot.get_state()
+
+
+@pytest.mark.parametrize("hangs", ["get_task_status", "stop_task"])
+def test_halt_answers_while_a_method_of_a_stranger_hangs(monkeypatch: pytest.MonkeyPatch, hangs: str) -> None:
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.2")
+    robot, released = Foreign(), threading.Event()
+    monkeypatch.setattr(robot, hangs, released.wait)
+    verdicts: list[StopVerdict] = []
+    halting = threading.Thread(target=lambda: verdicts.append(adapt(robot).halt()), daemon=True)
+    halting.start()
+    try:
+        halting.join(20)
+        assert [verdict.stopped for verdict in verdicts] == [False]
+    finally:
+        released.set()

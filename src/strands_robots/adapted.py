@@ -10,7 +10,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import partial
 from types import ModuleType
 from typing import Any, Protocol
@@ -32,7 +31,8 @@ from strands_robots.contract import (
 )
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.safety.gate import MotionRefused, MotionRequest, gate_of
-from strands_robots.safety.stop_targets import RobotWrapper, halted_with_verbs
+from strands_robots.safety.stop_executor import stop_executor
+from strands_robots.safety.stop_targets import RobotWrapper
 from strands_robots.safety.stopping import (
     PendingVerdict,
     StopVerdict,
@@ -306,10 +306,8 @@ class AdaptedRobot(RobotWrapper):
 
         Its status is read afterwards: a robot that says that its task runs has not stopped, whatever it answered.
         """
-        began = time.monotonic()
-        deadline = began + settings.number("STRANDS_HALT_DEADLINE_S")
-        verdict = halted_with_verbs(self, lambda: self.halt_here(reason, deadline), deadline)
-        return replace(verdict, elapsed_ms=(time.monotonic() - began) * 1000)
+        # A stop or a status of a stranger may hang, and the caller of a halt waits for its deadline at most.
+        return stop_executor().halt(self, self.tool_name_str, reason)
 
     def halt_here(self, reason: str, deadline: float) -> StopVerdict | PendingVerdict:
         """Ask everything to stop, and leave the answers and the status to be read."""
