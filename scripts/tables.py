@@ -1,4 +1,4 @@
-"""Write the tables of settings and extras in docs/reference.md from the code.
+"""Write the tables of settings, old settings and extras in docs/reference.md from the code.
 
 ``python scripts/tables.py`` rewrites them in place; ``--check`` only compares them.
 """
@@ -46,6 +46,12 @@ def settings_table() -> str:
     return "\n".join(rows)
 
 
+def unread_table() -> str:
+    rows = ["| variable of 0.5 | here |", "|---|---|"]
+    rows += [f"| `{name}` | {instead} |" for name, instead in sorted(settings.UNREAD.items())]
+    return "\n".join(rows)
+
+
 def extras_table() -> str:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     rows = ["| extra | gives | brings |", "|---|---|---|"]
@@ -56,7 +62,8 @@ def extras_table() -> str:
 
 
 def rewritten(text: str) -> str:
-    for name, table in (("settings", settings_table()), ("extras", extras_table())):
+    tables = (("settings", settings_table()), ("unread", unread_table()), ("extras", extras_table()))
+    for name, table in tables:
         pattern = rf"(<!-- table: {name} -->\n).*?(\n<!-- end -->)"
         text, found = re.subn(pattern, lambda m, t=table: m[1] + t + m[2], text, flags=re.DOTALL)
         if not found:

@@ -28,6 +28,8 @@ INTEGRATION = Path(__file__).parent / "integration"
 for setting in settings.declared():
     if setting.name not in {"DISPLAY", "MUJOCO_GL"}:
         os.environ.pop(setting.name, None)
+for name in settings.UNREAD:
+    os.environ.pop(name, None)
 
 # What moves in the tests is no metal.
 os.environ["STRANDS_ALLOW_MOCK"] = "true"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, given
@@ -86,3 +87,71 @@ def test_undeclared_setting_cannot_be_read() -> None:
     for read in (settings.raw, settings.is_set, settings.boolean, settings.number, settings.items):
         with pytest.raises(KeyError):
             read("STRANDS_NO_SUCH_THING")
+
+
+@pytest.fixture
+def fresh(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A process that has warned of nothing and set nothing itself."""
+    monkeypatch.setattr(settings, "_warned", set())
+    monkeypatch.setattr(settings, "_put", set())
+
+
+def test_no_setting_of_the_older_package_that_is_called_unread_is_read() -> None:
+    assert not {setting.name for setting in settings.declared()} & set(settings.UNREAD)
+    source = Path(settings.__file__)
+    for module in source.parent.rglob("*.py"):
+        read = module.read_text(encoding="utf-8") if module != source else ""
+        assert not [name for name in settings.UNREAD if f'"{name}"' in read], module
+
+
+def test_each_unread_setting_says_in_a_sentence_what_to_do() -> None:
+    for name, instead in settings.UNREAD.items():
+        assert instead.endswith(".") and instead[0].isupper() and "  " not in instead, name
+
+
+@pytest.mark.parametrize("name", settings.UNREAD)
+def test_start_with_an_unread_setting_warns_once(
+    fresh: None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, name: str
+) -> None:
+    monkeypatch.setenv(name, "secret-value")
+    settings.warn_of_unread()
+    settings.warn_at_join()
+    assert [each.getMessage() for each in caplog.records] == [
+        f"{name} is set and not read here. {settings.UNREAD[name]}"
+    ]
+
+
+def test_blank_unread_setting_warns_of_nothing(
+    fresh: None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("STRANDS_MESH_OVERRIDE_CODE", " ")
+    settings.warn_at_join()
+    assert not caplog.records
+
+
+@pytest.mark.parametrize(
+    ("callers", "sources", "warns"), [("agent-*", "", True), ("agent-*", "safety-*", False), ("", "", False)]
+)
+def test_callers_that_restrict_no_stop_are_said_once(
+    fresh: None,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    callers: str,
+    sources: str,
+    warns: bool,
+) -> None:
+    monkeypatch.setenv("DEVICE_CONNECT_RPC_ALLOW", callers)
+    monkeypatch.setenv("DEVICE_CONNECT_ESTOP_ALLOW", sources)
+    for _ in range(2):
+        settings.warn_at_join()
+    assert len(caplog.records) == warns
+    assert all("every named source may stop and lock" in each.getMessage() for each in caplog.records)
+
+
+def test_callers_of_a_flag_are_of_this_version(
+    fresh: None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("DEVICE_CONNECT_RPC_ALLOW", "")
+    settings.put("DEVICE_CONNECT_RPC_ALLOW", "agent-*")
+    settings.warn_at_join()
+    assert not caplog.records

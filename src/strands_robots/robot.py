@@ -12,6 +12,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
+from strands_robots import settings
 from strands_robots._mesh_switch import mesh_env_request
 from strands_robots.adapted import behind_contract
 from strands_robots.contract import put_away
@@ -110,6 +111,7 @@ def Robot(  # the factory reads as the class it stands for
         MissingExtraError: the [sim] or [lerobot] extra, or that of the mesh, is not installed.
         ConnectionError: a real robot could not be connected.
     """
+    settings.warn_of_unread()
     kind = choice("mode", mode, ("sim", "real"))
     if mesh is not None and not isinstance(mesh, bool):
         raise ValidationError(f"mesh must be true, false or None, not {shown(mesh)}.")

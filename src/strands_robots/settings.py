@@ -35,6 +35,8 @@ class Setting:
 
 _TABLE: dict[str, Setting] = {}
 _warned: set[tuple[str, str]] = set()
+_put: set[str] = set()
+"""Names that this process has set itself."""
 
 
 def _declare(*settings: Setting) -> None:
@@ -288,6 +290,154 @@ _declare(
     ),
 )
 
+UNREAD: dict[str, str] = {
+    name: instead
+    for names, instead in (
+        # Who may command.
+        (
+            "STRANDS_MESH_HITL_ACTIONS STRANDS_POSE_COMMAND_ALLOW STRANDS_DASH_TASK_REQUIRES_CONFIRM "
+            "STRANDS_DASH_AGENT_PHYSICAL_MOTION",
+            "Real hardware moves for the verbs of STRANDS_ROBOT_COMMAND_ALLOW and for one-time grants alone.",
+        ),
+        (
+            "STRANDS_ROBOT_MESH_AGENT_ID DEVICE_CONNECT_CLIENT_ID",
+            "The tool calls as robot-mesh-tool: name that in DEVICE_CONNECT_RPC_ALLOW at the robots.",
+        ),
+        ("STRANDS_DASH_MOTION_GRANT_TTL_S", "A grant lives for 300 s; strands-robots grant --for states another time."),
+        ("STRANDS_SERIAL_COMMAND_ALLOW", "No tool here writes to a serial bus; a robot's verbs do."),
+        ("STRANDS_UNITREE_COMMAND_ALLOW", "No driver of these robots is here; a driver of your own brings its verbs."),
+        ("STRANDS_TRUST_REMOTE_CODE", "Code of a checkpoint is never run; serve such a policy as provider remote."),
+        # Device Connect.
+        ("NATS_TLS_CA_FILE", "Set MESSAGING_TLS_CA_FILE."),
+        ("NATS_TLS_CERT_FILE", "Set MESSAGING_TLS_CERT_FILE."),
+        ("NATS_TLS_KEY_FILE", "Set MESSAGING_TLS_KEY_FILE."),
+        # The mesh.
+        (
+            "STRANDS_MESH_OVERRIDE_CODE",
+            "No shared code ends a lockout; set STRANDS_MESH_RESUME_PUBLIC_KEY and resume with the operator's key.",
+        ),
+        (
+            "STRANDS_MESH_RESUME_SIGNING_KEY_FILE",
+            "Give the key's file to strands-robots resume --key or to fleet.resume().",
+        ),
+        ("STRANDS_MESH_RESUME_FRESHNESS_S", "A resume counts for 60 s after it was signed."),
+        ("STRANDS_MESH_RESUME_FORWARD_SKEW_S", "A resume may be 5 s ahead of the robot's clock."),
+        (
+            "STRANDS_MESH_RESUME_MAX_FAILS STRANDS_MESH_RESUME_BACKOFF_S",
+            "After five refused resumes a robot accepts none for 30 s.",
+        ),
+        (
+            "STRANDS_MESH_RESUME_REPLAY_CACHE_MAX",
+            "A robot remembers 4096 resumes, and every epoch it was resumed from.",
+        ),
+        (
+            "STRANDS_MESH_CMD_RATE_HZ STRANDS_MESH_SAFETY_RATE_HZ",
+            "Rates are bounded by topic, as docs/mesh.md lists them; a stop finds a place in every flood.",
+        ),
+        (
+            "STRANDS_MESH_MAX_CMD_BYTES STRANDS_MESH_MAX_SAFETY_BYTES STRANDS_MESH_MAX_CAMERA_BYTES",
+            "Sizes are bounded by topic, as docs/mesh.md lists them.",
+        ),
+        (
+            "STRANDS_MESH_FALLBACK_MODE",
+            "A process that cannot be the hub of STRANDS_MESH_PORT connects to it; other endpoints are "
+            "STRANDS_MESH_CONNECT and STRANDS_MESH_LISTEN.",
+        ),
+        ("STRANDS_MESH_FILTER_INTERFACES", "Name the interface's address in STRANDS_MESH_LISTEN."),
+        ("STRANDS_MESH_GATEWAY_DISCOVERY_WAIT_S", "The tool waits as long as its answer takes."),
+        ("STRANDS_MESH_SUBSCRIBE_ALLOW", "No tool reads raw topics; connect() follows a robot's events and state."),
+        ("STRANDS_MESH_INPUT_AUDIT_EVERY", "The audit has the begin of every input stream, and its loss or end."),
+        (
+            "STRANDS_TELEOP_SLEW_ABS",
+            "The robot's own speed_limit bounds a leader, and over the mesh STRANDS_MESH_INPUT_SLEW_ABS does.",
+        ),
+        (
+            "STRANDS_MAX_TARGET_LINEAR_VELOCITY_MPS STRANDS_MAX_TARGET_ANGULAR_VELOCITY_RPS",
+            "Give max_linear and max_angular to the base's class.",
+        ),
+        # The mesh over MQTT.
+        (
+            "STRANDS_MESH_IOT_DIRECT STRANDS_IOT_DIRECT_AUTH",
+            "Commands and answers go over MQTT topics, authenticated by the certificate in STRANDS_IOT_CERT_DIR.",
+        ),
+        (
+            "STRANDS_MESH_IOT_CAMERA_INLINE STRANDS_MESH_CAMERA_S3_BUCKET STRANDS_MESH_CAMERA_S3_PREFIX "
+            "STRANDS_MESH_CAMERA_PRESIGN_TTL",
+            "No picture is sent over MQTT.",
+        ),
+        (
+            "STRANDS_MESH_CA_PINS STRANDS_MESH_DISABLE_CA_PIN",
+            "Nothing here provisions AWS; STRANDS_IOT_CA_FILE is the authority that the broker is checked against.",
+        ),
+        ("STRANDS_MESH_BRIDGE_TOPICS_PREFIX", "Name the topics in STRANDS_MESH_BRIDGE_TOPICS; answers are carried."),
+        (
+            "STRANDS_MESH_DEDUP_TTL STRANDS_MESH_BRIDGE_DEDUP_STRICT",
+            "A command that arrives over both legs of the bridge is always carried out once.",
+        ),
+        # The audit.
+        (
+            "STRANDS_MESH_AUDIT_MAX_BYTES STRANDS_MESH_AUDIT_MAX_FILES",
+            "The audit is rotated at 100 MiB with five older files; the first record of each stop is kept beyond that.",
+        ),
+        # Robots.
+        ("STRANDS_ROBOT_MODE", 'Give mode="real" or mode="sim" to Robot(), or --mode to serve.'),
+        ("STRANDS_BASE_DIR", "STRANDS_STATE_DIR is the folder of lockouts, grants and keys."),
+        ("STRANDS_ASSETS_DIR", "Give Robot() or serve the path of the MJCF or URDF file."),
+        ("REACHY_TTS_URL", "The driver plays no sound."),
+        (
+            "STRANDS_ROBOTS_FOXGLOVE STRANDS_FOXGLOVE_COMMAND_ALLOW",
+            "No Foxglove server is here; serve --record writes MCAP files, which Foxglove opens.",
+        ),
+        # The operator's page.
+        (
+            "DASHBOARD_AUTH_TOKEN STRANDS_DASH_AUTH_ENABLED STRANDS_DASH_AUTH_BOOTSTRAP_TOKEN "
+            "STRANDS_DASH_AUTH_ENROLL_TOKEN_FILE STRANDS_DASH_AUTH_TOKEN_TTL",
+            "The page is on 127.0.0.1 alone; dashboard --listen adds TLS and makes a token.",
+        ),
+        (
+            "DASHBOARD_CORS_ORIGINS STRANDS_DASH_CONNECT_ORIGINS STRANDS_DASH_AUTH_ORIGIN STRANDS_DASH_AUTH_RP_ID",
+            "The page answers to its own origins alone: 127.0.0.1, and the address of dashboard --listen.",
+        ),
+        (
+            "STRANDS_DASHBOARD_AUTOSPAWN STRANDS_DASHBOARD_AUTOSPAWN_REAL_SERIALS "
+            "STRANDS_DASH_REAL_SPAWN_WITHOUT_MESH_AUTH STRANDS_DASHBOARD_PROFILES",
+            "The page starts no robot; strands-robots serve does.",
+        ),
+        ("STRANDS_DASHBOARD_PEER_ID", "Give the page's name to dashboard --as."),
+    )
+    for name in names.split()
+}
+"""Settings of strands-robots 0.5 that are not read here, and what to set or do instead of each."""
+
+
+def warn_of_unread() -> None:
+    """Log each variable of :data:`UNREAD` that is set, once, with what to do instead.
+
+    Every start of a robot or of the page calls this.
+    """
+    for name, instead in UNREAD.items():
+        if os.environ.get(name, "").strip() and (name, "") not in _warned:
+            _warned.add((name, ""))
+            logger.warning("%s is set and not read here. %s", name, instead)
+
+
+def warn_at_join() -> None:
+    """Log what :func:`warn_of_unread` does, and that a list of callers restricts no stop.
+
+    In strands-robots 0.5 it did. A list that this process set itself, as a flag of ``serve`` does, is of this version.
+    """
+    warn_of_unread()
+    callers, sources = "DEVICE_CONNECT_RPC_ALLOW", "DEVICE_CONNECT_ESTOP_ALLOW"
+    if is_set(callers) and callers not in _put and not is_set(sources) and (sources, "") not in _warned:
+        _warned.add((sources, ""))
+        logger.warning(
+            "%s is set and %s is not: every named source may stop and lock the robots, whoever may move them. "
+            "Set %s to restrict that.",
+            callers,
+            sources,
+            sources,
+        )
+
 
 def declared() -> tuple[Setting, ...]:
     """Return every setting, in the order of the table."""
@@ -307,6 +457,7 @@ def verbatim(name: str) -> str:
 def put(name: str, value: str) -> None:
     """Set a declared variable for this process and its children."""
     os.environ[_TABLE[name].name] = value
+    _put.add(name)
 
 
 def is_set(name: str) -> bool:

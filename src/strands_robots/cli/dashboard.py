@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from strands_robots import settings
 from strands_robots._mesh_switch import mesh_env_request
 from strands_robots.cli.keys import PassphraseFile, signing_key
 from strands_robots.cli.network import Network
@@ -91,6 +92,7 @@ def dashboard(
     demo: Annotated[bool, typer.Option("--demo", help="Serve four simulated robots to try it with.")] = False,
 ) -> None:
     """Show every robot in a browser: watch, drive, stop; on 127.0.0.1 alone."""
+    settings.warn_of_unread()
     source = device_id("--as", source)
     if operator_key is not None and not operator_key.is_file():
         raise CliError(f"--operator-key {operator_key} is no file.", Exit.USAGE)

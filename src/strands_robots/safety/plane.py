@@ -303,6 +303,7 @@ class SafetyPlane:
         Raises:
             ValidationError: no identifier, or another robot has this name.
         """
+        settings.warn_at_join()
         identifier("robot_id", robot_id)
         with self._registering:
             known = self.robots.get(robot_id)

@@ -54,6 +54,24 @@ def test_panel_of_a_robot_on_this_machine_comes_without_a_warning(machine: Machi
     assert warned == ""
 
 
+@pytest.mark.parametrize("network", [(), ("--mesh",)], ids=["device-connect", "mesh"])
+def test_start_with_settings_of_the_older_package_names_each_once(machine: Machine, network: tuple[str, ...]) -> None:
+    older = {"STRANDS_MESH_OVERRIDE_CODE": "1234", "DASHBOARD_AUTH_TOKEN": "t", "DEVICE_CONNECT_RPC_ALLOW": "agent-*"}
+    older["STRANDS_MESH_LOCAL_DEV"] = "1"
+    served = machine.start("serve", "so100", "--peer-id", "older-1", "--json", *network, **older)
+    assert served.stdout is not None
+    assert json.loads(served.stdout.readline())["event"] == "serving"
+    served.terminate()
+    _, warned = served.communicate(timeout=WITHIN_S)
+    for said in (
+        "STRANDS_MESH_OVERRIDE_CODE is set and not read here. No shared code ends a lockout;",
+        "DASHBOARD_AUTH_TOKEN is set and not read here. The page is on 127.0.0.1 alone;",
+        "DEVICE_CONNECT_RPC_ALLOW is set and DEVICE_CONNECT_ESTOP_ALLOW is not: every named source may stop",
+    ):
+        assert warned.count(said) == 1, warned
+    assert "1234" not in warned
+
+
 def test_foreign_model_is_served_with_its_tip_named(machine: Machine, tmp_path: Path) -> None:
     model = tmp_path / "crane.xml"
     model.write_text(
