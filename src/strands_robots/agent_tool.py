@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import wraps
+from inspect import signature
 from typing import Any, TypeVar
 
 from strands_robots.utils import ValidationError, missing_extra, shown
@@ -14,12 +16,36 @@ except ModuleNotFoundError as exc:
         raise
     raise missing_extra("An agent's tool", "agent") from exc
 
-__all__ = ["ToolContext", "fitted", "strict", "tool"]
+__all__ = ["ToolContext", "fitted", "fitted_tool", "strict", "tool"]
 
 T = TypeVar("T", bound=Any)
+Fit = Callable[[dict[str, Any]], dict[str, Any]]
 
 
-def fitted(agent_tool: T, fit: Callable[[dict[str, Any]], dict[str, Any]]) -> T:
+def fitted_tool(fit: Fit, **options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Return a decorator that makes a tool whose input goes through ``fit`` first.
+
+    It sees the input of an agent before its types are checked, and then the arguments of the call, as it sees those of
+    a plain call in Python: an input may go through it twice.
+
+    Args:
+        fit: returns the arguments for those that it is given, by name.
+        options: of ``strands.tool``.
+    """
+
+    def decorate(function: Callable[..., Any]) -> Any:
+        names = tuple(signature(function).parameters)
+
+        @wraps(function)
+        def called(*values: Any, **given: Any) -> Any:
+            return function(**fit({**dict(zip(names, values, strict=False)), **given}))
+
+        return fitted(tool(**options)(called), fit)
+
+    return decorate
+
+
+def fitted(agent_tool: T, fit: Fit) -> T:
     """Return an agent tool whose input goes through ``fit`` before it is checked."""
     stream = agent_tool.stream
 

@@ -422,9 +422,9 @@ def warn_of_unread() -> None:
 
 
 def warn_at_join() -> None:
-    """Log what :func:`warn_of_unread` does, and that a list of callers restricts no stop.
+    """Log unread settings, and that a list of callers restricts no stop.
 
-    In strands-robots 0.5 it did. A list that this process set itself, as a flag of ``serve`` does, is of this version.
+    In strands-robots 0.5 such a list did. One that this process set itself, by a flag of ``serve``, is of this version.
     """
     warn_of_unread()
     callers, sources = "DEVICE_CONNECT_RPC_ALLOW", "DEVICE_CONNECT_ESTOP_ALLOW"

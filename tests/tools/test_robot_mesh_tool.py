@@ -76,7 +76,20 @@ def test_every_action_reaches_the_network(fake: ScriptedNetwork) -> None:
         ({"action": "tell", "target": "arm-1", "instruction": "wave", "duration": float("nan")}, "duration"),
         ({"action": "tell", "target": "arm-1", "instruction": "wave", "duration": 1e9}, "duration"),
         ({"action": "tell", "target": "arm-1", "instruction": "wave", "policy_provider": ""}, "policy_provider"),
-        ({"action": "status"}, "target"),
+        ({"action": "ping"}, "target"),
+        ({"action": "send", "command": '{"action": "status"}'}, "target"),
+        ({"action": "send", "target": "arm-1"}, "arguments action"),
+        ({"action": "send", "target": "arm-1", "command": "{no json"}, "arguments"),
+        ({"action": "send", "target": "arm-1", "command": '{"action": [1]}'}, "arguments action"),
+        ({"action": "broadcast", "command": '{"action": "execute", "instruction": "wave"}'}, "arguments action"),
+        ({"action": "broadcast", "command": '{"action": "status", "nonce": "x"}'}, "arguments action"),
+        ({"action": "rpc", "target": "arm-1"}, "verb"),
+        ({"action": "rpc", "target": "arm-1", "function": "nod", "command": "[1]"}, "arguments"),
+        ({"action": "status", "target": "arm-1", "timeout": 0}, "timeout"),
+        ({"action": "tell", "target": "arm-1", "instruction": "wave", "timeout": float("nan")}, "timeout"),
+        ({"action": "tell", "target": "arm-1", "instruction": "wave", "policy_port": 70000}, "policy_port"),
+        ({"action": "tell", "target": "arm-1", "instruction": "wave", "arguments": {"speed": 9}}, "speed"),
+        *(({"action": action, "target": "arm-1"}, "status says") for action in ("subscribe", "watch", "inbox")),
         ({"action": "move", "arguments": {"x": 1}}, "target"),
         ({"action": "call", "target": "arm-1"}, "verb"),
         ({"action": "call", "target": "arm-1", "verb": "a/b"}, "verb"),
@@ -92,6 +105,69 @@ def test_argument_out_of_its_domain_is_refused_by_name(
     assert named in answer["reason"]
     assert fake.calls == []
     assert fake.searches == 0
+
+
+def test_actions_of_the_older_tool_reach_the_network(fake: ScriptedNetwork) -> None:
+    """As strands-robots 0.5 was called: without a tool context, with its names, and with what it ignored."""
+    older: dict[str, Any] = {"tool_context": None, "name": "", "limit": 50, "function": "", "command": ""}
+    assert len(robot_mesh(action="status", **older)["peers"]) == 3
+    robot_mesh(action="tell", target="arm-1", instruction="wave", duration=2, policy_port=5555, timeout=7.0)
+    robot_mesh(action="send", target="arm-1", **{**older, "command": '{"action": "status"}'})
+    robot_mesh(action="send", target="arm-1", command='{"action": "start", "instruction": "wave", "durration": 2}')
+    robot_mesh(action="rpc", target="arm-1", function="nod", command='{"times": 2}', timeout=3.0)
+    assert robot_mesh(action="ping", target="arm-1")["latency_ms"] >= 0
+    task = {"instruction": "wave", "policy_provider": "mock", "duration": 2.0, "policy_port": 5555}
+    # What a verb takes is checked by its robot, which refuses the misspelt duration by name.
+    sent = {"instruction": "wave", "durration": 2}
+    assert fake.calls == [
+        ("arm-1", "execute", task, 7.0),
+        ("arm-1", "getStatus", {}, MODULE.CALL_S),
+        ("arm-1", "execute", sent, MODULE.CALL_S),
+        ("arm-1", "nod", {"times": 2}, 3.0),
+        ("arm-1", "getStatus", {}, 10.0),
+    ]
+
+
+def test_broadcast_asks_every_robot_and_names_those_without_an_answer(fake: ScriptedNetwork) -> None:
+    answer = robot_mesh(action="broadcast", command='{"action": "status"}')
+    assert [row["robot_id"] for row in answer["responses"]] == ["arm-1", "base-1", "world-1"]
+    assert {call[:2] for call in fake.calls} == {(name, "getStatus") for name in ("arm-1", "base-1", "world-1")}
+    fake.answers["getState"] = UnreachableError("base-1 is away")
+    answer = robot_mesh(action="broadcast", arguments={"action": "state"})
+    assert answer["status"] == "error"
+    assert "0 of 3 robots answered state. No answer: arm-1, base-1, world-1." in answer["reason"]
+
+
+@pytest.mark.parametrize(
+    ("given", "stopped"),
+    [
+        ({"action": "send", "target": "arm-1", "command": '{"action": "stop"}'}, ["arm-1"]),
+        ({"action": "send", "target": "a b", "command": {"action": "stop", "x": 1}}, ["arm-1", "base-1", "world-1"]),
+        ({"action": "send", "command": '{"action": "stop"}', "timeout": -1}, ["arm-1", "base-1", "world-1"]),
+        ({"action": "broadcast", "target": "arm-1", "command": '{"action": "stop"}'}, ["arm-1", "base-1", "world-1"]),
+    ],
+)
+async def test_stop_that_is_sent_or_broadcast_is_a_stop(
+    fake: ScriptedNetwork, given: dict[str, Any], stopped: list[str]
+) -> None:
+    assert robot_mesh(**given)["stopped"] is True
+    assert fake.stopped == stopped
+    fake.stopped.clear()
+    use = {"toolUseId": "1", "name": "robot_mesh", "input": given}
+    events = [event async for event in robot_mesh.stream(use, {})]
+    assert fake.stopped == stopped, events
+
+
+async def test_agent_reaches_a_verb_by_the_older_names(fake: ScriptedNetwork) -> None:
+    given = {"action": "rpc", "target": "arm-1", "function": "nod", "command": '{"times": 2}'}
+    use = {"toolUseId": "1", "name": "robot_mesh", "input": given}
+    events = [event async for event in robot_mesh.stream(use, {})]
+    assert [call[:3] for call in fake.calls] == [("arm-1", "nod", {"times": 2})], events
+
+
+def test_schema_has_one_name_for_each_meaning() -> None:
+    names = set(robot_mesh.tool_spec["inputSchema"]["json"]["properties"])
+    assert not names & {"command", "function", "limit", "name", "tool_context", "policy_port"}
 
 
 @pytest.mark.parametrize(

@@ -49,6 +49,13 @@ ACTIONS = (
     "service_call",
     "action_goal",
 )
+INSTEAD = {
+    "types": "docs/ros.md lists the types that bare DDS carries",
+    "advertise": "publish advertises its topic and waits for a subscription",
+    "subscribe": "echo reads the next messages",
+}
+"""Actions of strands-robots 0.5, and what to use."""
+
 COUNT_MAX = 1000
 RATE_MAX_HZ = 100.0
 TIMEOUT_MAX_S = 600.0
@@ -197,6 +204,8 @@ def ros_action(
         host: of the rosbridge server, with its ``port``. ``domain_id``: of DDS, ``ROS_DOMAIN_ID`` by default.
     """
     try:
+        if isinstance(action, str) and action in INSTEAD:
+            return error(f"action {action} is none here: {INSTEAD[action]}.")
         wanted = choice("action", action, ACTIONS)
         chosen = choice("backend", backend, BACKENDS)
         seconds = number("timeout", timeout, above=0, high=TIMEOUT_MAX_S)

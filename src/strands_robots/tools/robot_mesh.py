@@ -11,16 +11,18 @@
 from __future__ import annotations
 
 import base64
+import time
 from collections.abc import Callable, Mapping
 from contextlib import closing, suppress
-from functools import partial
 from typing import Any
 
 from strands_robots import settings
-from strands_robots.agent_tool import fitted, tool
+from strands_robots.agent_tool import fitted_tool
+from strands_robots.bounded_json import SMALL_BYTES, OutOfBoundsError, parsed
 from strands_robots.envelope import Envelope, error, is_error, success, text_of
 from strands_robots.errors import NoSuchRobotError, RefusalError, StrandsRobotsError, UnknownVerbError
-from strands_robots.fleet.adapter import STOP_S, TOOL, FoundRobot, StopRequest
+from strands_robots.fleet.adapter import STOP_S, TOOL, FoundRobot, NetworkAdapter, StopRequest
+from strands_robots.fleet.joining import side_by_side
 from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.profiles import networks_for_stop, networks_of, profile_for
 from strands_robots.fleet.reports import near_verbs, said
@@ -31,14 +33,30 @@ from strands_robots.serving.advertised import RobotDescription, fitting
 from strands_robots.serving.robot_verbs import TASK_VERBS, WORLD_VERBS
 from strands_robots.serving.stop_arguments import noted, stop_reason, stop_robot, stop_scope
 from strands_robots.serving.verbs import unknown_arguments
-from strands_robots.utils import WAIT_S, ValidationError, choice, device_id, identifier, mapping, plain_text, shown
+from strands_robots.utils import (
+    WAIT_S,
+    ValidationError,
+    choice,
+    device_id,
+    identifier,
+    mapping,
+    number,
+    plain_text,
+    shown,
+)
 
 CALLED = {"move": "moveTo", "picture": "getPicture", "wait": "wait"}
 """Verb of each action that calls one where none is named."""
 
 STOPS = ("stop", "emergency_stop")
-ACTIONS = ("peers", "tell", "status", *STOPS, "release_torque", "call", *CALLED)
-NEEDS_TARGET = ("tell", "status", "release_torque", "call", *CALLED)
+BODIES = ("send", "broadcast")
+"""Actions whose arguments name the action of the robot."""
+
+ACTIONS = ("peers", "tell", "status", *STOPS, "release_torque", "call", *CALLED, "ping", *BODIES)
+NEEDS_TARGET = ("tell", "release_torque", "call", *CALLED, "ping", "send")
+
+BROADCAST = ("status", "state", "features")
+"""Reads that a broadcast asks every robot for."""
 
 ANSWER_S = 10.0
 
@@ -49,21 +67,53 @@ OWN_BYTES = 16_000
 """Size of what the list of robots says on one robot's own verbs."""
 
 
-INPUTS = ("action", "target", "instruction", "policy_provider", "duration", "verb", "arguments")
+SUBSCRIPTIONS = ("subscribe", "unsubscribe", "watch", "inbox")
+NO_SUBSCRIPTION = (
+    "the tool keeps no subscription: status says what a robot does now, and connect() follows a robot's events"
+)
+
+
+INPUTS = ("action", "target", "instruction", "policy_provider", "duration", "verb", "arguments", "timeout")
+IGNORED = {"tool_context": None, "limit": 50, "name": "", "function": "", "command": "", "policy_port": 0}
+"""Inputs of strands-robots 0.5 with the values by which they say nothing."""
 
 
 def _readable(given: dict[str, Any]) -> dict[str, Any]:
-    """Return input as the tool's schema has it.
+    """Return input as the tool's schema has it; the names of 0.5 are read, too.
 
     What it does not have is an argument of the verb, which a motion refuses by name, instead of left out.
     """
-    if given.get("action") not in STOPS:
-        more = {name: value for name, value in given.items() if name not in INPUTS and value is not None}
-        stated = given.get("arguments")
-        if not more or not isinstance(stated, dict | None):
-            return given
-        known = {name: value for name, value in given.items() if name in INPUTS}
-        return {**known, "arguments": {**more, **(stated or {})}}
+    action = given.get("action")
+    if action in STOPS:
+        return _readable_stop(given)
+    stated = {name: value for name, value in given.items() if name not in IGNORED or value not in (None, IGNORED[name])}
+    stated.pop("tool_context", None)
+    if function := stated.pop("function", None):
+        stated["verb"] = stated.get("verb") or function
+    if command := stated.pop("command", None):
+        stated["arguments"] = stated.get("arguments") or _object(command)
+    body = stated.get("arguments")
+    if action in BODIES and isinstance(body, dict) and str(body.get("action")) in advertised.STOPS:
+        rest = {name: value for name, value in body.items() if name != "action"}
+        target = {"target": given.get("target")} if action == "send" else {}
+        return _readable_stop({"action": "stop", "arguments": rest, **target})
+    known = {name: value for name, value in stated.items() if name in INPUTS}
+    more = {name: value for name, value in stated.items() if name not in INPUTS and value is not None}
+    if more and isinstance(body, dict | None):
+        known["arguments"] = {**more, **(body or {})}
+    return {**known, "action": "call"} if action == "rpc" else known
+
+
+def _object(command: object) -> object:
+    """Return the JSON value of a text; the text where it has none."""
+    try:
+        return parsed(command, SMALL_BYTES) if isinstance(command, str) else command
+    except (ValueError, OutOfBoundsError):
+        return command
+
+
+def _readable_stop(given: dict[str, Any]) -> dict[str, Any]:
+    """Return the input of a stop as the tool's schema has it."""
     texts = {name: given[name] for name in ("target", "instruction") if given.get(name) is not None}
     arguments = given.get("arguments")
     return {
@@ -73,8 +123,7 @@ def _readable(given: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-@partial(fitted, fit=_readable)
-@tool
+@fitted_tool(_readable)
 def robot_mesh(
     action: str,
     target: str = "",
@@ -84,6 +133,7 @@ def robot_mesh(
     *,
     verb: str = "",
     arguments: dict[str, Any] | None = None,
+    timeout: float | None = None,
 ) -> dict[str, Any]:
     """Find robots, give them instructions, ask for their status, and stop them.
 
@@ -91,13 +141,15 @@ def robot_mesh(
 
     Args:
         action: peers lists the robots; tell gives one an instruction and returns once the motion has started; status
-            returns what one is doing; stop stops one, or all without a target, or with arguments {"robot_name": ...}
-            one robot of a world; emergency_stop stops and locks all, or with arguments {"only": ["arm-1"]} some and
-            with {"cell": "cell-1"} those of a cell and every robot without one;
+            returns what one is doing, or lists all without a target; stop stops one, or all without a target, or with
+            arguments {"robot_name": ...} one robot of a world; emergency_stop stops and locks all, or with arguments
+            {"only": ["arm-1"]} some and with {"cell": "cell-1"} those of a cell and every robot without one;
             release_torque stops one and switches its motors off, so that it falls, once its operator approved that;
-            move moves an arm (moveTo, or another verb) and returns what it reached; picture returns a camera's
-            picture (getPicture); wait waits for the end of a motion; call calls any verb that peers lists.
-        target: The robot's id, as peers lists it. Needed by all but peers, stop and emergency_stop.
+            move moves an arm (moveTo, or another verb) and returns what it reached; picture returns a camera's picture
+            (getPicture); wait waits for the end of a motion; call calls any verb that peers lists; ping says how fast a
+            robot answers; broadcast asks all for their status, state or features, or stops all, and send asks one, by
+            arguments such as {"action": "status"}.
+        target: The robot's id, as peers lists it. Needed by all but peers, status, broadcast, stop and emergency_stop.
         instruction: What to do, in plain language, 1 to 2000 characters. For emergency_stop: the reason.
         policy_provider: Policy that decides the actions, such as remote or lerobot_local; mock moves by itself and
             follows no instruction.
@@ -107,29 +159,42 @@ def robot_mesh(
             setGripper (opening 0 closed to 1 open), goTo (place), pick (object) or place (x, y, or on). Each
             takes picture, the camera whose picture its answer brings.
         arguments: The verb's arguments by name, such as {"x": 0.25, "y": 0.0, "z": 0.1} or {"camera": "table"}.
+        timeout: Longest wait for an answer, in seconds, above 0 and at most 3600; by default as long as the action
+            needs. A stop ignores it.
     """
     if action == "emergency_stop":
         return _emergency_stop(instruction, arguments)
     if action == "stop":
         return _stop(target, arguments)
     try:
+        if isinstance(action, str) and action in SUBSCRIPTIONS:
+            return error(f"action {action} is none here: {NO_SUBSCRIPTION}.")
         asked = choice("action", action, ACTIONS)
         robot = device_id("target", target) if target or asked in NEEDS_TARGET else ""
+        longest = None if timeout is None else number("timeout", timeout, above=0, high=3600)
+        moving = asked in (*CALLED, "call", "tell", *BODIES)
+        given = mapping("arguments", arguments or {}) if moving else {}
         if asked in CALLED or asked == "call":
             name = identifier("verb", verb or CALLED.get(asked, ""))
-            given = mapping("arguments", {} if arguments is None else arguments)
-            return _with_image(_asked(lambda there: _called(there, robot, name, given)))
+            return _with_image(_asked(lambda there: _called(there, robot, name, given, longest)))
         if asked == "tell":
-            task = {"instruction": instruction, "policy_provider": policy_provider, "duration": duration}
-            given = {**task, **mapping("arguments", {} if arguments is None else arguments)}
-            checked = TASK_VERBS["execute"].checked(given)
-            wanted = {name: checked[name] for name in checked if name in given}
-            return _asked(lambda there: _started(there, robot, wanted))
+            task = {"instruction": instruction, "policy_provider": policy_provider, "duration": duration} | given
+            checked = TASK_VERBS["execute"].checked(task)
+            wanted = {name: checked[name] for name in checked if name in task}
+            return _asked(lambda there: _started(there, robot, wanted, longest))
+        if asked in BODIES:
+            body = dict(given)
+            name = identifier("arguments action", body.pop("action", None))
+            if asked == "broadcast":
+                return _broadcast(name, body, longest)
+            return _with_image(_asked(lambda there: _sent(there, robot, name, body, longest)))
     except ValidationError as refused:
         return error(str(refused))
     if asked == "release_torque":
-        return _asked(lambda there: there.call(robot, "releaseTorque", {}, ANSWER_S))
-    return _asked((lambda there: _status(there, robot)) if asked == "status" else _peers)
+        return _asked(lambda there: there.call(robot, "releaseTorque", {}, longest or ANSWER_S))
+    if asked == "ping":
+        return _asked(lambda there: _pinged(there, robot, longest))
+    return _asked((lambda there: _status(there, robot, longest)) if asked == "status" and robot else _peers)
 
 
 def _peers(there: Networks) -> Envelope:
@@ -157,24 +222,66 @@ def _not_reached(missing: Mapping[str, str]) -> str:
     return f"Not reached: {named}." if named else ""
 
 
-def _status(there: Networks, robot: str) -> Envelope:
+def _status(there: Networks, robot: str, timeout: float | None) -> Envelope:
     network = there.of(robot)
-    return network.call(robot, network.reads["status"], {}, ANSWER_S)
+    return network.call(robot, network.reads["status"], {}, timeout or ANSWER_S)
 
 
-def _started(there: Networks, robot: str, task: Mapping[str, Any]) -> Envelope:
+def _pinged(there: Networks, robot: str, timeout: float | None) -> Envelope:
+    """Say how long the robot takes to answer with its status."""
+    network, began = there.of(robot), time.monotonic()
+    answer = network.call(robot, network.reads["status"], {}, timeout or ANSWER_S)
+    took = round(1000 * (time.monotonic() - began), 1)
+    return answer if is_error(answer) else success(f"{robot} answered in {took:g} ms.", latency_ms=took)
+
+
+def _sent(there: Networks, robot: str, action: str, arguments: Mapping[str, Any], timeout: float | None) -> Envelope:
+    """Send a command by its name on the mesh, whatever the network calls it."""
+    network = there.of(robot)
+    verb = network.starts if action == "start" else network.reads.get(action, action)
+    return _called(there, robot, verb, arguments, timeout)
+
+
+def _broadcast(action: str, arguments: Mapping[str, Any], timeout: float | None) -> Envelope:
+    """Ask every robot; none is moved, because its operator approves each motion."""
+
+    def asked(there: Networks) -> Envelope:
+        found = sorted((name, each) for name, each in there.find(None).items() if not each[0].world)
+        answers = side_by_side(lambda each: _answered(each[0], each[1][1], action, timeout), found)
+        silent = [name for (name, _), answer in zip(found, answers, strict=True) if is_error(answer)]
+        rows = [{"robot_id": name, **answer} for (name, _), answer in zip(found, answers, strict=True)]
+        told = f"{len(rows) - len(silent)} of {len(rows)} robots answered {action}."
+        if silent or not rows:
+            return error(f"{told} No answer: {', '.join(silent) or 'there is no robot'}.", responses=rows)
+        return success(told, responses=rows)
+
+    if action not in BROADCAST or arguments:
+        only = f"arguments action must be {', '.join(BROADCAST)} or stop, alone, for a broadcast, not {shown(action)}"
+        return error(f"{only}: give a motion to each robot by tell or call, so that each asks its own operator.")
+    return _asked(asked)
+
+
+def _answered(robot: str, network: NetworkAdapter, read: str, timeout: float | None) -> Envelope:
+    try:
+        return network.call(robot, network.reads[read], {}, timeout or ANSWER_S)
+    except RefusalError as refusal:
+        return error(said(refusal))
+
+
+def _started(there: Networks, robot: str, task: Mapping[str, Any], timeout: float | None) -> Envelope:
     """Have the robot start a task."""
     network = there.of(robot, "tell", moves=True)
-    return network.call(robot, network.starts, task, ANSWER_S)
+    return network.call(robot, network.starts, task, timeout or ANSWER_S)
 
 
-def _called(there: Networks, robot: str, verb: str, arguments: Mapping[str, Any]) -> Envelope:
+def _called(there: Networks, robot: str, verb: str, arguments: Mapping[str, Any], timeout: float | None) -> Envelope:
     """Call any verb of the robot, and wait as long as it lasts by its description."""
     if verb in advertised.STOPS:
         return there.call(robot, verb, arguments, STOP_S)
     network, described = there.described(robot, verb)
+    within = timeout or CALL_S + (described.lasts_s if described is not None else 0.0)
     try:
-        return network.call(robot, verb, arguments, CALL_S + (described.lasts_s if described is not None else 0.0))
+        return network.call(robot, verb, arguments, within)
     except UnknownVerbError as refusal:
         text = said(refusal)
         return error(text if "Near it: " in text else f"{text.rstrip('.')}.{near_verbs(network, robot, verb)}")
@@ -210,6 +317,8 @@ def _emergency_stop(instruction: object, arguments: object) -> dict[str, Any]:
 
 def _asked(work: Callable[[Networks], Envelope]) -> Envelope:
     """Return what ``work`` answers on networks that are joined; as :func:`_answer`."""
+
+    settings.warn_of_unread()
 
     def joined(there: Networks) -> Envelope:
         there.open()

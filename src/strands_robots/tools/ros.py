@@ -4,14 +4,30 @@ from __future__ import annotations
 
 from typing import Any
 
-from strands_robots.agent_tool import ToolContext, tool
+from strands_robots.agent_tool import ToolContext, fitted_tool
 from strands_robots.ros.actions import ros_action
 
+NAMES = ("name", "topic", "service", "action_name")
+"""Names of strands-robots 0.5 for the one argument that is called name here."""
 
-@tool(context=True)
+
+def _renamed(given: dict[str, Any]) -> dict[str, Any]:
+    """Return arguments by today's names; two names for one thing are refused as one."""
+    named = list(dict.fromkeys(str(given[each]) for each in NAMES if given.get(each)))
+    renamed = {key: value for key, value in given.items() if key not in NAMES}
+    if named:
+        renamed["name"] = " or ".join(named)
+    if renamed.get("type", "") is None:
+        del renamed["type"]
+    if renamed.get("action") == "action_send_goal":
+        renamed["action"] = "action_goal"
+    return renamed
+
+
+@fitted_tool(_renamed, context=True)
 def use_ros(
     action: str,
-    tool_context: ToolContext,
+    tool_context: ToolContext | None = None,
     *,
     name: str = "",
     type: str = "",  # noqa: A002 - ROS calls it so
@@ -47,10 +63,10 @@ def use_ros(
     )
 
 
-@tool(context=True)
+@fitted_tool(_renamed, context=True)
 def use_rtps(
     action: str,
-    tool_context: ToolContext,
+    tool_context: ToolContext | None = None,
     *,
     name: str = "",
     type: str = "",  # noqa: A002 - ROS calls it so
@@ -86,10 +102,10 @@ def use_rtps(
     )
 
 
-@tool(context=True)
+@fitted_tool(_renamed, context=True)
 def use_rosbridge(
     action: str,
-    tool_context: ToolContext,
+    tool_context: ToolContext | None = None,
     *,
     name: str = "",
     type: str = "",  # noqa: A002 - ROS calls it so

@@ -138,6 +138,11 @@ def test_ros_action_lists_and_reads_a_graph_over_dds(tmp_path: Path) -> None:
         eventually(lambda: odom in ros_action("list_topics", domain_id=DOMAIN)["topics"])
         sample = ros_action("echo", name="/odom", domain_id=DOMAIN)["messages"][0]
         assert sample["twist"]["twist"]["linear"] == {"x": 0.0, "y": 0.0, "z": 0.0}
+        for tool in (use_ros, use_rtps):
+            heard = tool(action="echo", topic="/odom", timeout=20.0, domain_id=DOMAIN)
+            assert heard["messages"][0]["twist"]["twist"]["linear"]["x"] == 0.0
+        refused = use_rtps(action="publish", topic="/cmd_vel", type="geometry_msgs/msg/Twist", domain_id=DOMAIN)
+        assert "STRANDS_ROS2_COMMAND_ALLOW" in refused["reason"]
         command = {"name": "/cmd_vel", "type": "geometry_msgs/msg/Twist", "fields": {"linear": {"x": 0.1}}}
         at: dict[str, Any] = {"domain_id": DOMAIN, "tool_context": Operator(True)}
         eventually(lambda: ros_action("publish", **at, **command)["status"] == "success")

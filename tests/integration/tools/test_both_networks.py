@@ -82,6 +82,30 @@ def test_robot_that_is_on_the_mesh_alone_is_found_driven_stopped_and_locked(cell
     assert not cell.moving
 
 
+def test_calls_of_the_older_tool_find_drive_and_stop_robots_of_both_networks(cell: Cell) -> None:
+    cell.serve_on_the_mesh("far-arm")
+    for name in ("arm-1", "far-arm"):
+        assert robot_mesh(action="ping", target=name, timeout=30.0)["latency_ms"] > 0
+        start = '{"action": "start", "policy_provider": "mock", "instruction": "wave", "duration": 300.0}'
+        started = robot_mesh(action="send", target=name, command=start)
+        assert started["status"] == "success", started
+        running = robot_mesh(action="send", target=name, command='{"action": "status"}')
+        assert running["task_status"] == "running", running
+        assert robot_mesh(action="send", target=name, command='{"action": "stop"}')["stopped"] is True
+        misspelt = start.replace("duration", "durration")
+        refused = robot_mesh(action="send", target=name, command=misspelt)
+        assert (refused["status"], "durration" in refused["reason"]) == ("error", True), refused
+    assert robot_mesh(action="rpc", target="arm-1", function="getFeatures")["status"] == "success"
+    assert told("arm-1")["status"] == "success"
+    asked = robot_mesh(action="broadcast", command='{"action": "status"}')
+    assert {row["robot_id"]: row["task_status"] for row in asked["responses"]}.keys() == {"arm-1", "far-arm"}, asked
+    motion = robot_mesh(action="broadcast", command='{"action": "start", "instruction": "wave"}')
+    assert "give a motion to each robot by tell" in motion["reason"]
+    stopped = robot_mesh(action="broadcast", command='{"action": "stop"}')
+    assert (stopped["stopped"], set(stopped["robots"])) == (True, {"arm-1", "far-arm"}), stopped
+    assert not cell.moving
+
+
 def test_robot_of_a_network_that_is_gone_is_named_by_every_stop(cell: Cell) -> None:
     far = cell.serve_on_the_mesh("far-arm")
     assert robot_mesh(action="stop")["status"] == "success"
