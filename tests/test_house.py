@@ -38,6 +38,7 @@ FLOORS: list[set[str]] = [
         "rate_limits",
         "threads",
         "certificates",
+        "moved",
     },
     {"safety", "audit", "adapted", "contract", "verb_declaration", "verb_parameters"},
     {"arm_mixin", "kinematics", "policies", "teleop_mixin", "teleoperators", "recording"},

@@ -5,12 +5,14 @@ Every name is loaded when it is first used, so that the package imports with no 
 
 from __future__ import annotations
 
+import sys
 from importlib import import_module
 
 __version__ = "0.1.0"
 
 TYPE_CHECKING = False  # importing typing would be most of this import's time
 if TYPE_CHECKING:
+    from importlib.machinery import ModuleSpec
     from typing import Any
 
     from strands_robots.fleet import connect
@@ -37,10 +39,10 @@ _SIM_PACKAGES = ("mujoco", "numpy", "PIL")
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     try:
-        return getattr(import_module(_HOMES[name]), name)
+        if name in _HOMES:
+            return getattr(import_module(_HOMES[name]), name)
+        return import_module("strands_robots.moved").moved_name(__name__, name)
     except ModuleNotFoundError as exc:
         if (exc.name or "").partition(".")[0] not in _SIM_PACKAGES:
             raise
@@ -50,3 +52,17 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted(__all__)
+
+
+class _MovedModules:
+    """Finder of modules that strands-robots 0.5 had; asked for what no other finds."""
+
+    @staticmethod
+    def find_spec(path: str, where: object = None, target: object = None) -> ModuleSpec | None:
+        if not path.startswith(f"{__name__}.") or path == f"{__name__}.moved":
+            return None
+        found: ModuleSpec | None = import_module(f"{__name__}.moved").spec_of(path)
+        return found
+
+
+sys.meta_path.append(_MovedModules)

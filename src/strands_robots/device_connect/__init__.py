@@ -77,7 +77,7 @@ _FRAMEWORK = ("device_connect_edge", "device_connect_agent_tools", "zenoh", "nat
 def __getattr__(name: str) -> Any:
     home = _HOMES.get(name)
     if home is None:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return import_module("strands_robots.moved").moved_name(__name__, name)
     try:
         value = getattr(import_module(home), name.lstrip("_"))
     except ModuleNotFoundError as exc:

@@ -16,7 +16,9 @@ __all__ = ["Mesh", "get_local_robots", "init_mesh", "mesh_disabled_by_env"]
 
 def __getattr__(name: str) -> Any:
     if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        from strands_robots.moved import moved_name  # noqa: PLC0415 - the point of this function
+
+        return moved_name(__name__, name)
     from strands_robots.mesh import core  # noqa: PLC0415 - the point of this function
 
     return getattr(core, name)

@@ -447,12 +447,15 @@ class Mesh(SensorLoopsMixin):
     # Publishing and hearing.
 
     def publish(self, key: str, payload: dict[str, Any]) -> None:
-        """Publish an object under a key.
+        """Publish an object under a key; nothing while the peer is not on the mesh.
 
         Raises:
-            TransportError: the mesh is not running or the transport refused.
+            TransportError: the transport refused.
             WireError: JSON cannot hold the payload, or it is above the topic's size.
         """
+        if self._context.transport is None:
+            logger.debug("publish %s: %s is not on the mesh.", key, self.peer_id)
+            return
         self._context.put(key, payload)
 
     def subscribe(

@@ -5,15 +5,19 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
+from strands_robots.moved import getter
 from strands_robots.plug_ins import PlugIns, takes
 from strands_robots.policies.base import Action, Policy, Ranges
 from strands_robots.policies.profiles import Profile, profiles
 from strands_robots.utils import ValidationError, alike, shown
 
 __all__ = ["ALIASES", "Action", "Policy", "Ranges", "create_policy", "policy_names", "resolve_provider"]
+
+if not TYPE_CHECKING:  # a package with a __getattr__ has every name for a type checker
+    __getattr__ = getter(__name__)
 
 ALIASES = {"lerobot": "lerobot_local"}
 

@@ -23,7 +23,7 @@ _EXTRA = ("mujoco", "numpy", "PIL")
 
 def __getattr__(name: str) -> Any:
     if name != "Simulation":
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return import_module("strands_robots.moved").moved_name(__name__, name)
     try:
         # Before another module imports MuJoCo, which would load its default backend as well as the chosen one.
         import_module("strands_robots.simulation.engine")

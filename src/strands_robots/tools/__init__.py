@@ -14,7 +14,7 @@ __all__ = ["robot_mesh", "use_ros", "use_rosbridge", "use_rtps"]
 
 def __getattr__(name: str) -> Any:
     if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return import_module("strands_robots.moved").moved_name(__name__, name)
     # `robot_mesh` replaces the module of the same name, which the import has just bound here.
     module = import_module(f"{__name__}.{'robot_mesh' if name == 'robot_mesh' else 'ros'}")
     tool = globals()[name] = getattr(module, name)

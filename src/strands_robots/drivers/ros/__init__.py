@@ -1,1 +1,8 @@
 """Robots that already live on a ROS graph, behind one drive contract."""
+
+from typing import TYPE_CHECKING
+
+from strands_robots.moved import getter
+
+if not TYPE_CHECKING:  # a package with a __getattr__ has every name for a type checker
+    __getattr__ = getter(__name__)

@@ -18,6 +18,7 @@ from typing import Any, Protocol
 
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.mesh import topics, wire
+from strands_robots.moved import moved_name
 from strands_robots.threads import BoundedExecutor
 
 logger = logging.getLogger(__name__)
@@ -52,7 +53,7 @@ _MODULES = {
 
 def __getattr__(name: str) -> Any:
     if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return moved_name(__name__, name)
     return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
 
 

@@ -1,0 +1,311 @@
+"""Import paths of strands-robots 0.5, and where each name is here.
+
+A package asks :func:`moved_name` for what it does not have, and :func:`spec_of` finds the modules that have another
+name here. Nothing is loaded before it is asked for.
+"""
+
+from __future__ import annotations
+
+import sys
+from importlib import import_module
+
+TYPE_CHECKING = False  # importing typing would be most of this import's time
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from importlib.machinery import ModuleSpec
+    from types import ModuleType
+    from typing import Any
+
+_HERE = "strands_robots"
+
+MODULES = {
+    f"{_HERE}.{old}": f"{_HERE}.{new}"
+    for old, new in {
+        "device_connect.sim_driver": "device_connect.simulation_driver",
+        "drivers.ros._mobile_base": "drivers.ros.mobile_base",
+        "hardware_robot": "hardware",
+        "inference": "policies.remote",
+        "inference.client": "policies.remote",
+        "mesh.transport.base": "mesh.transport",
+        "mesh.transport.bridge_transport": "mesh.transport.bridge",
+        "mesh.transport.iot_transport": "mesh.transport.iot",
+        "mesh.transport.zenoh_transport": "mesh.transport.zenoh",
+        "policies.factory": "policies",
+        "policies.mock": "policies.base",
+        "rosbridge": "ros.rosbridge",
+        "simulation.mujoco": "simulation",
+        "simulation.mujoco.simulation": "simulation",
+        "tools.use_ros": "tools:use_ros",
+        "tools.use_rosbridge": "tools:use_rosbridge",
+        "tools.use_rtps": "tools:use_rtps",
+    }.items()
+}
+"""Modules by their path in 0.5; a tool's module is the tool."""
+
+
+def _names(home: str, package: str, names: str) -> dict[str, str]:
+    return {f"{_HERE}{package and '.'}{package}.{name}": f"{_HERE}.{home}:{name}" for name in names.split()}
+
+
+_ROS_ROBOTS = {
+    "AckermannRosRobot": "drivers.ros.ackermann_robot",
+    "MobileBaseRobot": "drivers.ros.mobile_base",
+    "RosBridgedRobot": "drivers.ros.ros_bridge",
+    "RosbridgeRobot": "drivers.ros.rosbridge_robot",
+    "RtpsRobot": "drivers.ros.rtps_robot",
+}
+_BRIDGES = {"HardwareRosBridge": "hardware_ros_bridge", "HardwareRtpsBridge": "hardware_rtps_bridge"}
+
+NAMES = {
+    **{f"{_HERE}.drivers.ros.{name}": f"{_HERE}.{home}:{name}" for name, home in _ROS_ROBOTS.items()},
+    **{f"{_HERE}.mesh.{name}": f"{_HERE}.{home}:{name}" for name, home in {**_ROS_ROBOTS, **_BRIDGES}.items()},
+    **{f"{_HERE}.{name}": f"{_HERE}.{home}:{name}" for name, home in _BRIDGES.items()},
+    **_names("policies.base", "", "Policy MockPolicy"),
+    **_names("policies", "", "create_policy"),
+    f"{_HERE}.list_providers": f"{_HERE}.policies:policy_names",
+    f"{_HERE}.policies.list_providers": f"{_HERE}.policies:policy_names",
+    f"{_HERE}.policies.factory.list_providers": f"{_HERE}.policies:policy_names",
+    **_names("policies.base", "policies", "MockPolicy"),
+    **_names("tools", "", "robot_mesh use_ros use_rosbridge use_rtps"),
+    **_names(
+        "device_connect",
+        "",
+        "ReachyMiniDriver RobotDeviceDriver SimulationDeviceDriver init_device_connect init_device_connect_sync",
+    ),
+    **_names("mesh.input", "mesh", "InputPublisher InputReceiver"),
+    **_names(
+        "mesh.session",
+        "mesh",
+        "clear_peers current_session get_peers get_session prune_peers put release_session session_alive update_peer",
+    ),
+    **_names("audit", "mesh", "log_safety_event"),
+    f"{_HERE}.mesh.transport.MeshTransport": f"{_HERE}.mesh.transport:Transport",
+    f"{_HERE}.mesh.transport.SubHandle": f"{_HERE}.mesh.transport:Declaration",
+    f"{_HERE}.policies.lerobot_local.LerobotLocalPolicy": f"{_HERE}.policies.lerobot_local:LeRobotPolicy",
+    f"{_HERE}.hardware_robot.Robot": f"{_HERE}.hardware:HardwareRobot",
+    f"{_HERE}.inference.RemotePolicy": f"{_HERE}.policies.remote:RemotePolicy",
+    **{
+        f"{_HERE}.{package}.{name}": f"{_HERE}.simulation:Simulation"
+        for package in ("simulation", "simulation.mujoco", "simulation.mujoco.simulation")
+        for name in ("MuJoCoSimEngine", "MuJoCoSimulation")
+    },
+}
+"""Names by their path in 0.5, each with its module and its name here."""
+
+_KEEPS = "strands-robots 0.5 keeps it"
+_NO_DRIVER = f"{_KEEPS}; a package brings a robot by the entry point strands_robots.robots (docs/own-robots.md)"
+_NO_ROBOT_LIST = (
+    "Robot takes the name of a robot, or the path of an MJCF or URDF file; 'strands-robots peers' lists the live ones"
+)
+_NO_POLICY = f"{_KEEPS}; a package brings a policy by the entry point strands_robots.policies (docs/policies.md)"
+_PRELOADED = "a policy profile is loaded before a robot moves by it (docs/policies.md)"
+_ONE_CLASS = "strands_robots.policies.lerobot_local has one class, LeRobotPolicy, for every type of LeRobot's"
+_PAGE = "'strands-robots dashboard' serves the page of this release"
+_ENGINE = f"{_KEEPS}; the one engine here is strands_robots.Simulation, in MuJoCo"
+_EVALUATE = "'strands-robots eval' and strands_robots.evaluation judge policies by task"
+_TRAIN = f"{_KEEPS}; train with LeRobot and run the checkpoint by policy_provider lerobot_local"
+_LEROBOT = "LeRobot's own commands do it"
+_RECORD = (
+    "'strands-robots record' writes the events of a device into an MCAP file, which strands_robots.recording reads"
+)
+_STREAM = f"{_KEEPS}; LeRobot's StreamingLeRobotDataset reads a dataset from the Hub"
+_TELEOP = "'strands-robots teleop' leads an arm; strands_robots.teleoperators has keyboards, gamepads and recordings"
+_TRANSPORT = "STRANDS_MESH_BACKEND chooses the transport, and init_mesh opens it"
+_ARM_VERBS = "the verbs moveJoints, moveTo and goTo move an arm, in simulation and real"
+_REACHY = f"{_KEEPS}; ReachyMiniDriver has the verbs of this release (docs/reachy-mini.md)"
+_DDS = "strands_robots.tools.use_rtps speaks DDS, and strands_robots.ros.dds is its link"
+
+_INSTEAD = (
+    ("", "assets registry get_robot is_discoverable list_discoverable list_robots list_urdf_only", _NO_ROBOT_LIST),
+    ("", "download_assets", "Robot finds its built-in models without a download; any other is given by its path"),
+    ("", "create_simulation list_backends register_backend", _ENGINE),
+    ("", "SimCamera SimObject SimRobot SimWorld", "strands_robots.Simulation names robots, objects and cameras"),
+    ("", "list_policy_types", "strands_robots.policies.policy_names lists the policies"),
+    ("", "register_policy", _NO_POLICY),
+    ("", "Teleoperator teleoperator lerobot_teleoperate", _TELEOP),
+    ("", "teleop", f"{_KEEPS}; {_TELEOP}"),
+    ("", "training lerobot_train train_policy", _TRAIN),
+    ("", "StreamingDatasetReader stream_dataset streaming_dataset dataset_source dataset_metadata", _STREAM),
+    ("", "sync_dataset_to_bucket dataset_transfer", f"{_KEEPS}; hf upload puts a dataset on the Hub"),
+    ("", "dataset_recorder recorder recording_errors", _RECORD),
+    ("", "verify_dataset episode_labels", f"{_KEEPS}; {_LEROBOT}"),
+    ("", "run_policy", "robot.start_task and the verb execute run a policy"),
+    ("", "pose_tool", _ARM_VERBS),
+    ("", "lerobot_camera", "the verb getPicture takes a picture"),
+    ("", "serial_tool use_lerobot", f"{_KEEPS}; 'strands-robots calibrate' and 'strands-robots doctor' look at an arm"),
+    ("", "harness_memory", _KEEPS),
+    ("", "create_judge_agent load_episode sample_frames read_predicate_verdict write_label", _EVALUATE),
+    ("", "foxglove", f"{_KEEPS}; Foxglove opens the MCAP files of 'strands-robots record'"),
+    ("", "rendering locomotion_envelope hardware_observe refusal_codes", _KEEPS),
+    ("", "rtps", _DDS),
+    ("", "doctor", "the command is 'strands-robots doctor'"),
+    ("", "__main__", "the command is 'strands-robots', or python -m strands_robots.cli"),
+    ("inference", "PolicyServer server protocol", f"{_KEEPS}; policy_provider remote, openpi and groot ask a server"),
+    ("device_connect", "resolve_allow_insecure", "init_device_connect reads DEVICE_CONNECT_ALLOW_INSECURE"),
+    (
+        "drivers",
+        "DRIVER_SURFACE HardwareDriver constructor_keywords drifted_driver_parameters driver_choice_error "
+        "get_native_driver_class halt_failure_detail list_driver_coverage list_native_drivers missing_driver_members "
+        "port_kind register_native_driver resolve_driver shipped_robot_names base booster cameras composite crazyflie "
+        "dynamixel earthrover feetech franka g1 go2 kinova kuka kuka_session microduck rby1 registry robotiq rollout "
+        "spot stretch unitree ur xarm yahboom_m3pro yahboom_m3pro_twin yahboom_m3pro_wire",
+        _NO_DRIVER,
+    ),
+    ("drivers", "reachy_doa reachy_envelope reachy_look_at reachy_media reachy_vocabulary", _REACHY),
+    (
+        "drivers.ros",
+        "ActionCapable ServiceCapable Transport",
+        "strands_robots.ros.link has the links of this release: RosLink, GoalLink",
+    ),
+    ("mesh", "iot", f"{_KEEPS}; STRANDS_MESH_BACKEND=iot joins with a thing that is provisioned already"),
+    ("mesh", "pacing", "the mesh paces itself (docs/mesh.md)"),
+    ("mesh.transport", "get_transport release_transport current_transport current_backend", _TRANSPORT),
+    ("mesh.transport", "DIRECT_REASONS DirectResult DirectSender", "Mesh.ping says whether an answer was direct"),
+    (
+        "policies",
+        "ChunkedPolicy Cosmos3Policy CompositePolicy align_action_values chunk_count_error composite "
+        "construction_failure_keeps_its_raise cosmos3 curobo flux3_action holosoma import_policy_class "
+        "isaaclab_actuator_pd kimodo list_aliases list_policy_types microduck moveit2 policy_mapping_error "
+        "policy_object_error policy_overrides_preflight policy_provider_error preflight_policy preflight_reason "
+        "protomotions register_policy required_bodies_error resolve_chunk_length rl rsl_rl_onnx wbc wbc_latent",
+        _NO_POLICY,
+    ),
+    ("policies", "PersistentPolicy evict list_cached persistent", _PRELOADED),
+    ("policies.lerobot_local", "clear_model_cache list_cached_models", _PRELOADED),
+    ("policies.lerobot_local", "embodiment list_policy_types molmoact2 policy processor resolution", _ONE_CLASS),
+    ("policies", "UntrustedRemoteCodeError", "no policy of this release runs code of a checkpoint"),
+    (
+        "simulation",
+        "ActionResolution IsaacConfig IsaacSimulation LegacyHookOutcome SimEngine SimStatus SpecBuilder base "
+        "capabilities create_simulation factory ik isaac list_backends mjlab model_registry models "
+        "motion_primitives_base newton obs_noise policy_runner recording register_backend safe_output seeds terrain "
+        "tool_frame video_config",
+        _ENGINE,
+    ),
+    ("simulation", "SimCamera SimObject SimRobot SimWorld", "Simulation names robots, objects and cameras"),
+    (
+        "simulation",
+        "list_available_models list_registered_urdfs register_urdf resolve_model resolve_urdf",
+        "Simulation.add_robot takes the path of an MJCF or URDF file",
+    ),
+    (
+        "simulation",
+        "RunPolicyEnded RunPolicyEvent RunPolicyObserver RunPolicyOutcome RunPolicyStarted RunPolicyStep StoppedReason "
+        "TrajectoryStep observers",
+        "Simulation.subscribe gives a strands_robots.contract.RolloutEvent",
+    ),
+    (
+        "simulation",
+        "BenchmarkCompatibilityError BenchmarkProtocol DeclarativeBenchmark PREDICATE_REGISTRY StepInfo benchmark "
+        "benchmark_spec builtin_benchmark_specs builtin_benchmarks get_benchmark list_benchmarks make_predicate "
+        "predicates register_benchmark register_benchmark_from_file register_builtin_benchmarks register_predicate "
+        "task_objects unregister_benchmark",
+        _EVALUATE,
+    ),
+    (
+        "simulation.mujoco",
+        "backend divergence manipulation motion_primitives physics randomization recording rendering scene_ops "
+        "spec_builder wire_surface",
+        _ENGINE,
+    ),
+    ("tools", "download_assets", _NO_ROBOT_LIST),
+    ("tools", "episode_judge", _EVALUATE),
+    ("tools", "harness_memory g1", _KEEPS),
+    ("tools", "lerobot_camera", "the verb getPicture takes a picture"),
+    ("tools", "lerobot_teleoperate", _TELEOP),
+    ("tools", "lerobot_train train_policy", _TRAIN),
+    ("tools", "pose_tool", _ARM_VERBS),
+    ("tools", "reachy", "robot_mesh and the MCP server call the verbs of a Reachy Mini (docs/agents.md)"),
+    ("tools", "run_policy", "robot.start_task and the verb execute run a policy"),
+    ("tools", "serial_tool use_lerobot", f"{_KEEPS}; {_LEROBOT}"),
+    (
+        "dashboard",
+        "agent_console agent_hitl agent_motion argv_exposure arm_roles artifact_check auth build_info bus_claim "
+        "calibration calibration_run camera_liveness cameras checkpoints churn_guard cli config_api consent "
+        "dataset_check deploy device_manager direct_serial disk_headroom env_install episode_label_view fleet "
+        "health_ingest joint_silence lan_hint log_redaction mesh_bridge mirror output_dir_check peer_policies "
+        "peer_tools policy_fit record_api record_crash record_joints record_motion record_worker refusals routes_agent "
+        "routes_auth routes_config routes_consent routes_devices routes_env routes_mesh routes_record routes_sim "
+        "routes_train routes_voice safety_state scene settings sim_session task_timeout teleop_health training "
+        "ttl_cache upload_preflight validate_scope voice ws_observability",
+        _PAGE,
+    ),
+)
+
+GONE = {
+    f"{_HERE}{package and '.'}{package}.{name}": instead
+    for package, names, instead in _INSTEAD
+    for name in names.split()
+}
+"""What is not here, by its path in 0.5, and what to use instead. A package stands for what is in it."""
+
+
+def moved_name(package: str, name: str) -> Any:
+    """Return what was called ``name`` in a package of 0.5.
+
+    Raises:
+        AttributeError: there is nothing of that name; what was there says what to use instead.
+    """
+    path = f"{package}.{name}"
+    if path in NAMES:
+        home, _, new = NAMES[path].partition(":")
+        return getattr(import_module(home), new)
+    raise AttributeError(_sentence(path) or f"module {package!r} has no attribute {name!r}")
+
+
+def getter(package: str) -> Callable[[str], Any]:
+    """Return the ``__getattr__`` of a package that has no other names."""
+    return lambda name: moved_name(package, name)
+
+
+def spec_of(path: str) -> ModuleSpec | None:
+    """Return the spec of a module of 0.5 that has another name here, or None.
+
+    Raises:
+        ImportError: it is not here, with what to use instead. ``from package import name`` asks for a module, too.
+    """
+    if path in MODULES:
+        from importlib.machinery import ModuleSpec  # noqa: PLC0415 - importing this module costs next to nothing
+
+        loader: Any = _MovedModule
+        return ModuleSpec(path, loader, is_package=_has_names(path))
+    sentence = _sentence(path)
+    if sentence is None:
+        return None
+    raise ImportError(sentence)
+
+
+class _MovedModule:
+    """Loader of a module that has another name here."""
+
+    @staticmethod
+    def create_module(spec: ModuleSpec) -> None:
+        return None
+
+    @staticmethod
+    def exec_module(module: ModuleType) -> None:
+        path = module.__name__
+        home, _, name = MODULES[path].partition(":")
+        here: Any = import_module(home)
+        if name:
+            tool: Any = getattr(here, name)
+            vars(tool)[name] = tool
+            sys.modules[path] = tool
+        elif not _has_names(path):
+            # The module itself, so that what a program sets in it is set here.
+            sys.modules[path] = here
+        else:
+
+            def moved_or_here(asked: str) -> Any:
+                stated = f"{path}.{asked}" in (*NAMES, *GONE) or asked.startswith("__")
+                return getattr(here, asked) if not stated and hasattr(here, asked) else moved_name(path, asked)
+
+            vars(module)["__getattr__"] = moved_or_here
+
+
+def _has_names(path: str) -> bool:
+    return any(each.startswith(f"{path}.") for each in (*NAMES, *GONE, *MODULES))
+
+
+def _sentence(path: str) -> str | None:
+    return None if path not in GONE else f"{path} is not in this release: {GONE[path]}."
