@@ -9,9 +9,10 @@ from types import MappingProxyType
 from typing import Any, Literal
 
 from strands_robots.contract import Haltable, Robot, holds_robots
-from strands_robots.envelope import Envelope, RefusalReason, Refused, is_error
+from strands_robots.envelope import Envelope, RefusalReason, Refused, error, is_error
 from strands_robots.mesh import topics, wire
 from strands_robots.mesh.estop_retry import ESTOP
+from strands_robots.mesh.former_actions import FORMER, as_verb
 from strands_robots.mesh.session import Context
 from strands_robots.mesh.transport import Sample, TransportError
 from strands_robots.mesh.wire_identity import MOTION, IdentityError
@@ -200,7 +201,8 @@ class CommandReceiver:
         action = request.command.get("action") if isinstance(request.command, dict) else None
         verb = self._verbs.get(action) if isinstance(action, str) else None
         if verb is None:
-            self._refuse_unknown(request, action)
+            verb = self._verb_of_former(request, action)
+        if verb is None:
             return
         if verb.kind is Kind.STOP:
             self._lock_first(request, sample)
@@ -233,6 +235,19 @@ class CommandReceiver:
             self._retained_at = now
             name = self._context.peer_id
             logger.warning("%s: %s of %s on %s is refused: %s.", name, shown(action), request.sender_id, key, RETAINED)
+
+    def _verb_of_former(self, request: wire.Request, action: object) -> Verb | None:
+        """Return the verb that an action of a 0.5 release means, or refuse the command."""
+        if not isinstance(action, str) or action not in FORMER:
+            self._refuse_unknown(request, action)
+            return None
+        try:
+            request.command = as_verb(request.command, self._verbs)
+        except ValidationError as exc:
+            self._reply(request.sender_id, request.turn_id, result=error(str(exc)))
+            self._context.audit("command_refused", request.sender_id, action=action, reason=str(exc))
+            return None
+        return self._verbs[request.command["action"]]
 
     def _refuse_unknown(self, request: wire.Request, action: object) -> None:
         if not isinstance(request.command, dict):

@@ -9,9 +9,10 @@ from __future__ import annotations
 from typing import Any
 
 from strands_robots import settings
+from strands_robots.mesh.former_actions import FORMER, checked_former
 from strands_robots.serving.peer_verbs import PEER_VERBS
 from strands_robots.serving.verbs import Kind
-from strands_robots.utils import ValidationError, identifier, mapping, number, peer_id, shown
+from strands_robots.utils import ValidationError, finite, identifier, mapping, number, peer_id, shown
 
 __all__ = [
     "ValidationError",
@@ -46,7 +47,8 @@ def validate_command(command: object) -> dict[str, Any]:
     """Return the command with defaults filled in and unknown keys dropped.
 
     Args:
-        command: an object with ``action`` and that action's fields.
+        command: an object with ``action`` and that action's fields. A ``call`` of 0.5 is returned as it is: its
+            receiver checks the arguments.
 
     A stop is refused for none of its fields: what cannot be read is dropped, which stops more. A resume's assertion
     is passed on unchanged: the check of its signature counts refusals.
@@ -57,6 +59,9 @@ def validate_command(command: object) -> dict[str, Any]:
     given = mapping("command", command)
     action = given.get("action")
     verb = PEER_VERBS.get(action) if isinstance(action, str) else None
+    if isinstance(action, str) and action in FORMER:
+        finite("command", given)
+        return checked_former(given)
     if verb is None:
         raise ValidationError(f"action must be one of {', '.join(PEER_VERBS)}, not {shown(action)}.")
     if verb.kind is Kind.STOP:
