@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 from typing import Any
 
 import pytest
+from fixtures.waiting import free_port
 
 from strands_robots.envelope import Envelope, success
 from strands_robots.tools import use_ros, use_rosbridge, use_rtps
@@ -74,3 +76,20 @@ def test_action_that_is_none_here_says_what_to_use(action: str, instead: str) ->
 def test_argument_that_no_version_has_is_refused_by_name() -> None:
     with pytest.raises(TypeError, match="hz"):
         use_ros(action="echo", topic="/odom", hz=3)
+
+
+@pytest.mark.parametrize("first", ["strands_robots.tools", "strands_robots.tools.{}"])
+@pytest.mark.parametrize("name", ["robot_mesh", "use_ros", "use_rosbridge", "use_rtps"])
+def test_both_ways_to_import_a_tool_give_the_same(name: str, first: str) -> None:
+    code = (
+        f"from {first.format(name)} import {name} as one\n"
+        f"from strands_robots.tools.{name} import {name} as two\n"
+        f"from strands_robots.tools import {name} as three\n"
+        "assert one is two is three and callable(one)\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=100)
+
+
+def test_goal_without_a_server_is_an_error_and_no_exception() -> None:
+    answer = use_rosbridge(action="action_send_goal", action_name="/go", type="p/Go", port=free_port(), timeout=1.0)
+    assert answer["reason"].startswith("No connection to rosbridge at ")

@@ -208,7 +208,8 @@ class RosbridgeLink:
         try:
             self._session.send(frame)
         except BaseException:
-            del self._goals[key]
+            # A connection that was lost, or not there, has ended its goals already.
+            self._goals.pop(key, None)
             raise
         return sent
 
@@ -404,7 +405,7 @@ class RosbridgeLink:
             if feedback is not None and isinstance(values, dict):
                 feedback(values)
             return
-        del self._goals[str(key)]
+        self._goals.pop(str(key), None)
         if message.get("result") is False:
             # Only what happens before the server has taken a goal, or after it has ended, is answered so.
             goal.reject(f"{message.get('action')} did not take the goal: {shown(values)}")

@@ -186,7 +186,7 @@ def robot_mesh(
             body = dict(given)
             name = identifier("arguments action", body.pop("action", None))
             if asked == "broadcast":
-                return _broadcast(name, body, longest)
+                return _broadcast(name, longest)
             return _with_image(_asked(lambda there: _sent(there, robot, name, body, longest)))
     except ValidationError as refused:
         return error(str(refused))
@@ -242,7 +242,7 @@ def _sent(there: Networks, robot: str, action: str, arguments: Mapping[str, Any]
     return _called(there, robot, verb, arguments, timeout)
 
 
-def _broadcast(action: str, arguments: Mapping[str, Any], timeout: float | None) -> Envelope:
+def _broadcast(action: str, timeout: float | None) -> Envelope:
     """Ask every robot; none is moved, because its operator approves each motion."""
 
     def asked(there: Networks) -> Envelope:
@@ -255,8 +255,8 @@ def _broadcast(action: str, arguments: Mapping[str, Any], timeout: float | None)
             return error(f"{told} No answer: {', '.join(silent) or 'there is no robot'}.", responses=rows)
         return success(told, responses=rows)
 
-    if action not in BROADCAST or arguments:
-        only = f"arguments action must be {', '.join(BROADCAST)} or stop, alone, for a broadcast, not {shown(action)}"
+    if action not in BROADCAST:
+        only = f"arguments action must be {', '.join(BROADCAST)} or stop for a broadcast, not {shown(action)}"
         return error(f"{only}: give a motion to each robot by tell or call, so that each asks its own operator.")
     return _asked(asked)
 
