@@ -435,3 +435,12 @@ def test_oldest_records_beyond_the_bound_are_replaced_by_their_count(
     lost = sum(each["payload"]["lost"] for each in records if each["event"] == "audit_records_lost")
     assert lost + sum(each["event"] == "e" for each in records) == 30
     assert records[-1]["payload"] == {"n": 29}
+
+
+def test_records_of_the_older_package_are_checked_by_their_signatures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As strands-robots 0.5 wrote it: no chain, and the signature over the sorted compact rest."""
+    monkeypatch.setenv("STRANDS_MESH_AUDIT_PSK", "s")
+    signed = "e0a0bf7a022a7026d76b404a984c8e0db6de19f52b8961ffefcc228a45efa424"
+    record = {"event": "emergency_stop", "peer_id": "arm-1", "seq": 1, "sig": signed, "ts": 1795745865.2665324}
+    assert verify_audit_integrity([{**record, "payload": {"n": 0, "t": "é"}}])["ok"]
+    assert not verify_audit_integrity([{**record, "payload": {"n": 1, "t": "é"}}])["ok"]
