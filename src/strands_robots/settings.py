@@ -297,7 +297,7 @@ UNREAD: dict[str, str] = {
         (
             "STRANDS_MESH_HITL_ACTIONS STRANDS_POSE_COMMAND_ALLOW STRANDS_DASH_TASK_REQUIRES_CONFIRM "
             "STRANDS_DASH_AGENT_PHYSICAL_MOTION",
-            "Real hardware moves for the verbs of STRANDS_ROBOT_COMMAND_ALLOW and for one-time grants alone.",
+            "Motions of real hardware are approved at the robot: STRANDS_ROBOT_COMMAND_ALLOW, or a one-time grant.",
         ),
         (
             "STRANDS_ROBOT_MESH_AGENT_ID DEVICE_CONNECT_CLIENT_ID",
@@ -306,7 +306,10 @@ UNREAD: dict[str, str] = {
         ("STRANDS_DASH_MOTION_GRANT_TTL_S", "A grant lives for 300 s; strands-robots grant --for states another time."),
         ("STRANDS_SERIAL_COMMAND_ALLOW", "No tool here writes to a serial bus; a robot's verbs do."),
         ("STRANDS_UNITREE_COMMAND_ALLOW", "No driver of these robots is here; a driver of your own brings its verbs."),
-        ("STRANDS_TRUST_REMOTE_CODE", "Code of a checkpoint is never run; serve such a policy as provider remote."),
+        (
+            "STRANDS_TRUST_REMOTE_CODE",
+            "Code of a checkpoint is never run; serve such a policy elsewhere and ask it by policy_provider remote.",
+        ),
         # Device Connect.
         ("NATS_TLS_CA_FILE", "Set MESSAGING_TLS_CA_FILE."),
         ("NATS_TLS_CERT_FILE", "Set MESSAGING_TLS_CERT_FILE."),
@@ -328,7 +331,7 @@ UNREAD: dict[str, str] = {
         ),
         (
             "STRANDS_MESH_RESUME_REPLAY_CACHE_MAX",
-            "A robot remembers 4096 resumes, and every epoch it was resumed from.",
+            "A robot remembers the last 4096 resumes.",
         ),
         (
             "STRANDS_MESH_CMD_RATE_HZ STRANDS_MESH_SAFETY_RATE_HZ",

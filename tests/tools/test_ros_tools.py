@@ -11,6 +11,7 @@ from fixtures.waiting import free_port
 
 from strands_robots.envelope import Envelope, success
 from strands_robots.tools import use_ros, use_rosbridge, use_rtps
+from strands_robots.utils import ValidationError
 
 TOOLS = [use_ros, use_rosbridge, use_rtps]
 
@@ -76,6 +77,20 @@ def test_action_that_is_none_here_says_what_to_use(action: str, instead: str) ->
 def test_argument_that_no_version_has_is_refused_by_name() -> None:
     with pytest.raises(TypeError, match="hz"):
         use_ros(action="echo", topic="/odom", hz=3)
+
+
+@pytest.mark.parametrize("tool", TOOLS)
+def test_command_of_an_agent_with_a_misspelt_argument_is_not_sent(asked: list[dict[str, Any]], tool: Any) -> None:
+    given = {"action": "publish", "topic": "/cmd_vel", "type": "geometry_msgs/msg/Twist", "cuont": 5}
+    with pytest.raises(ValidationError, match=r"publish takes name, .*, not 'cuont'"):
+        tool.stream({"toolUseId": "1", "name": tool.tool_name, "input": given}, {"agent": None})
+    assert asked == []
+
+
+async def test_read_of_an_agent_ignores_what_it_does_not_take(asked: list[dict[str, Any]]) -> None:
+    use = {"toolUseId": "1", "name": "use_rtps", "input": {"action": "echo", "name": "/odom", "hz": 3}}
+    assert [event async for event in use_rtps.stream(use, {"agent": None})]
+    assert asked[0]["name"] == "/odom"
 
 
 @pytest.mark.parametrize("first", ["strands_robots.tools", "strands_robots.tools.{}"])

@@ -6,13 +6,26 @@ from typing import Any
 
 from strands_robots.agent_tool import ToolContext, fitted_tool
 from strands_robots.ros.actions import ros_action
+from strands_robots.utils import ValidationError, shown
 
 NAMES = ("name", "topic", "service", "action_name")
 """Names of strands-robots 0.5 for the one argument that is called name here."""
 
 
-def _renamed(given: dict[str, Any]) -> dict[str, Any]:
-    """Return arguments by today's names; two names for one thing are refused as one."""
+COMMANDS = ("publish", "service_call", "action_goal")
+TAKES = ("action", "tool_context", "name", "type", "fields", "count", "rate", "timeout")
+
+
+def _renamed(given: dict[str, Any], *more: str) -> dict[str, Any]:
+    """Return arguments by today's names; two names for one thing are refused as one.
+
+    Args:
+        given: as they came.
+        more: the tool's arguments besides :data:`TAKES`.
+
+    Raises:
+        ValidationError: an argument that a command would not read.
+    """
     named = list(dict.fromkeys(str(given[each]) for each in NAMES if given.get(each)))
     renamed = {key: value for key, value in given.items() if key not in NAMES}
     if named:
@@ -21,10 +34,14 @@ def _renamed(given: dict[str, Any]) -> dict[str, Any]:
         del renamed["type"]
     if renamed.get("action") == "action_send_goal":
         renamed["action"] = "action_goal"
+    takes = (*TAKES, *more)
+    unknown = ", ".join(shown(key) for key in renamed if key not in takes)
+    if unknown and renamed.get("action") in COMMANDS:
+        raise ValidationError(f"{renamed['action']} takes {', '.join(takes[2:])}, not {unknown}.")
     return renamed
 
 
-@fitted_tool(_renamed, context=True)
+@fitted_tool(lambda given: _renamed(given, "domain_id"), context=True)
 def use_ros(
     action: str,
     tool_context: ToolContext | None = None,
@@ -63,7 +80,7 @@ def use_ros(
     )
 
 
-@fitted_tool(_renamed, context=True)
+@fitted_tool(lambda given: _renamed(given, "domain_id"), context=True)
 def use_rtps(
     action: str,
     tool_context: ToolContext | None = None,
@@ -102,7 +119,7 @@ def use_rtps(
     )
 
 
-@fitted_tool(_renamed, context=True)
+@fitted_tool(lambda given: _renamed(given, "host", "port"), context=True)
 def use_rosbridge(
     action: str,
     tool_context: ToolContext | None = None,
