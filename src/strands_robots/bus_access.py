@@ -10,9 +10,14 @@ import math
 import threading
 import weakref
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from strands_robots.moved import of_module
 from strands_robots.policies.base import numbers
+
+if not TYPE_CHECKING:
+    __path__, __getattr__ = of_module(__name__)
+
 
 NESTING_MAX = 4
 """Wrappers around wrappers that are looked through."""

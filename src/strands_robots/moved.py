@@ -79,6 +79,9 @@ NAMES = {
         "clear_peers current_session get_peers get_session prune_peers put release_session session_alive update_peer",
     ),
     **_names("audit", "mesh", "log_safety_event"),
+    f"{_HERE}.mesh.resume_authority.generate_signing_key": f"{_HERE}.mesh.resume_authority:keygen",
+    **_names("safety.orders", "mesh.resume_authority", "new_epoch"),
+    **_names("ros.gate", "ros", "CommandGate"),
     f"{_HERE}.mesh.transport.MeshTransport": f"{_HERE}.mesh.transport:Transport",
     f"{_HERE}.mesh.transport.SubHandle": f"{_HERE}.mesh.transport:Declaration",
     f"{_HERE}.policies.lerobot_local.LerobotLocalPolicy": f"{_HERE}.policies.lerobot_local:LeRobotPolicy",
@@ -113,6 +116,12 @@ _TELEOP = "'strands-robots teleop' leads an arm; strands_robots.teleoperators ha
 _TRANSPORT = "STRANDS_MESH_BACKEND chooses the transport, and init_mesh opens it"
 _ARM_VERBS = "the verbs moveJoints, moveTo and goTo move an arm, in simulation and real"
 _REACHY = f"{_KEEPS}; ReachyMiniDriver has the verbs of this release (docs/reachy-mini.md)"
+_BOUNDS = "its value is in docs/reference.md, with the settings and bounds of this release"
+_CHECKED = "strands_robots.mesh.security has the checks of this release: validate_command, validate_input_frame"
+_SIGNED = "strands_robots.mesh.resume_authority has keygen, load_signing_key, sign and ResumeVerifier"
+_IDENTITY = "strands_robots.mesh.wire_identity has an Identity, which signs and verifies"
+_APPROVAL = "strands_robots.safety.authorization decides who may move a robot"
+_OWN_HELPER = f"{_KEEPS} for itself, and programs have their own"
 _DDS = "strands_robots.tools.use_rtps speaks DDS, and strands_robots.ros.dds is its link"
 
 _INSTEAD = (
@@ -156,6 +165,96 @@ _INSTEAD = (
         "drivers.ros",
         "ActionCapable ServiceCapable Transport",
         "strands_robots.ros.link has the links of this release: RosLink, GoalLink",
+    ),
+    (
+        "mesh.core",
+        "BROADCAST_RESPONDER CMD_PACE_MARGIN_S MAX_DEGRADED_DETAIL_LEN RESUME_FORWARD_SKEW_S "
+        "RESUME_FRESHNESS_WINDOW_S RESUME_REPLAY_CACHE_MAX SIM_CALL_MAX_IMAGE_BYTES SIM_CALL_MAX_TEXT_CHARS",
+        _BOUNDS,
+    ),
+    (
+        "mesh.core",
+        "PERMISSIVE_ACL_REFUSAL WIRE_MOTION_ACTIONS WIRE_MOTION_ALLOW_ENV WireSource allow_match remote_motion_refusal",
+        _APPROVAL,
+    ),
+    ("mesh.input", "INPUT_AUDIT_EVERY_DEFAULT INPUT_MAX_HZ_DEFAULT", _BOUNDS),
+    (
+        "mesh.resume_authority",
+        "ASSERTION_VERSION MAX_TARGETS PASSPHRASE_MIN_CLASSES PASSPHRASE_MIN_DISTINCT PASSPHRASE_MIN_LEN "
+        "PUBLIC_KEY_ENV SIGNING_KEY_FILE_ENV check_assertion is_epoch passphrase_problem public_key_text "
+        "sign_assertion signing_key_path verify_keys",
+        _SIGNED,
+    ),
+    (
+        "mesh.security",
+        "ALLOWED_ACTIONS INPUT_ENVELOPE_FULL_SCALES INPUT_FULL_SCALE_BY_NORM_MODE LOCKOUT_ADMITTED_ACTIONS "
+        "LockoutError MAX_CALL_NAME_LEN MAX_CALL_PARAMS_BYTES MAX_DC_RPC_FUNC_LEN MAX_DC_RPC_PARAMS_BYTES "
+        "MAX_DURATION_S MAX_INPUT_FRAME_KEYS MAX_INPUT_KEY_LEN MAX_INPUT_SLEW_ABS MAX_INPUT_VALUE_ABS "
+        "MAX_INSTRUCTION_LEN MAX_MODEL_PATH_LEN MAX_PASSTHROUGH_LEN MAX_PEER_ID_LEN MAX_RESUME_ASSERTION_BYTES "
+        "MAX_SERVER_ADDRESS_LEN MAX_SIM_CALL_NAME_LEN MAX_SIM_CALL_PARAMS_BYTES MAX_TARGET_JOINTS "
+        "MAX_WORLD_UPDATE_BYTES SIM_CALL_DENIED_ACTIONS SIM_CALL_DENIED_PARAMS SIM_CALL_RAIL_FOR SecurityError "
+        "as_wire_timestamp input_frame_slew_violation input_value_abs_by_key is_safe_model_path is_safe_policy_host "
+        "is_safe_policy_provider is_safe_policy_type is_safe_server_address merge_slew_baseline "
+        "sim_call_allowed_actions sim_call_allowed_params sim_call_published_actions sim_call_published_params "
+        "validate_device_rpc",
+        _CHECKED,
+    ),
+    (
+        "mesh.session",
+        "CAMERA_HZ FALLBACK_MODE_DEFAULT FALLBACK_RETRY HAND_HZ HEALTH_HZ HEARTBEAT_HZ IMU_HZ LIDAR_STATE_HZ "
+        "LIDAR_SUMMARY_HZ MAP_INFO_HZ MAX_PEERS_DEFAULT ODOM_HZ PEER_RETENTION_DEFAULT POSE_HZ STATE_HZ STREAM_HZ "
+        "hz_from_env stream_min_period_from_env",
+        _BOUNDS,
+    ),
+    ("mesh.session", "peer_count peer_is_physical", "get_peers lists the peers, each with its type"),
+    ("mesh.session", "zenoh_backend_missing", "'strands-robots doctor' says what is not installed"),
+    ("mesh.transport.factory", "current_backend current_transport get_transport release_transport", _TRANSPORT),
+    (
+        "mesh.wire_identity",
+        "MAX_CERT_DER_BYTES REQUIRE_ENV ReplayGuard SIG_FIELD TrustRoots WireIdentity cn_speaks_for sign "
+        "signing_required verify",
+        _IDENTITY,
+    ),
+    ("bus_access", "motor_norm_modes read_observation write_action", "bus_access has read_joints and write_joints"),
+    (
+        "drivers.reachy_transport",
+        "HardwareLink ImuCallback JointsCallback identity_pose resolve_host rpy_to_pose",
+        _REACHY,
+    ),
+    (
+        "policies.base",
+        "ChunkedPolicy align_action_values chunk_count_error collect_required_bodies instruction_not_read_notice "
+        "iter_policy_tree provider_policy_class required_bodies_error resolve_chunk_length",
+        _NO_POLICY,
+    ),
+    ("drivers.reachy", "DEFAULT_API_PORT", "the api_port of ReachyMiniDriver is 8000 by default"),
+    ("ros", "GATE_TOOL never_gated", "strands_robots.ros.gate asks the operator"),
+    ("ros_telemetry", "ROS2_INSECURE_ENV ROS2_SYSTEM_INSTALL_HINT", _BOUNDS),
+    ("teleop_mixin", "AttachedTeleop", _OWN_HELPER),
+    (
+        "audit",
+        "AuditPSKDegradedError",
+        "log_safety_event never raises; what is not on the disk is logged as CRITICAL",
+    ),
+    (
+        "utils",
+        "base_dir_path boolean_flag_error camera_name_error dds_domain_id_error did_you_mean entity_name_error "
+        "finite_number_error finite_vector_error get_assets_dir get_base_dir get_search_paths is_boolean log_safe "
+        "non_negative_count_error non_negative_whole_number_error partial_construction_repr positive_count_error "
+        "positive_finite_number_error positive_whole_number_error refusal_repr refusal_str require_optional "
+        "require_optionals resolve_asset_path safe_join tcp_port_error torch_device_error "
+        "BOOLEAN_VECTOR_REASON BUCKET_STREAMING_MIN_LEROBOT CREDENTIAL_KEY_WORDS DEFAULT_BASE_DIR "
+        "FREE_CAMERA_TOKENS LEROBOT_UPGRADE MAX_DDS_DOMAIN_ID MAX_ZMQ_TIMEOUT_MS MIN_QUATERNION_NORM "
+        "RGBA_ACCEPTED_LENGTHS RGBA_LAYOUT camera_fov_error camera_schema_key camera_token_error "
+        "coerce_orientation_quaternion coerce_pose_vector coerce_rgba coerce_size_vector coerce_zmq_timeout_ms "
+        "declared_count effective_episode_count ensure_lerobot_family_registered ensure_lerobot_plugins_registered "
+        "episode_subset_budget_error free_camera_routing_rank is_credential_key lerobot_floor_error "
+        "lerobot_install_error lerobot_version mounted_camera_pose_error name_list_error optional_callable_error "
+        "orientation_quaternion_error pose_vector_error process_rss_mb published_string_error redact_config_pairs "
+        "refusal_container_repr refuse_dropped_connection_kwargs reserved_camera_name_error "
+        "scoped_camera_name_error sequence_length stale_output_dir_is_clearable step_aborted_msg "
+        "step_cadence_error validation_split_error validation_split_fraction",
+        _OWN_HELPER,
     ),
     ("mesh", "iot", f"{_KEEPS}; STRANDS_MESH_BACKEND=iot joins with a thing that is provisioned already"),
     ("mesh", "pacing", "the mesh paces itself (docs/mesh.md)"),
@@ -256,6 +355,14 @@ def moved_name(package: str, name: str) -> Any:
 def getter(package: str) -> Callable[[str], Any]:
     """Return the ``__getattr__`` of a package that has no other names."""
     return lambda name: moved_name(package, name)
+
+
+def of_module(module: str) -> tuple[list[str], Callable[[str], Any]]:
+    """Return ``__path__`` and ``__getattr__`` of a module that had more names.
+
+    A module without a path is not asked why it has no such name: ``from module import name`` says that it has not.
+    """
+    return [], getter(module)
 
 
 def spec_of(path: str) -> ModuleSpec | None:

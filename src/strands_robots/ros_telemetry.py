@@ -11,16 +11,21 @@ import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from strands_robots import settings
 from strands_robots.envelope import is_error, text_of
+from strands_robots.moved import of_module
 from strands_robots.policies.base import limited, numbers
 from strands_robots.ros.link import DOMAIN_MAX, BroadcastLink, Message
 from strands_robots.ros.link import node_name as checked_node_name
 from strands_robots.ros.rclpy import MAX_QOS_HISTORY_DEPTH, RclpyLink
 from strands_robots.safety.gate import MotionGate
 from strands_robots.utils import ValidationError, flag, number, shown, text, whole
+
+if not TYPE_CHECKING:
+    __path__, __getattr__ = of_module(__name__)
+
 
 __all__ = ["MAX_QOS_HISTORY_DEPTH", "RosTelemetryBase", "RosTelemetryBridge", "checked_limits", "refuse_unsecured"]
 

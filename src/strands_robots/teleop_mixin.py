@@ -6,14 +6,19 @@ import time
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from functools import cached_property, partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from strands_robots.envelope import Envelope, error, success
+from strands_robots.moved import of_module
 from strands_robots.policies.rollout import STOP_JOIN_S, Body, Rollout
 from strands_robots.policies.task_engine import NewTask, TaskEngine
 from strands_robots.safety.gate import Permit, answered
 from strands_robots.teleoperators import FULL_RANGES_PER_S, InputSink, LeaderPolicy
 from strands_robots.utils import ValidationError, choice, flag, identifier, number, teleoperator_contract_error
+
+if not TYPE_CHECKING:
+    __path__, __getattr__ = of_module(__name__)
+
 
 METHODS = ("arm", "gamepad", "keyboard", "phone")
 

@@ -20,9 +20,14 @@ from functools import partial
 from importlib import import_module
 from itertools import islice
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from strands_robots.errors import StrandsRobotsError
+from strands_robots.moved import of_module
+
+if not TYPE_CHECKING:
+    __path__, __getattr__ = of_module(__name__)
+
 
 DISTRIBUTION = "strands-robots-edge"
 """Name of this project on a package index; ``strands-robots`` is another project's."""

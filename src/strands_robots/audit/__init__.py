@@ -24,17 +24,21 @@ from collections import Counter, deque
 from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from strands_robots import settings
 from strands_robots.audit.head import Anchor, log_id
 from strands_robots.audit.journal import AUDIT_PEER, BROKEN, NAME, AuditEntry, Journal, storable
 from strands_robots.audit.verification import WITNESS, compare, stated_head, verify, verify_records, witnessed
+from strands_robots.moved import getter
 from strands_robots.state_files import make_private, state_dir
 from strands_robots.stop_log import stop_logger
 from strands_robots.utils import ValidationError, shown
 
 logger = stop_logger(__name__)
+
+if not TYPE_CHECKING:  # a package with a __getattr__ has every name for a type checker
+    __getattr__ = getter(__name__)
 
 PENDING_MAX = 10_000
 QUEUED_MAX = 2 * PENDING_MAX

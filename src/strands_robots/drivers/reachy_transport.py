@@ -5,7 +5,14 @@ Third parties (``httpx``, ``websockets``, ``zenoh``) are loaded by the first req
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from strands_robots.drivers.reachy.links import WebSocketLink, ZenohLink
 from strands_robots.drivers.reachy.rest import api
+from strands_robots.moved import of_module
+
+if not TYPE_CHECKING:
+    __path__, __getattr__ = of_module(__name__)
+
 
 __all__ = ["WebSocketLink", "ZenohLink", "api"]

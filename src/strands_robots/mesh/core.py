@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from strands_robots import settings
 from strands_robots._mesh_switch import mesh_env_request
@@ -37,6 +37,7 @@ from strands_robots.mesh.transport import (
     Transport,
 )
 from strands_robots.mesh.wire_identity import ConsoleSigner, ConsoleTrust, Identity, identity_of
+from strands_robots.moved import of_module
 from strands_robots.recording.cameras import frames_of
 from strands_robots.safety.gate import MotionGate
 from strands_robots.safety.persistence import simulation_key
@@ -49,6 +50,10 @@ from strands_robots.serving.robot_verbs import served
 from strands_robots.tags import tags_of
 from strands_robots.threads import BoundedExecutor
 from strands_robots.utils import DURATION_MAX_S, number, text
+
+if not TYPE_CHECKING:
+    __path__, __getattr__ = of_module(__name__)
+
 
 logger = logging.getLogger(__name__)
 

@@ -11,15 +11,20 @@ import math
 import threading
 import time
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from strands_robots.mesh import topics
 from strands_robots.mesh.input_receiver import InputMesh, InputReceiver
 from strands_robots.mesh.security import validate_mesh_identifier
 from strands_robots.mesh.transport import TransportError
 from strands_robots.mesh.wire import WireError
+from strands_robots.moved import of_module
 from strands_robots.teleoperators import teleop_events
 from strands_robots.utils import ValidationError, number, shown, teleoperator_contract_error, text
+
+if not TYPE_CHECKING:
+    __path__, __getattr__ = of_module(__name__)
+
 
 __all__ = ["INPUT_HZ_DEFAULT", "InputPublisher", "InputReceiver", "MeshInputSink"]
 

@@ -9,10 +9,16 @@ from __future__ import annotations
 import getpass
 import sys
 from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
+from strands_robots.moved import of_module
 from strands_robots.safety.ed25519 import keygen, load_signing_key
 from strands_robots.safety.resume import ResumeVerifier, sign
 from strands_robots.utils import MissingExtraError
+
+if not TYPE_CHECKING:
+    __path__, __getattr__ = of_module(__name__)
+
 
 __all__ = ["ResumeVerifier", "keygen", "load_signing_key", "main", "sign"]
 

@@ -6,13 +6,18 @@ the mesh, and holds the table of a command's fields. A machine reads ``Validatio
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from strands_robots import settings
 from strands_robots.mesh.former_actions import FORMER, checked_former
+from strands_robots.moved import of_module
 from strands_robots.serving.peer_verbs import PEER_VERBS
 from strands_robots.serving.verbs import Kind
 from strands_robots.utils import ValidationError, finite, identifier, mapping, number, peer_id, shown
+
+if not TYPE_CHECKING:
+    __path__, __getattr__ = of_module(__name__)
+
 
 __all__ = [
     "ValidationError",

@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from strands_robots import settings
 from strands_robots._mesh_switch import mesh_env_request
@@ -30,8 +30,13 @@ from strands_robots.mesh.transport.config import stated_endpoints
 from strands_robots.mesh.transport.factory import make_transport
 from strands_robots.mesh.wire import WireError
 from strands_robots.mesh.wire_identity import ConsoleSigner, ConsoleTrust, Identity
+from strands_robots.moved import of_module
 from strands_robots.safety.network_key import MESH, NetworkKey
 from strands_robots.utils import MissingExtraError, number
+
+if not TYPE_CHECKING:
+    __path__, __getattr__ = of_module(__name__)
+
 
 PEER_TIMEOUT = 10.0
 """Seconds of silence after which a peer is out of reach."""

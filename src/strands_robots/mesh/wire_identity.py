@@ -30,6 +30,7 @@ from strands_robots.certificates import cryptography
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.mesh import wire
 from strands_robots.mesh.transport.config import Posture, TlsCredentials
+from strands_robots.moved import of_module
 from strands_robots.rate_limits import RecentKeys
 from strands_robots.safety import ed25519
 from strands_robots.safety.identity import (
@@ -46,6 +47,10 @@ if TYPE_CHECKING:
     from cryptography import x509
 
     from strands_robots.mesh.transport import Transport
+
+if not TYPE_CHECKING:
+    __path__, __getattr__ = of_module(__name__)
+
 
 logger = logging.getLogger(__name__)
 

@@ -8,10 +8,15 @@ import math
 import random
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 from strands_robots.errors import StrandsRobotsError
+from strands_robots.moved import of_module
 from strands_robots.utils import ValidationError, mapping, number, shown, whole
+
+if not TYPE_CHECKING:
+    __path__, __getattr__ = of_module(__name__)
+
 
 Action = dict[str, float]
 """Targets by action key, in the robot's own units."""

@@ -18,7 +18,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from strands_robots.moved import getter
+from strands_robots.moved import of_module
 from strands_robots.policies.base import Action, PolicyError, Ranges
 from strands_robots.policies.checkpoint import ENVIRONMENT, STATE
 from strands_robots.policies.decoding import read_json
@@ -27,8 +27,8 @@ from strands_robots.policies.profiles import IMAGES, Profile
 from strands_robots.utils import ValidationError, missing_extra, shown
 
 if not TYPE_CHECKING:
-    __path__: list[str] = []  # a package in release 0.5: what it had is asked for as a module
-    __getattr__ = getter(__name__)
+    __path__, __getattr__ = of_module(__name__)
+
 
 LEROBOT_IMPORTS = threading.RLock()
 """Held by every import of LeRobot in this package."""

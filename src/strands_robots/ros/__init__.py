@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from strands_robots.moved import moved_name
+
 if TYPE_CHECKING:
     from strands_robots.ros.actions import ros_action
 
@@ -15,4 +17,4 @@ def __getattr__(name: str) -> Any:
         from strands_robots.ros.actions import ros_action  # noqa: PLC0415 - the package loads nothing by itself
 
         return ros_action
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return moved_name(__name__, name)

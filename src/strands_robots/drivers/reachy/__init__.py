@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
 from strands_robots import settings
+from strands_robots.moved import moved_name
 from strands_robots.utils import ValidationError, missing_extra, number
 
 if TYPE_CHECKING:
@@ -28,7 +29,7 @@ def __getattr__(name: str) -> Any:
         from strands_robots.drivers.reachy.driver import ReachyDriver  # noqa: PLC0415 - loaded on use
 
         return ReachyDriver
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return moved_name(__name__, name)
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from strands_robots import settings
 from strands_robots.mesh import transport
+from strands_robots.moved import of_module
+
+if not TYPE_CHECKING:
+    __path__, __getattr__ = of_module(__name__)
+
 
 CLASSES = {
     "zenoh": "ZenohTransport",
