@@ -206,7 +206,7 @@ def serve(
         ),
     ] = None,
     host: Annotated[
-        str | None, typer.Option("--host", help="Of a Reachy Mini's daemon; searched for by default.")
+        str | None, typer.Option("--host", help="Of a Reachy Mini's daemon; REACHY_HOST or searched for by default.")
     ] = None,
     options: Annotated[
         list[str] | None,
