@@ -45,6 +45,7 @@ system:
 	@./scripts/venv.sh .venv-bridge requirements/bridge.lock
 	@./scripts/rosbridge.sh
 	@./scripts/registry.sh
+	@./scripts/strands-05.sh
 	@./scripts/axe.sh
 	@./scripts/dds-peers.sh
 	@./scripts/dds-security.sh

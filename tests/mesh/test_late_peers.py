@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import Any
 
@@ -167,3 +168,36 @@ def test_console_without_a_robot_reports_no_lockout(peers: Fleet) -> None:
     console.emergency_stop()
     peers.meet()
     assert "locked" not in (other.get_peer("console") or {})
+
+
+def test_resume_is_published_once_more_for_an_older_peer_in_reach_unless_another_stop_follows(
+    peers: Fleet, key: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It may have dropped the resume, and cannot say; five of another stop's epoch would close it to every resume."""
+    monkeypatch.setattr(estop_retry, "SETTLE_S", 0.1)
+    older, robot = peers.stranger(), peers.join(Arm("arm-1"), "arm-1")
+
+    def beat() -> None:
+        peers.clock.pass_(2)
+        older.put("strands/old-1/presence", {"robot_id": "old-1", "timestamp": peers.clock()})
+
+    beat()
+    eventually(lambda: robot.get_peer("old-1"), what="the older peer is known")
+    resumes = received(peers, "strands/safety/resume")
+
+    def resumed(again: bool) -> list[bool]:
+        robot.emergency_stop()
+        epoch = robot.lockout_epoch
+        resumes.clear()
+        assert robot.resume(key) == {"status": "ok"}
+        if again:
+            robot.emergency_stop()
+        beat()
+        time.sleep(0.5)  # some looks
+        beat()
+        time.sleep(0.5)
+        assert epoch is not None
+        return [each["assertion"]["epoch"] == epoch for each in resumes]
+
+    assert resumed(again=False) == [True, True]
+    assert resumed(again=True) == [True]

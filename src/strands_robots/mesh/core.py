@@ -500,9 +500,9 @@ class Mesh(SensorLoopsMixin):
         self._subscriptions.remove(name)
 
     @property
-    def inbox(self) -> dict[str, Any]:
-        """The latest messages of each subscription without a callback, oldest first."""
-        return dict(self._subscriptions.inbox)
+    def inbox(self) -> dict[str, list[tuple[str, dict[str, Any]]]]:
+        """Latest keys and messages of subscriptions without a callback, oldest first."""
+        return {name: list(kept) for name, kept in list(self._subscriptions.inbox.items())}
 
     def publish_step(
         self,

@@ -207,6 +207,12 @@ SPREAD_S = 1.0
 TRIES_MAX = 10
 """Repeats to a peer that goes on reporting the same; access rules may keep them from it."""
 
+OLDER_TRIES = 1
+"""Repeats of a resume to a peer of a 0.5 release in reach: it drops one within half a second of a stop, and cannot say.
+
+Five of another stop's epoch make it refuse every resume for 30 s.
+"""
+
 RESUME_S = 50.0
 """Seconds for which a recorded resume is passed on: a robot refuses one older than 60 s."""
 
@@ -248,6 +254,7 @@ class LatePeers:
     def stopped(self, epoch: str, publish: Publish) -> None:
         """Note a stop that locked us; ``publish`` repeats it to peers of 0.5 releases."""
         known = self._context.registry.seen_within(KNOWN_S)
+        self.overtaken()
         self._note(epoch, float("inf"), known, lambda peers: publish(), locks=True)
 
     def resumed(self, epoch: str, targets: Iterable[str], publish: Publish) -> None:
@@ -263,6 +270,24 @@ class LatePeers:
         missing = self._missing.get((epoch, True))
         if missing is not None:
             missing.due = time.monotonic() + AGAIN_S + self._delay_s
+
+    def overtaken(self) -> None:
+        """Repeat no resume to older peers in reach, because another stop followed."""
+        for missing in list(self._missing.values()):
+            self._told(missing)
+
+    def relayed(self, epoch: str) -> None:
+        """Note that another peer published the resume of this epoch again just now."""
+        missing = self._missing.get((epoch, False))
+        if missing is not None:
+            self._told(missing)
+
+    @staticmethod
+    def _told(missing: _Missing) -> None:
+        """Repeat a resume to no peer of a 0.5 release that was in reach of it."""
+        if not missing.locks:
+            for peer in missing.pending.keys() - missing.absent:
+                missing.pending[peer] = max(missing.pending[peer], OLDER_TRIES)
 
     @property
     def waits(self) -> bool:
@@ -280,12 +305,14 @@ class LatePeers:
                 missing.due = now + AGAIN_S + self._delay_s
                 for peer in back:
                     missing.pending[peer] += 1
-                logger.warning(
-                    "%s missed the %s of %s: it is published again.",
-                    ", ".join(back),
-                    "emergency stop" if missing.locks else "resume",
-                    missing.epoch,
-                )
+                missed = {*back} - ({*self._context.registry.older()} - missing.absent)
+                if missed:
+                    logger.warning(
+                        "%s missed the %s of %s: it is published again.",
+                        ", ".join(sorted(missed)),
+                        "emergency stop" if missing.locks else "resume",
+                        missing.epoch,
+                    )
                 missing.publish(back)
 
     def _note(
@@ -317,14 +344,15 @@ class LatePeers:
     def _back(self, missing: _Missing, keys: Mapping[str, bytes] | None) -> list[str]:
         """Return peers in reach that missed it; forget those that it reached."""
         back: list[str] = []
-        older = self._context.registry.older() if missing.locks else ()
+        older = self._context.registry.older()
         passed = self._context.monotonic() - missing.since
         for peer, tries in list(missing.pending.items()):
             row = self._context.registry.get(peer)
             if row is None or not row["reachable"] or row["age"] > passed - SETTLE_S:
                 continue
             asks = missing.locks and peer not in older
-            if asks or tries >= TRIES_MAX or self._reached(row, missing, keys):
+            unsure = not missing.locks and peer in older and tries < OLDER_TRIES
+            if asks or tries >= TRIES_MAX or (not unsure and self._reached(row, missing, keys)):
                 del missing.pending[peer]
             else:
                 back.append(peer)

@@ -110,6 +110,7 @@ class FleetSafety:
         self.stops: PeerStops | None = None
         self._admitted: deque[str] = deque(maxlen=RECENT_MAX)
         self._resumed: deque[str] = deque(maxlen=RECENT_MAX)
+        self._over: deque[str] = deque(maxlen=RECENT_MAX)
         self.network = session.network().text
         self._latest = ""
         self._press = ("", 0.0)
@@ -160,6 +161,7 @@ class FleetSafety:
         local = self.adapter.begin(order)
         none = {"responses_received": 0, "peers_not_stopped": 0, "peers_silent": 0}
         self._publish_estop(order, none, signing_key)
+        self.late.overtaken()
         roster = {row["peer_id"] for row in context.registry.all() if row["reachable"]} - {context.peer_id}
         published = time.monotonic()
 
@@ -294,7 +296,9 @@ class FleetSafety:
         context = self.context
         if paced and context.registry.older():
             with context.pacer.turn(SAFETY, SAFETY_S):
-                self._put_estop(order, counts, signing_key)
+                # A peer of a 0.5 release would lock again by a stop that it was resumed from meanwhile.
+                if order.epoch not in self._over:
+                    self._put_estop(order, counts, signing_key)
         else:
             self._put_estop(order, counts, signing_key)
             context.pacer.note(SAFETY)
@@ -453,7 +457,9 @@ class FleetSafety:
                     return {"status": "error", "error": rejected}
                 if relayed:
                     time.sleep(SPACING_S)
-                self._relay(assertion)
+                self._over.append(epoch)
+                with context.pacer.turn(SAFETY, SAFETY_S) if context.registry.older() else contextlib.nullcontext():
+                    self._relay(assertion)
                 relayed += 1
             self.late.renewable(epoch, late, lambda epoch, peers: self._relay_all(sign(signing_key, epoch, peers)))
         return {"status": "ok"}
@@ -502,6 +508,8 @@ class FleetSafety:
         epochs = self.adapter.epochs()
         if not isinstance(assertion, dict) or not epochs or assertion.get("epoch") not in epochs:
             context.audit("remote_resume_redundant", relayer)
+            if isinstance(assertion, dict):
+                self.late.relayed(str(assertion.get("epoch")))
             return
         targets = assertion.get("targets")
         if not isinstance(targets, list) or context.peer_id not in targets:
@@ -535,6 +543,7 @@ class FleetSafety:
 
     def _note_admitted(self, assertion: Any) -> None:
         """Pass an admitted resume on to targets that are back within its minute."""
+        self._over.append(str(assertion["epoch"]))
         self.late.resumed(str(assertion["epoch"]), assertion["targets"], lambda: self._relay(assertion))
 
     def _relay_all(self, assertions: Iterable[Any]) -> None:

@@ -63,7 +63,7 @@ class AuditThrottle:
             payload.setdefault("about", about)
         self._sink(event, self._peer, payload)
 
-    def always(self, event: str, /, **payload: Any) -> None:
+    def always(self, event: str, **payload: Any) -> None:
         """Record an event that is never left out, such as a stop."""
         self._sink(event, self._peer, payload)
 

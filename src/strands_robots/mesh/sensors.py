@@ -23,15 +23,13 @@ from typing import Any
 
 from strands_robots import settings
 from strands_robots.contract import body_of
-from strands_robots.envelope import is_error, jsonable, text_of
+from strands_robots.envelope import is_error, text_of
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.mesh import topics
 from strands_robots.mesh.scheduler import Scheduler, TroubleLog
 from strands_robots.mesh.session import Context
-from strands_robots.mesh.transport import TransportError
-from strands_robots.mesh.wire import WireError
 from strands_robots.recording.cameras import Frames, jpeg
-from strands_robots.utils import ValidationError, identifier, mapping, shown, text, w_positive, yaw_of
+from strands_robots.utils import ValidationError, identifier, shown, w_positive, yaw_of
 
 logger = logging.getLogger(__name__)
 
@@ -126,7 +124,6 @@ class SensorPublisher:
 class SensorLoopsMixin:
     """The sensor methods of a mesh peer, mixed into its class."""
 
-    peer_id: str
     _context: Context
     _sensors: SensorPublisher
     robot: Any
@@ -145,31 +142,6 @@ class SensorLoopsMixin:
         """
         suffix, default_hz = _suffix_and_rate(name)
         self._sensors.add(suffix, provider, default_hz if hz is None else hz)
-
-    def publish_safety_event(
-        self, event_type: str, severity: str = "warning", payload: Mapping[str, Any] | None = None
-    ) -> None:
-        """Record a safety event and publish it; nothing while not on the mesh.
-
-        Args:
-            event_type: short lower-case name of the event.
-            severity: goes into the record alone; every published event is ``info``.
-            payload: facts of the event.
-
-        Raises:
-            ValidationError: an argument outside its domain.
-        """
-        context = self._context
-        event, graded = text("event_type", event_type, longest=100), text("severity", severity, longest=100)
-        facts = jsonable(mapping("payload", dict(payload or {})))
-        if context.transport is None:
-            return
-        context.audit.always(event, **{**facts, "severity": graded})
-        body = {"peer_id": context.peer_id, "t": context.clock(), "type": event, "severity": "info", "payload": facts}
-        try:
-            context.put(topics.safety_event(context.peer_id), body)
-        except (TransportError, WireError) as exc:
-            logger.warning("%s: the safety event %s is recorded, and was not published: %s", self.peer_id, event, exc)
 
     def add_robot_sensors(self) -> None:
         """Publish every sensor the robot itself can read, and the health of its host."""

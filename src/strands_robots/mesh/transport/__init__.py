@@ -238,7 +238,7 @@ class Subscriptions:
         self._executor = executor
         self._lock = threading.Lock()
         self._declared: dict[str, Declaration] = {}
-        self.inbox: dict[str, deque[dict[str, Any]]] = {}
+        self.inbox: dict[str, deque[tuple[str, dict[str, Any]]]] = {}
 
     def add(
         self,
@@ -303,7 +303,7 @@ class Subscriptions:
             else:
                 inbox = self.inbox.get(name)
                 if inbox is not None:
-                    inbox.append({"key": sample.key, **data})
+                    inbox.append((sample.key, data))
 
         def submit(sample: Sample) -> None:
             self._executor.submit(lambda: deliver(sample))
