@@ -14,7 +14,6 @@ from typing import Any, TypeVar
 from strands_robots import settings
 from strands_robots.contract import Observer, Unsubscribe, for_request
 from strands_robots.drivers.ros.motion import COUNT_MAX, BaseMotion, Drive, DriveOrder, messages_for
-from strands_robots.drivers.ros.transport_link import former_link
 from strands_robots.drivers.ros.velocity import CurrentHold, OdometryMonitor, VelocityPublisher, ZeroVelocityHold
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.policies.rollout import RolloutObservers
@@ -24,7 +23,7 @@ from strands_robots.safety.gate import MotionGate, MotionRefused, MotionRequest,
 from strands_robots.safety.stop_targets import halted_with_verbs
 from strands_robots.safety.stopping import PendingVerdict, StopVerdict, halts_in_parts
 from strands_robots.stop_log import stop_logger
-from strands_robots.utils import MissingExtraError, ValidationError, identifier, number, whole
+from strands_robots.utils import MissingExtraError, ValidationError, identifier, number, shown, whole
 
 logger = stop_logger(__name__)
 
@@ -47,12 +46,6 @@ AgentVerb = tuple[Callable[..., Envelope], str]
 _Motion = TypeVar("_Motion", bound=BaseMotion)
 
 
-def _without_slashes(node_name: object) -> object:
-    """Return an identifier for a graph name, which names in 0.5 could be."""
-    words = node_name.strip("~/") if isinstance(node_name, str) else ""
-    return words.replace("/", "_").replace("~", "_") or node_name
-
-
 def tool_suffix(node_name: str) -> str:
     """Return the robot's unique part of a tool's name that model APIs accept."""
     plain = node_name.replace(".", "_")
@@ -71,10 +64,9 @@ class MobileBaseRobot:
     the zeros of a halt need no approval.
 
     Args:
-        node_name: name of the robot and of its tools, an identifier; of a graph name its words, as ``a_b`` of ``/a/b``.
+        node_name: name of the robot and of its tools, an identifier.
         link: the link to the graph.
         command_topic: the velocity topic, of ``command_type``.
-        former: ``cmd_vel_topic``, ``transport`` and ``cmd_vel_type`` of 0.5, in place of link, topic and type.
         odom_topic: odometry or pose; with it, a stop waits to see the base still.
         publish_rate: Hz of a timed or repeated drive, above 0.
         max_linear: clamp in m/s, above 0; None: this platform declares no limit. ``max_angular`` in rad/s likewise.
@@ -91,8 +83,8 @@ class MobileBaseRobot:
     def __init__(
         self,
         node_name: str,
-        link: RosLink | str | None = None,
-        command_topic: Any = "",
+        link: RosLink,
+        command_topic: str,
         command_type: str = TWIST,
         *,
         odom_topic: str | None = None,
@@ -104,10 +96,14 @@ class MobileBaseRobot:
         max_angular: float | None = None,
         max_duration: float | None = None,
         command_gate: CommandGate | None = None,
-        **former: Any,
     ) -> None:
-        self.tool_name_str = self.node_name = identifier("node_name", _without_slashes(node_name))
-        link, command_topic, command_type = former_link(link, command_topic, command_type, former)
+        self.tool_name_str = self.node_name = identifier("node_name", node_name)
+        if isinstance(link, str):
+            # The order of strands-robots 0.5: node_name, cmd_vel_topic, transport.
+            raise ValidationError(
+                f"link must be a link of strands_robots.ros.link, not {shown(link)}: give MobileBaseRobot its "
+                "node_name, link and command_topic in this order."
+            )
         self.link = link
         self._topic = graph_name("command_topic", command_topic)
         self._kind = interface("command_type", command_type)
