@@ -163,6 +163,33 @@ def test_world_of_others_is_stopped_robot_by_robot() -> None:
         assert "simulation exposes no " in lacking["reason"]
 
 
+def test_robot_that_was_started_is_stopped_before_its_world_is_read() -> None:
+    class Read(World):
+        def list_robots(self) -> list[str]:
+            self.calls.append("list")
+            return ["left"]
+
+    foreign = Read()
+    world = adapt_world(foreign)
+    world.start_policy("left", "wave")
+    world.start_policy("gone", "wave")
+    foreign.calls.clear()
+    assert world.halt().halted == ("left",)
+    assert foreign.calls == ["stop left", "stop gone", "list"]
+    foreign.calls.clear()
+    assert world.halt().stopped is True
+    assert foreign.calls == ["stop left", "list"]
+
+
+def test_world_whose_robots_cannot_be_listed_did_not_stop() -> None:
+    class Torn(World):
+        def list_robots(self) -> list[str]:
+            raise RuntimeError("torn down")
+
+    verdict = adapt_world(Torn()).halt()
+    assert "torn down" in verdict.not_stopped["simulation"]
+
+
 def test_locked_world_of_others_is_never_asked_to_move() -> None:
     foreign = World()
     world = adapt_world(foreign)

@@ -142,6 +142,8 @@ class _Shared:
         self.reading = threading.Lock()
         self.read: tuple[float, Joints] | None = None
         self.warned = False
+        self.started: dict[str, None] = {}
+        """Robots of a world whose policies were started from here."""
         self._calls: set[object] = set()
 
     @property
@@ -383,6 +385,7 @@ class AdaptedWorld(RobotWrapper):
         request: MotionRequest | None = None,
         **policy: Any,
     ) -> Envelope:
+        self._shared.started[robot_name] = None
         named = {"robot_name": robot_name, "instruction": instruction, "policy_provider": policy_provider}
         return self._motion("start_policy", request, **named, duration=duration, **policy)
 
@@ -406,27 +409,38 @@ class AdaptedWorld(RobotWrapper):
         unsubscribe: Unsubscribe = (lambda: None) if subscribe is None else subscribe(observer)
         return unsubscribe
 
+    @halts_in_parts
     def halt(self, reason: str = "") -> StopVerdict:
         """The world's own ``halt`` or ``stop_task``, else ``stop_policy`` of each robot.
 
         Its teleoperation is stopped besides.
         """
+        return stop_executor().halt(self, self.tool_name_str, reason)
+
+    def halt_here(self, reason: str, deadline: float) -> StopVerdict:
+        """Ask everything to stop: what was started from here before the world is read."""
         self.gate.revoke()
-        stops: dict[str, Callable[[], object]] = {}
-        whole = self._own("halt") or self._own("stop_task")
+        halt, stop = self._own("halt"), self._own("stop_task")
+        whole = stop if halt is None else partial(halt, reason)
+        answers: dict[str, object] = {}
         if whole is not None:
-            stops[self.tool_name_str] = partial(whole, reason) if self._own("halt") else whole
+            answers[self.tool_name_str] = _answer(whole)
         elif self.halts:
-            try:
-                stops |= {name: partial(self.stop_policy, name) for name in self.list_robots()}
-            except Exception as exc:  # noqa: BLE001 - what cannot be listed cannot be stopped, and is said so
-                stops[self.tool_name_str] = partial(error, f"its robots could not be listed: {exc}")
+            answers |= {name: _answer(partial(self.stop_policy, name)) for name in tuple(self._shared.started)}
+            listed = _answer(self.list_robots)
+            if isinstance(listed, list):
+                for gone in answers.keys() - set(listed):
+                    del answers[gone]
+                    self._shared.started.pop(gone, None)
+                answers |= {name: _answer(partial(self.stop_policy, name)) for name in listed if name not in answers}
+            else:
+                answers[self.tool_name_str] = error(f"its robots could not be listed: {listed}")
         else:
-            stops[self.tool_name_str] = partial(error, NO_STOP)
+            answers[self.tool_name_str] = error(NO_STOP)
         teleoperation = self._own("stop_teleoperate")
         if teleoperation is not None:
-            stops["teleoperation"] = teleoperation
-        return halt_each({name: partial(_given, _answer(stop)) for name, stop in stops.items()})
+            answers["teleoperation"] = _answer(teleoperation)
+        return halt_each({name: partial(_given, answer) for name, answer in answers.items()})
 
     def warn_endless(self, name: str) -> None:
         """Warn once in its life, where it has no way to halt."""
@@ -459,6 +473,7 @@ class AdaptedWorld(RobotWrapper):
             return refused.envelope
         answer = for_request(permit.request, self._ask)(verb, *values, **named)
         if not permit.valid:
+            permit.begin()
             again = self.halt("halted while it started")
             end = "and was stopped again" if again.stopped else "and DID NOT STOP AGAIN"
             return error(f"{verb} is refused: {self.tool_name_str} was halted meanwhile, {end}.")
