@@ -1,4 +1,4 @@
-"""Write the tables of settings, old settings and extras in docs/reference.md from the code.
+"""Write the tables of settings and extras in docs/reference.md and of old names in docs/from-0.5.md from the code.
 
 ``python scripts/tables.py`` rewrites them in place; ``--check`` only compares them.
 """
@@ -10,10 +10,11 @@ import sys
 import tomllib
 from pathlib import Path
 
-from strands_robots import settings
+from strands_robots import moved, settings
 
 ROOT = Path(__file__).resolve().parent.parent
-PAGE = ROOT / "docs" / "reference.md"
+REFERENCE = ROOT / "docs" / "reference.md"
+FROM_05 = ROOT / "docs" / "from-0.5.md"
 
 EXTRA_MEANINGS = {
     "device-connect": "the Device Connect networks (Zenoh, NATS), drivers and client",
@@ -61,25 +62,47 @@ def extras_table() -> str:
     return "\n".join(rows)
 
 
-def rewritten(text: str) -> str:
-    tables = (("settings", settings_table()), ("unread", unread_table()), ("extras", extras_table()))
-    for name, table in tables:
-        pattern = rf"(<!-- table: {name} -->\n).*?(\n<!-- end -->)"
-        text, found = re.subn(pattern, lambda m, t=table: m[1] + t + m[2], text, flags=re.DOTALL)
+def moved_table() -> str:
+    rows = ["| in 0.5 | here |", "|---|---|"]
+    homes = {**moved.MODULES, **moved.NAMES}
+    rows += [f"| `{old}` | `{new.replace(':', '.')}` |" for old, new in sorted(homes.items())]
+    return "\n".join(rows)
+
+
+def gone_table() -> str:
+    names: dict[tuple[str, str], list[str]] = {}
+    for path, instead in moved.GONE.items():
+        package, _, name = path.rpartition(".")
+        names.setdefault((package, instead), []).append(f"`{name}`")
+    rows = ["| package | names in 0.5 | instead |", "|---|---|---|"]
+    rows += [f"| `{package}` | {', '.join(each)} | {instead} |" for (package, instead), each in sorted(names.items())]
+    return "\n".join(rows)
+
+
+PAGES = {
+    REFERENCE: (("settings", settings_table), ("unread", unread_table), ("extras", extras_table)),
+    FROM_05: (("moved", moved_table), ("gone", gone_table)),
+}
+
+
+def rewritten(page: Path) -> str:
+    text = page.read_text(encoding="utf-8")
+    for name, table in PAGES[page]:
+        pattern = rf"(<!-- table: {name} -->\n).*?(<!-- end -->)"
+        text, found = re.subn(pattern, lambda m, t=table: f"{m[1]}{t()}\n{m[2]}", text, flags=re.DOTALL)
         if not found:
-            raise SystemExit(f"{PAGE.name} has no table marker for {name}.")
+            raise SystemExit(f"{page.name} has no table marker for {name}.")
     return text
 
 
 def main() -> int:
-    current = PAGE.read_text(encoding="utf-8")
-    wanted = rewritten(current)
-    if "--check" in sys.argv:
-        if wanted != current:
-            print(f"{PAGE.name} is behind the code: run python scripts/tables.py")
-        return int(wanted != current)
-    PAGE.write_text(wanted, encoding="utf-8")
-    return 0
+    behind = {page: wanted for page in PAGES if (wanted := rewritten(page)) != page.read_text(encoding="utf-8")}
+    for page, wanted in behind.items():
+        if "--check" in sys.argv:
+            print(f"{page.name} is behind the code: run python scripts/tables.py")
+        else:
+            page.write_text(wanted, encoding="utf-8")
+    return int("--check" in sys.argv and bool(behind))
 
 
 if __name__ == "__main__":
