@@ -28,6 +28,45 @@ ANYTHING = st.one_of(
     st.just(float("nan")),
     st.builds(object),
 )
+
+
+class Boxed:
+    """A number as numpy has it: what it is in Python is told by its ``tolist``."""
+
+    def __init__(self, value: object) -> None:
+        self.value = value
+
+    def tolist(self) -> object:
+        return self.value
+
+
+def test_a_boxed_number_is_the_number_in_it_and_a_boxed_boolean_is_none() -> None:
+    assert utils.number("x", Boxed(0.5)) == 0.5
+    assert utils.whole("x", Boxed(4)) == 4
+    assert utils.flag("x", Boxed(True)) is True
+    utils.finite("x", {"a": Boxed([0.5, 1.5])})
+    for check, value in ((utils.number, Boxed(True)), (utils.number, Boxed(math.nan)), (utils.whole, Boxed(4.0))):
+        with pytest.raises(ValidationError, match="x must be"):
+            check("x", value)
+    with pytest.raises(ValidationError, match=r"x\.a\[1\] must be finite"):
+        utils.finite("x", {"a": Boxed([0.5, math.inf])})
+    assert utils.canonical_json({"b": Boxed([1, 2.5]), "a": Boxed(True)}) == b'{"a":true,"b":[1,2.5]}'
+    with pytest.raises(TypeError, match="object"):
+        utils.canonical_json({"a": object()})
+
+
+@pytest.mark.parametrize("value", [4, 4.0, Boxed(4), Boxed(4.0)])
+def test_an_integer_of_a_message_may_be_an_integral_float(value: object) -> None:
+    found = utils.integral("steps", value, low=1, high=9)
+    assert (found, type(found)) == (4, int)
+
+
+@pytest.mark.parametrize("value", [2.5, True, "4", None, math.nan, math.inf, 10.0, 0, -4.0, Boxed(True), Boxed([4])])
+def test_any_other_value_is_no_integer_of_a_message(value: object) -> None:
+    with pytest.raises(ValidationError, match="steps must be an integer from 1 to 9"):
+        utils.integral("steps", value, low=1, high=9)
+
+
 CHECKS: list[Callable[[str, Any], Any]] = [
     utils.number,
     utils.whole,

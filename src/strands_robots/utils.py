@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from importlib import import_module
 from itertools import islice
+from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
@@ -166,13 +167,43 @@ def near(wanted: str, names: Iterable[str]) -> str:
     return f" There {'is' if len(known) == 1 else 'are'}: {', '.join(known[:NAMED_MAX])}{more}." if known else ""
 
 
+_PYTHONS_OWN = frozenset({bool, int, float, str, bytes, list, tuple, dict, set, type(None)})
+
+
+def plain_value(value: object) -> Any:
+    """Return numpy's scalars and arrays as numbers, booleans and lists.
+
+    Other values stay as they are. What has a ``tolist`` counts as one, so that numpy is not needed for it.
+    """
+    if type(value) in _PYTHONS_OWN:
+        return value
+    convert = getattr(value, "tolist", None)
+    if not callable(convert):
+        return value
+    found = convert()
+    # The widest float of numpy has no number of Python's own to become.
+    return float(found) if type(found) not in _PYTHONS_OWN and isinstance(found, Real) else found
+
+
+def json_value(value: object) -> Any:
+    """Return what JSON carries in place of a value that it does not know.
+
+    Raises:
+        TypeError: it has nothing for it.
+    """
+    found = plain_value(value)
+    if found is value:
+        raise TypeError(f"{type(value).__name__} {shown(value)} is no value of JSON")
+    return found
+
+
 def canonical_json(fields: Mapping[str, Any]) -> bytes:
     """Return the bytes that are signed: JSON with sorted keys and without blanks.
 
     Raises:
         ValueError: a number that JSON cannot carry.
     """
-    return json.dumps(fields, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
+    return json.dumps(fields, sort_keys=True, separators=(",", ":"), allow_nan=False, default=json_value).encode()
 
 
 def field_values(instance: Any) -> dict[str, Any]:
@@ -194,9 +225,10 @@ def number(
     above: float | None = None,
 ) -> float:
     """Return a finite float; ``low`` and ``high`` are included, ``above`` is not."""
-    if isinstance(value, int | float) and not isinstance(value, bool):
+    plain = plain_value(value)
+    if isinstance(plain, int | float) and not isinstance(plain, bool):
         try:
-            result = float(value)
+            result = float(plain)
         except OverflowError:
             result = math.inf
         inside = (
@@ -220,6 +252,7 @@ def finite(name: str, value: object) -> None:
     left: list[tuple[str, object, int]] = [(name, value, 0)]
     while left:
         place, each, depth = left.pop()
+        each = plain_value(each)
         inside: list[tuple[str, object]] = []
         if isinstance(each, Mapping):
             inside = [(f"{place}.{key}", one) for key, one in each.items()]
@@ -234,11 +267,20 @@ def finite(name: str, value: object) -> None:
 
 def whole(name: str, value: object, *, low: float | None = None, high: float | None = None) -> int:
     """Return an integer, bounds included; ``True`` is not 1 and 2.0 is not 2."""
-    if isinstance(value, int) and not isinstance(value, bool):
-        inside = (low is None or value >= low) and (high is None or value <= high)
+    plain = plain_value(value)
+    if isinstance(plain, int) and not isinstance(plain, bool):
+        inside = (low is None or plain >= low) and (high is None or plain <= high)
         if inside:
-            return value
+            return plain
     raise ValidationError(f"{name} must be {_domain('an integer', low, high, None)}, not {shown(value)}.")
+
+
+def integral(name: str, value: object, *, low: float | None = None, high: float | None = None) -> int:
+    """Return an integer of a message; 4.0 is 4, and ``True`` is not 1."""
+    plain = plain_value(value)
+    if isinstance(plain, float) and plain.is_integer():
+        plain = int(plain)
+    return whole(name, plain if isinstance(plain, int) else value, low=low, high=high)
 
 
 def duration(name: str, value: object) -> float:
@@ -248,9 +290,10 @@ def duration(name: str, value: object) -> float:
 
 def flag(name: str, value: object) -> bool:
     """Return ``value`` as a boolean; a spelling of one, 0 and 1 are refused."""
-    if not isinstance(value, bool):
+    plain = plain_value(value)
+    if not isinstance(plain, bool):
         raise ValidationError(f"{name} must be true or false, not {shown(value)}.")
-    return value
+    return plain
 
 
 def text(name: str, value: object, *, longest: int = 2000, empty: bool = False) -> str:

@@ -11,7 +11,18 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from strands_robots.safety.gate import Permit
-from strands_robots.utils import ValidationError, finite, flag, mapping, number, plain_text, shown, text, whole
+from strands_robots.utils import (
+    ValidationError,
+    finite,
+    flag,
+    integral,
+    mapping,
+    number,
+    plain_text,
+    plain_value,
+    shown,
+    text,
+)
 
 TEXT_MAX = 2000
 """Characters of a text argument."""
@@ -208,7 +219,7 @@ def _number(hint: type, domain: Domain) -> _Kind:
     high = None if domain.high is None else math.floor(domain.high)
     return _Kind(
         int,
-        lambda name, value: whole(name, value, low=low, high=high),
+        lambda name, value: integral(name, value, low=low, high=high),
         {"type": "integer", **Domain(low, high, domain.unit).schema()},
     )
 
@@ -220,22 +231,26 @@ def _choice(where: str, values: tuple[Any, ...]) -> _Kind:
         raise ValidationError(f"{where} must be a Literal of texts, of numbers or of booleans alone.")
 
     def check(name: str, value: object) -> Any:
-        if type(value) is not kind or value not in values:
+        plain = plain_value(value)
+        if kind is int and isinstance(plain, float) and plain.is_integer():
+            plain = int(plain)
+        if type(plain) is not kind or plain not in values:
             allowed = ", ".join(str(each) for each in values)
             raise ValidationError(f"{name} must be one of {allowed}, not {shown(value)}.")
-        return value
+        return plain
 
     return _Kind(kind, check, {"type": JSON_TYPES[kind], "enum": list(values)})
 
 
 def _list(item: _Kind | None) -> _Kind:
     def check(name: str, value: object) -> list[Any]:
-        if not isinstance(value, list | tuple) or len(value) > ITEMS_MAX:
+        plain = plain_value(value)
+        if not isinstance(plain, list | tuple) or len(plain) > ITEMS_MAX:
             raise ValidationError(f"{name} must be a list of at most {ITEMS_MAX} items, not {shown(value)}.")
         if item is None:
-            finite(name, value)
-            return list(value)
-        return [item.check(f"{name}[{at}]", each) for at, each in enumerate(value)]
+            finite(name, plain)
+            return list(plain)
+        return [item.check(f"{name}[{at}]", each) for at, each in enumerate(plain)]
 
     return _Kind(
         list, check, {"type": "array", "maxItems": ITEMS_MAX, **({} if item is None else {"items": item.schema})}

@@ -89,6 +89,17 @@ def test_any_input_action_is_finite_or_refused(action: Any) -> None:
     assert len(checked) <= 64
 
 
+@pytest.mark.parametrize("key", ["../x", "é", "..", "a..b", "a/b", "a b", "", "x" * 65, "pan.pos\n", "a\x00"])
+def test_key_of_an_input_that_is_no_joints_is_refused(key: str) -> None:
+    with pytest.raises(ValidationError, match="the keys of action must be"):
+        validate_input_frame({"pan.pos": 0.0, key: 1.0})
+
+
+@pytest.mark.parametrize("key", ["shoulder_pan.pos", "x.vel", "Joint-1", "x" * 64])
+def test_key_of_an_input_that_may_be_a_joints_is_taken(key: str) -> None:
+    assert validate_input_frame({key: 1.0}) == {key: 1.0}
+
+
 @pytest.mark.parametrize(
     "data",
     [

@@ -167,6 +167,26 @@ def test_a_peer_that_cannot_join_is_not_alive(monkeypatch: pytest.MonkeyPatch) -
     mesh.close()
 
 
+@pytest.mark.parametrize(
+    ("given", "refused"),
+    [
+        ((print, "strands/*/state"), "topic must be a key expression"),
+        (("", print), "topic must be a key expression"),
+        (("strands/*/state", "states"), "callback must be callable"),
+        (("strands/*/state", print, print), "name must be text"),
+    ],
+)
+def test_arguments_of_a_subscription_in_another_order_are_refused_by_name(
+    peers: Fleet, given: tuple[Any, ...], refused: str
+) -> None:
+    console = peers.join(None, "console")
+    with pytest.raises(ValidationError, match=refused):
+        console.subscribe(*given)
+    with pytest.raises(ValidationError, match="on_sample must be callable"):
+        console.subscribe("strands/*/state", on_sample="states")  # type: ignore[arg-type]
+    assert console.subscribe("strands/*/state", name="") == "strands/*/state"
+
+
 def test_subscriptions_deliver_objects_and_end_when_the_mesh_stops(peers: Fleet) -> None:
     one, two = peers.join(None, "one"), peers.join(None, "two")
     received: list[tuple[str, dict[str, Any], str | None]] = []

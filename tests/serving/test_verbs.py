@@ -188,6 +188,23 @@ def test_a_step_of_0_5_3_without_a_number_is_one_step_on_both_networks() -> None
         WORLD_VERBS["step"].checked({"steps": True})
 
 
+@pytest.mark.parametrize("name", ["n_steps", "policy_port", "action_horizon"])
+def test_an_integral_float_is_the_integer_of_a_command(name: str) -> None:
+    start = PEER_VERBS["start"]
+    checked = start.checked({"policy_provider": "mock", name: 4.0})
+    assert (checked[name], type(checked[name])) == (4, int)
+    for value in (2.5, True, "4"):
+        with pytest.raises(ValidationError, match=name):
+            start.checked({"policy_provider": "mock", name: value})
+
+
+@pytest.mark.parametrize("name", ["target_velocity", "target_joints"])
+@pytest.mark.parametrize("empty", [[], {}, ()])
+def test_an_empty_goal_is_refused_by_name(name: str, empty: object) -> None:
+    with pytest.raises(ValidationError, match=f"{name} must be 1 to"):
+        PEER_VERBS["start"].checked({"policy_provider": "mock", name: empty})
+
+
 GO = Verb(
     "go",
     Kind.MOTION,

@@ -33,7 +33,7 @@ from strands_robots.safety.sightings import sightings
 from strands_robots.safety.statements import Purpose
 from strands_robots.safety.stopping import Outcome, explain, grade
 from strands_robots.threads import LOOP_JOIN_TIMEOUT_S, LoopThread
-from strands_robots.utils import ValidationError, device_id, finite, shown, text
+from strands_robots.utils import ValidationError, device_id, finite, json_value, shown, text
 
 if TYPE_CHECKING:
     from strands_robots.serving.advertised import AdvertisedVerb
@@ -386,7 +386,7 @@ class FleetClient:
             "params": {**params, "_dc_meta": {"source_device": self.source, "source_type": "client"}},
         }
         try:
-            encoded = json.dumps(request, allow_nan=False).encode()
+            encoded = json.dumps(request, allow_nan=False, default=json_value).encode()
         except (TypeError, ValueError, RecursionError) as exc:
             raise ValidationError(f"params must be values that JSON can carry: {exc}.") from exc
         try:

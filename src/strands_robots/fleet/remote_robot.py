@@ -41,7 +41,17 @@ from strands_robots.serving.advertised import (
     RobotDescription,
 )
 from strands_robots.serving.verbs import LEASE_ID
-from strands_robots.utils import DURATION_MAX_S, START_S, WAIT_S, near, number, optional_module, shown, text
+from strands_robots.utils import (
+    DURATION_MAX_S,
+    START_S,
+    WAIT_S,
+    near,
+    number,
+    optional_module,
+    plain_value,
+    shown,
+    text,
+)
 
 if TYPE_CHECKING:
     import numpy as np
@@ -484,6 +494,7 @@ class RemoteRobot:
         return method
 
     def _call(self, verb: str, arguments: Mapping[str, Any], timeout: float | None) -> dict[str, Any]:
+        arguments = {name: plain_value(value) for name, value in arguments.items()}
         if verb in STOPS and len(self._networks.stated) > 1:
             # It waits for no description, and goes to every robot of this id.
             stop = {**arguments, **self._one}

@@ -24,7 +24,7 @@ from strands_robots.kinematics.chain import (
     place_obstacle,
     spare_body,
 )
-from strands_robots.utils import ValidationError, flag, mapping, number, shown, text
+from strands_robots.utils import ValidationError, flag, mapping, number, plain_value, shown, text
 
 
 @dataclass(frozen=True, slots=True)
@@ -302,7 +302,7 @@ def _object(row: object) -> SeenObject:
 
 
 def _vector(name: str, value: object, low: float) -> Any:
-    given = value.tolist() if isinstance(value, np.ndarray) else value
+    given = plain_value(value)
     if not isinstance(given, list | tuple) or len(given) != 3:
         raise ValidationError(f"{name} must be three numbers, x, y and z in metres, not {shown(value)}.")
     return np.array([number(name, each, low=low, high=FAR_M) for each in given], dtype=np.float64)

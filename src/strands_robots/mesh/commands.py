@@ -9,7 +9,7 @@ from types import MappingProxyType
 from typing import Any, Literal
 
 from strands_robots.contract import Haltable, Robot, holds_robots
-from strands_robots.envelope import Envelope, RefusalReason, Refused, error, is_error
+from strands_robots.envelope import Envelope, RefusalReason, Refused, error, is_error, jsonable
 from strands_robots.mesh import topics, wire
 from strands_robots.mesh.estop_retry import ESTOP
 from strands_robots.mesh.former_actions import FORMER, as_verb
@@ -340,7 +340,14 @@ class CommandReceiver:
         self._reply(request.sender_id, request.turn_id, error=text, refusal=envelope)
 
     def _reply(
-        self, sender: str, turn: str, *, result: Any = None, error: str = "", refusal: Envelope | None = None
+        self,
+        sender: str,
+        turn: str,
+        *,
+        result: Any = None,
+        error: str = "",
+        refusal: Envelope | None = None,
+        plain: bool = False,
     ) -> None:
         context = self._context
         if sender in RESERVED_IDS:
@@ -350,12 +357,16 @@ class CommandReceiver:
         key = topics.response(sender, context.peer_id, turn)
         try:
             context.put(key, context.identity.sign(reply.to_wire()))
-        except wire.WireError as exc:
+        except TransportError as exc:
+            logger.warning("%s: the reply to %s was not sent: %s", context.peer_id, sender, exc)
+        except (TypeError, ValueError, RecursionError) as exc:
+            if not plain and not isinstance(exc, wire.TooLargeError):
+                # Something in it is no JSON, which costs that value alone: what the robot did has begun.
+                self._reply(sender, turn, result=jsonable(result), error=error, refusal=jsonable(refusal), plain=True)
+                return
             logger.warning("%s: the reply to %s cannot be sent: %s", context.peer_id, sender, exc)
             if not error:
                 self._reply(sender, turn, error=DISPATCH)
-        except TransportError as exc:
-            logger.warning("%s: the reply to %s was not sent: %s", context.peer_id, sender, exc)
 
 
 def _is_stop(command: object) -> bool:

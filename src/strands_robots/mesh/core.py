@@ -49,7 +49,7 @@ from strands_robots.serving.pipeline import Own, Pipeline
 from strands_robots.serving.robot_verbs import served
 from strands_robots.tags import tags_of
 from strands_robots.threads import BoundedExecutor
-from strands_robots.utils import DURATION_MAX_S, number, text
+from strands_robots.utils import DURATION_MAX_S, ValidationError, number, plain_value, shown, text
 
 if not TYPE_CHECKING:
     __path__, __getattr__ = of_module(__name__)
@@ -444,7 +444,7 @@ class Mesh(SensorLoopsMixin):
 
     def tell(self, target: str, instruction: str, **kw: Any) -> dict[str, Any]:
         """Ask a peer to ``execute`` with a ``policy_provider`` and wait."""
-        duration = kw.get("duration")
+        duration = plain_value(kw.get("duration"))
         patience = 30.0 + (duration if isinstance(duration, int | float) and 0 < duration <= DURATION_MAX_S else 30.0)
         timeout = kw.pop("timeout", patience)
         return self.send(target, {"action": "execute", "instruction": instruction, **kw}, timeout)
@@ -478,8 +478,9 @@ class Mesh(SensorLoopsMixin):
             on_sample: called with key, object and the publisher's session id instead.
 
         Raises:
-            ValueError: both callbacks are given.
+            ValueError: both callbacks are given, ``topic`` or ``name`` is no text, or a callback cannot be called.
         """
+        _check_subscription(topic, name, callback=callback, on_sample=on_sample)
         if callback is not None and on_sample is not None:
             raise ValueError("subscribe takes callback or on_sample, not both.")
         transport = self._context.transport
@@ -583,6 +584,17 @@ class Mesh(SensorLoopsMixin):
             ``{"status": "ok"}``, or status ``error`` and ``resume rejected``; the reason is in the local audit.
         """
         return self._safety.resume(signing_key, targets)
+
+
+def _check_subscription(topic: object, name: object, **callbacks: object) -> None:
+    """Refuse arguments of another kind, as in another order, by name."""
+    if not isinstance(topic, str) or not topic:
+        raise ValidationError(f"topic must be a key expression, such as strands/*/state, not {shown(topic)}.")
+    if name is not None and not isinstance(name, str):
+        raise ValidationError(f"name must be text, not {shown(name)}.")
+    for called, each in callbacks.items():
+        if each is not None and not callable(each):
+            raise ValidationError(f"{called} must be callable, not {shown(each)}.")
 
 
 def _safety_key(robot: Any, peer: str, *, keep: bool) -> str | None:

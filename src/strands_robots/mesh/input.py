@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from strands_robots.mesh import topics
 from strands_robots.mesh.input_receiver import InputMesh, InputReceiver
-from strands_robots.mesh.security import validate_mesh_identifier
+from strands_robots.mesh.security import check_input_key, validate_mesh_identifier
 from strands_robots.mesh.transport import TransportError
 from strands_robots.mesh.wire import WireError
 from strands_robots.moved import of_module
@@ -179,6 +179,8 @@ class InputPublisher:
         left_out = sorted(str(key) for key in action if str(key) not in joints)
         if not joints:
             raise ValidationError(f"action must hold a finite number for at least one joint, not {shown(action)}.")
+        for key in joints:
+            check_input_key(key)
         if left_out and left_out != self._left_out:
             logger.warning("%s: no finite numbers, left out of the frames: %s", self.topic, ", ".join(left_out))
             self._left_out = left_out

@@ -26,7 +26,7 @@ from strands_robots.serving.verbs import Arguments
 from strands_robots.serving.workers import UNBOUNDED
 from strands_robots.stop_log import stop_logger
 from strands_robots.threads import BoundedExecutor
-from strands_robots.utils import ValidationError
+from strands_robots.utils import ValidationError, integral
 
 logger = stop_logger(__name__)
 
@@ -381,8 +381,9 @@ class InputReceiver:
             return None
         if frame.get("action") is None:
             return None
-        sequence = frame.get("seq")
-        if isinstance(sequence, bool) or not isinstance(sequence, int):
+        try:
+            sequence = integral("seq", frame.get("seq"))
+        except ValidationError:
             self._counts["invalid"] += 1
             return None
         if sequence <= self._sequence:

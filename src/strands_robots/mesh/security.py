@@ -6,6 +6,7 @@ the mesh, and holds the table of a command's fields. A machine reads ``Validatio
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING, Any
 
 from strands_robots import settings
@@ -32,6 +33,7 @@ TELEOP_VALUE_OUT_OF_RANGE = "TELEOP_VALUE_OUT_OF_RANGE"
 INPUT_KEYS = 64
 INPUT_KEY_CHARACTERS = 64
 INPUT_VALUE_ABS = 720.0
+_INPUT_KEY = re.compile(rf"[A-Za-z0-9_.-]{{1,{INPUT_KEY_CHARACTERS}}}\Z")
 
 
 def validate_mesh_identifier(value: object, name: str = "identifier") -> str:
@@ -75,11 +77,22 @@ def validate_command(command: object) -> dict[str, Any]:
     return {"action": verb.name, **verb.checked(given)}
 
 
+def check_input_key(key: str) -> None:
+    """Refuse a key of an input frame that can be no joint's.
+
+    Raises:
+        ValidationError: anything but 1 to 64 letters, digits, ``.``, ``_``, ``-``, or two dots in a row.
+    """
+    if not _INPUT_KEY.match(key) or ".." in key:
+        domain = f"1 to {INPUT_KEY_CHARACTERS} letters, digits, '.', '_' or '-', without two dots in a row"
+        raise ValidationError(f"the keys of action must be {domain}, not {shown(key)}.")
+
+
 def validate_input_frame(action: object, *, limit: float | None = None) -> dict[str, float]:
     """The action of one input frame as floats by joint.
 
     Args:
-        action: at most 64 keys of at most 64 characters, each a finite number.
+        action: at most 64 keys as :func:`check_input_key` has them, each a finite number.
         limit: largest magnitude; ``STRANDS_MESH_INPUT_VALUE_ABS`` where None.
 
     Raises:
@@ -90,8 +103,7 @@ def validate_input_frame(action: object, *, limit: float | None = None) -> dict[
     if len(given) > INPUT_KEYS:
         raise ValidationError(f"action must have at most {INPUT_KEYS} keys, not {len(given)}.")
     for key in given:
-        if not 1 <= len(key) <= INPUT_KEY_CHARACTERS or not key.isprintable():
-            raise ValidationError(f"action keys must be 1 to {INPUT_KEY_CHARACTERS} printable characters: {shown(key)}")
+        check_input_key(key)
     try:
         return {key: number(key, value, low=-most, high=most) for key, value in given.items()}
     except ValidationError as exc:

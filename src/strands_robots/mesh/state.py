@@ -29,6 +29,7 @@ from strands_robots.rate_limits import RateLimiter
 from strands_robots.safety.gate import MotionGate
 from strands_robots.serving.peer_verbs import kind_of
 from strands_robots.threads import BoundedExecutor
+from strands_robots.utils import plain_value
 
 logger = logging.getLogger(__name__)
 
@@ -138,8 +139,8 @@ class StateReader:
             for joint, value in inner.items():
                 if isinstance(value, Mapping):
                     entry = {"position": value.get("position"), "velocity": value.get("velocity")}
-                elif isinstance(value, int | float):
-                    entry = {"position": float(value), "velocity": self._velocity(f"{name}/{joint}", float(value), at)}
+                elif (position := _float(value)) is not None:
+                    entry = {"position": position, "velocity": self._velocity(f"{name}/{joint}", position, at)}
                 else:
                     continue
                 joints[joint if len(names) == 1 else f"{name}/{joint}"] = entry
@@ -148,13 +149,14 @@ class StateReader:
 
     def _velocity(self, joint: str, position: float, at: object) -> float | None:
         """Velocity by simulated time since the last message; None for the first."""
-        if not isinstance(at, int | float):
+        now = _float(at)
+        if now is None:
             return None
         known = self._positions.get(joint)
-        self._positions[joint] = (float(at), position)
+        self._positions[joint] = (now, position)
         if known is None:
             return None
-        passed = float(at) - known[0]
+        passed = now - known[0]
         return (position - known[1]) / passed if passed > 0 else 0.0
 
 
@@ -219,13 +221,15 @@ def _joints(state: Fields) -> dict[str, float]:
     good: dict[str, float] = {}
     bad: list[str] = []
     for name, value in (joints if isinstance(joints, Mapping) else {}).items():
-        if _is_number_or_none(value) and value is not None:
-            good[str(name)] = float(value)
+        position = _float(value)
+        if position is not None and math.isfinite(position):
+            good[str(name)] = position
         else:
             bad.append(str(name))
     problem, age = state.get("joints_error"), state.get("joints_age_s")
     if problem:
-        fresh = isinstance(age, int | float) and age <= STALE_S
+        aged = _float(age)
+        fresh = aged is not None and aged <= STALE_S
         raise UnreadableError("stale", str(problem), good if fresh else None)
     return _without(good, bad)
 
@@ -240,15 +244,20 @@ def _without(joints: dict[str, Any], bad: list[str]) -> dict[str, Any]:
 def _is_number_or_none(value: object) -> bool:
     if value is None:
         return True
-    try:
-        return not isinstance(value, bool | str | bytes) and math.isfinite(value)  # type: ignore[arg-type]
-    except TypeError:
-        return False
+    found = _float(value)
+    return found is not None and math.isfinite(found)
+
+
+def _float(value: object) -> float | None:
+    """Return a number, or an array's one element, as a float, else None."""
+    plain = plain_value(value)
+    while plain is not value and isinstance(plain, list) and len(plain) == 1:
+        plain = plain[0]
+    return float(plain) if isinstance(plain, int | float) and not isinstance(plain, bool) else None
 
 
 def _sim_time(state: Fields) -> float | None:
-    at = state.get("sim_time")
-    return float(at) if isinstance(at, int | float) else None
+    return _float(state.get("sim_time"))
 
 
 def _active(names: list[str], running: list[dict[str, Any]]) -> dict[str, bool]:
@@ -315,7 +324,7 @@ def _world_features(features: Fields) -> Fields:
 
 
 def _typed(device: Any, field: str, name: str, kind: type) -> Fields:
-    value = getattr(device, name, None)
+    value = plain_value(getattr(device, name, None))
     return {field: value} if isinstance(value, kind) and value != "" else {}
 
 
@@ -433,8 +442,8 @@ def _positions(joints: object) -> list[tuple[str, float]]:
     found = []
     for name, entry in joints.items() if isinstance(joints, Mapping) else ():
         at = entry.get("position") if isinstance(entry, Mapping) else entry
-        if isinstance(at, int | float) and not isinstance(at, bool):
-            found.append((str(name), float(at)))
+        if (position := _float(at)) is not None:
+            found.append((str(name), position))
     return found
 
 

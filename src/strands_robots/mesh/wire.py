@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 from strands_robots.bounded_json import OutOfBoundsError, parsed
 from strands_robots.errors import StrandsRobotsError
-from strands_robots.utils import ValidationError, identifier, peer_id, shown
+from strands_robots.utils import ValidationError, identifier, json_value, peer_id, plain_value, shown
 
 FRESH_S = 60.0
 AHEAD_S = 5.0
@@ -43,9 +43,10 @@ def encode(payload: Mapping[str, Any], limit: int) -> bytes:
     """
     try:
         data = _ENCODER.encode(payload).encode()
-    except ValueError:
+    except (TypeError, ValueError):
+        # A number that is not finite, or a key that is numpy's.
         data = _encode_finite(payload)
-    except (TypeError, RecursionError) as exc:
+    except RecursionError as exc:
         raise WireError(f"payload cannot be JSON: {exc}") from None
     if len(data) > limit:
         raise TooLargeError(f"a message of {len(data)} bytes is above the topic's {limit}.")
@@ -73,10 +74,11 @@ def decode(data: bytes, limit: int) -> dict[str, Any]:
 
 def finite(value: object) -> float | None:
     """Return a finite JSON number as a float, or None; a boolean is no number."""
-    if isinstance(value, bool) or not isinstance(value, int | float):
+    plain = plain_value(value)
+    if isinstance(plain, bool) or not isinstance(plain, int | float):
         return None
     try:
-        number = float(value)
+        number = float(plain)
     except OverflowError:
         return None
     return number if math.isfinite(number) else None
@@ -93,23 +95,24 @@ def _refuse_constant(name: str) -> float:
 
 def _encode_finite(payload: Mapping[str, Any]) -> bytes:
     try:
-        return json.dumps(_scrubbed(payload), allow_nan=False, separators=(",", ":")).encode()
+        return _ENCODER.encode(_scrubbed(payload)).encode()
     except (TypeError, ValueError, RecursionError) as exc:
         raise WireError(f"payload cannot be JSON: {exc}") from None
 
 
 def _scrubbed(value: Any) -> Any:
+    value = plain_value(value)
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, Mapping):
-        return {key: _scrubbed(entry) for key, entry in value.items()}
+        return {plain_value(key): _scrubbed(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
         return [_scrubbed(entry) for entry in value]
     return value
 
 
 # Made once: a coder with options is otherwise made anew for every message.
-_ENCODER = json.JSONEncoder(allow_nan=False, separators=(",", ":"))
+_ENCODER = json.JSONEncoder(allow_nan=False, separators=(",", ":"), default=json_value)
 _DECODER = json.JSONDecoder(parse_constant=_refuse_constant)
 
 

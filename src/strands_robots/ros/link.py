@@ -20,7 +20,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from strands_robots import settings
 from strands_robots.errors import StrandsRobotsError
-from strands_robots.utils import ValidationError, shown, whole
+from strands_robots.utils import ValidationError, plain_value, shown, whole
 
 logger = logging.getLogger(__name__)
 
@@ -368,6 +368,7 @@ def plain(message: Any) -> dict[str, Any]:
 
 
 def _value(kind: str, value: Any, place: str, new: NewMessage, zero: Any = None) -> Any:
+    value = plain_value(value)
     if (several := _several(kind)) is not None:
         return _items(*several, value, place, new)
     if "/" in kind:

@@ -21,7 +21,7 @@ from types import MappingProxyType
 from typing import Any, Literal, TypeAlias, TypeVar
 
 from strands_robots.errors import StrandsRobotsError
-from strands_robots.utils import DURATION_MAX_S, ValidationError, number, plain_text, shown, whole
+from strands_robots.utils import DURATION_MAX_S, ValidationError, integral, number, plain_text, shown
 from strands_robots.verb_parameters import JSON_TYPES, UNIT_MAX
 
 READS = frozenset(
@@ -148,7 +148,7 @@ class AdvertisedParameter:
         if self.type not in NUMERIC and (kind or not isinstance(value, int | float)):
             return ""
         try:
-            (whole if self.type == "integer" else number)(self.name, value, low=self.low, high=self.high)
+            (integral if self.type == "integer" else number)(self.name, value, low=self.low, high=self.high)
         except ValidationError as exc:
             return str(exc)
         return ""

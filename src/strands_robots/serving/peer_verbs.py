@@ -64,7 +64,7 @@ from strands_robots.serving.verbs import (
     release_torque_verb,
     table,
 )
-from strands_robots.utils import identifier, number, port
+from strands_robots.utils import identifier, number
 from strands_robots.verb_parameters import REQUIRED, Parameter
 
 POLL_S = 0.05
@@ -88,14 +88,14 @@ _PEER_POLICY = (
     _optional("instruction", str, INSTRUCTION.meaning, INSTRUCTION.check),
     DURATION,
     Parameter("policy_host", str, "Host of the policy's server, loopback or allowed", policy_host, "localhost"),
-    _optional("policy_port", int, "TCP port of the policy's server, 1 to 65535", port),
+    _optional("policy_port", int, "TCP port of the policy's server, 1 to 65535", between(1, 65535)),
     _optional("pretrained_name_or_path", str, "Checkpoint on the Hub, org/name", repository),
     _optional("control_frequency", float, "Rate of the policy in Hz, 0.1 to 2000", _frequency),
     _optional("action_horizon", int, "Actions taken of each chunk, 1 to 10000", between(1, 10_000)),
     _optional("n_steps", int, "Actions after which the policy ends, 1 to 10000000", between(1, 10_000_000)),
     _optional("target_pose", list, "Goal of the tip: 7 numbers", vector(7, exactly=True)),
-    _optional("target_joints", list, "Goal of the joints: at most 256 numbers", vector(256)),
-    _optional("target_velocity", list, "Goal velocity: at most 16 numbers", vector(16)),
+    _optional("target_joints", list, "Goal of the joints: 1 to 256 numbers", vector(256)),
+    _optional("target_velocity", list, "Goal velocity: 1 to 16 numbers", vector(16)),
     _PEER_ROBOT,
 )
 _NONCE = replace(NONCE, default=None)

@@ -19,7 +19,7 @@ from strands_robots.policies import provider_names
 from strands_robots.policies.profiles import profiles
 from strands_robots.safety.authorization import provider_refusal
 from strands_robots.serving.workers import UNBOUNDED
-from strands_robots.utils import ValidationError, identifier, number, shown, text
+from strands_robots.utils import ValidationError, identifier, number, plain_value, shown, text
 from strands_robots.verb_parameters import Check
 
 POLICY_HOST_NOT_ALLOWED = "POLICY_HOST_NOT_ALLOWED"
@@ -213,14 +213,16 @@ def repository(name: str, value: object) -> str:
 
 
 def vector(longest: int, *, exactly: bool = False) -> Check:
-    """Make a check of at most (or exactly) so many numbers within 1e6."""
-    domain = f"{'' if exactly else 'at most '}{longest} numbers within 1e6"
+    """Make a check of 1 to so many numbers within 1e6, or of exactly so many."""
+    domain = f"{'' if exactly else '1 to '}{longest} numbers within 1e6"
 
     def check(name: str, value: object) -> list[float] | dict[str, float]:
-        if isinstance(value, dict) and not exactly and len(value) <= longest:
-            return {identifier(name, key): number(name, entry, low=-1e6, high=1e6) for key, entry in value.items()}
-        if not isinstance(value, list) or len(value) > longest or (exactly and len(value) != longest):
+        plain = plain_value(value)
+        if isinstance(plain, dict) and not exactly and 0 < len(plain) <= longest:
+            return {identifier(name, key): number(name, entry, low=-1e6, high=1e6) for key, entry in plain.items()}
+        fits = isinstance(plain, list | tuple) and (longest if exactly else 1) <= len(plain) <= longest
+        if not fits:
             raise ValidationError(f"{name} must be {domain}, not {shown(value)}.")
-        return [number(name, entry, low=-1e6, high=1e6) for entry in value]
+        return [number(name, entry, low=-1e6, high=1e6) for entry in plain]
 
     return check

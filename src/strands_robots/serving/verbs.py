@@ -23,10 +23,10 @@ from strands_robots.utils import (
     alike,
     duration,
     identifier,
+    integral,
     number,
     shown,
     text,
-    whole,
 )
 from strands_robots.verb_parameters import JSON_TYPES, REQUIRED, Check, Parameter, checked_arguments
 
@@ -294,7 +294,7 @@ def _text(longest: int, *, empty: bool = False) -> Check:
 
 def between(low: int, high: int) -> Check:
     """Check a whole number within these bounds."""
-    return lambda name, value: whole(name, value, low=low, high=high)
+    return lambda name, value: integral(name, value, low=low, high=high)
 
 
 INSTRUCTION = Parameter("instruction", str, "What to do, in plain language, 1 to 2000 characters", _text(2000))

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from device_connect_edge.drivers import DeviceDriver, rpc
 from fixtures.mesh_peer import MeshPeer
@@ -133,6 +134,25 @@ class TestOnEachNetwork:
     def test_unread_argument_of_a_read_or_a_stop_is_ignored(self, site: Site) -> None:
         assert site.arm.call("getStatus", durration=1)["task_status"] == "idle"
         assert site.arm.call("stop", durration=1)["status"] == "success"
+
+    def test_values_of_numpy_are_numbers_and_lists_in_arguments_and_answers(
+        self, site: Site, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        reading = {"speed": np.float32(0.5), "ready": np.bool_(True), "pose": np.arange(3.0), "n": {np.int64(1): 2}}
+        for name in ("start_task", "get_task_status", "get_features", "get_state"):
+            own = getattr(site.toy, name)
+            answered = lambda *given, _own=own, **named: {**_own(*given, **named), **reading}  # noqa: E731
+            monkeypatch.setattr(site.toy, name, answered)
+        begun = site.arm.call(
+            "execute" if site.network == DEVICE_CONNECT else "start",
+            **{"instruction": "wave", "policy_provider": "mock", "duration": np.float32(300.0)},
+        )
+        for answer in (begun, site.arm.status(), site.arm.features(), site.arm.state()):
+            assert answer["status"] == "success"
+            assert (answer["speed"], answer["ready"], answer["pose"]) == (0.5, True, [0.0, 1.0, 2.0])
+            assert answer["n"] == {"1": 2}
+        with pytest.raises(errors.ArgumentsError, match="duration"):
+            site.arm.call("execute", instruction="wave", policy_provider="mock", duration=np.float32("nan"))
 
     def test_unknown_verb_is_refused_with_similar_names(self, site: Site) -> None:
         with pytest.raises(errors.UnknownVerbError, match="acquireControl"):

@@ -21,7 +21,7 @@ from strands_robots.ros.link import (
 )
 from strands_robots.safety.gate import MotionsHeldError, Permit, PermitVoidError
 from strands_robots.stop_log import stop_logger
-from strands_robots.utils import MissingExtraError
+from strands_robots.utils import MissingExtraError, plain_value
 
 logger = stop_logger(__name__)
 
@@ -431,7 +431,7 @@ class OdometryMonitor:
 
 def _norm(part: object) -> float | None:
     parts = list(part.values()) if isinstance(part, Mapping) else [part]
-    values = [v for v in parts if isinstance(v, int | float) and not isinstance(v, bool)]
+    values = [v for v in map(plain_value, parts) if isinstance(v, int | float) and not isinstance(v, bool)]
     if len(values) != len(parts):
         return None
     norm = math.hypot(*values)

@@ -77,7 +77,7 @@ from strands_robots.safety.network_key import NetworkKey
 from strands_robots.safety.statements import enrolled_peers, lockout_distrust
 from strands_robots.safety.stop_roster import StopOutcome
 from strands_robots.tags import read_tags
-from strands_robots.utils import MissingExtraError, ValidationError, finite, near, plain_text, shown
+from strands_robots.utils import MissingExtraError, ValidationError, finite, json_value, near, plain_text, shown
 
 if TYPE_CHECKING:
     from strands_robots.mesh import Mesh
@@ -603,7 +603,7 @@ def _carried(robot: str, verb: str, arguments: Mapping[str, Any]) -> Mapping[str
     try:
         for name, value in arguments.items():
             finite(name, value)
-        json.dumps(arguments, allow_nan=False)
+        json.dumps(arguments, allow_nan=False, default=json_value)
     except (ValidationError, TypeError, ValueError, RecursionError) as exc:
         problem = problem or str(exc)
     if problem and verb != "stop":
