@@ -92,7 +92,7 @@ WRONG: dict[str, list[Any]] = {
     "instruction": ["", "  ", "x" * 2001, "a\nb", "\x00", "\ud800", None, 1, True, [], {}],
     "policy_provider": ["", "a b", "../x", "x" * 200, None, 1, []],
     "duration": [0, -1, 3600.1, math.nan, math.inf, -math.inf, True, "30", None, [], 10**400],
-    "policy_port": [-1, 65536, 1.0, True, "80", None, math.nan, 10**100],
+    "policy_port": [-1, 65536, 1.5, True, "80", None, math.nan, 10**100],
 }
 
 

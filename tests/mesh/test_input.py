@@ -138,6 +138,8 @@ def test_a_stream_whose_leader_is_lost_is_closed_while_the_followers_bus_hangs(
     try:
         assert holding.wait(20)
         monkeypatch.setattr(input_receiver, "LOST_S", 0.1)
+        assert stream.receiver.running
+        monkeypatch.setattr(Mesh, "left", lambda *_: True)
         eventually(lambda: not stream.receiver.running)
         assert not free.is_set()
     finally:
@@ -264,6 +266,46 @@ def test_first_frame_is_bounded_by_the_followers_position(stream: Stream) -> Non
     stream.send(action={"shoulder.pos": 11.0})
     eventually(lambda: stream.stat("frames_received")() == 1)
     assert stream.arm.actions == [{"shoulder.pos": 11.0}]
+
+
+def test_first_frame_after_a_pause_is_bounded_by_the_followers_position(
+    stream: Stream, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    at = {"shoulder.pos": 10.0}
+    stream.arm.get_state = lambda: success("state", joints=dict(at), task={})  # type: ignore[method-assign]
+    stream.send(action={"shoulder.pos": 11.0})
+    eventually(lambda: stream.stat("frames_received")() == 1)
+    monkeypatch.setattr(input_receiver, "HOLD_S", 0.05)
+    eventually(lambda: stream.receiver.stats["holding"], what="the hold")
+    # By the time since its last frame, a leader could have gone anywhere.
+    stream.receiver._last = {"shoulder.pos": (11.0, time.monotonic() - 3600.0)}
+    at["shoulder.pos"] = 12.0
+    stream.send(action={"shoulder.pos": 700.0})
+    eventually(lambda: stream.stat("slew_rejected")() == 1)
+    assert len(stream.arm.actions) == 1
+    monkeypatch.setattr(input_receiver, "HOLD_S", 600.0)
+    stream.send(action={"shoulder.pos": 12.5})
+    eventually(lambda: stream.stat("frames_received")() == 2)
+    assert stream.receiver.running
+
+
+def test_first_frame_after_a_pause_is_bounded_by_the_last_one_where_no_joints_are_read(
+    stream: Stream, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stream.arm.get_state = lambda: success("state", joints={}, task={})  # type: ignore[method-assign]
+    stream.send(action={"shoulder.pos": 11.0})
+    eventually(lambda: stream.stat("frames_received")() == 1)
+    monkeypatch.setattr(input_receiver, "HOLD_S", 0.05)
+    eventually(lambda: stream.receiver.stats["holding"], what="the hold")
+    stream.send(action={"shoulder.pos": 700.0})
+    eventually(lambda: stream.stat("slew_rejected")() == 1)
+
+
+def test_follower_that_may_keep_a_speed_is_halted_in_a_pause(stream: Stream, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(input_receiver, "HOLD_S", 0.05)
+    stream.send(action={"shoulder.pos": 1.0, "x.vel": 0.5})
+    eventually(lambda: stream.arm.halts == ["its leader is silent"])
+    assert not stream.receiver.running
 
 
 def test_no_frame_is_applied_while_the_followers_joints_cannot_be_read(stream: Stream) -> None:

@@ -118,7 +118,7 @@ class Watch:
         eventually(lambda: self.looks > before + 10, what="looks at the time")
 
 
-def test_follower_of_a_silent_leader_holds_after_half_a_second_and_is_let_go_after_two(
+def test_follower_of_a_silent_leader_holds_after_half_a_second_and_follows_on_after_any_pause(
     cell: Cell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     watch = Watch()
@@ -139,17 +139,57 @@ def test_follower_of_a_silent_leader_holds_after_half_a_second_and_is_let_go_aft
     assert not cell.stream()["holding"]
     watch.go_to(last + HOLD_S + 0.01)
     eventually(lambda: cell.stream()["holding"], what="the hold")
-    watch.go_to(last + LOST_S - 0.01)
+    watch.go_to(last + 60 * LOST_S)
     assert cell.stream()["running"]
+    assert cell.ask(cell.agent, "getControl")["holder"] == "lead"
     targets = cell.world.body("arm").targets
     where = cell.world.body("arm").get_joints()
     assert targets["shoulder_pan"] == pytest.approx(where["shoulder_pan"], abs=0.05)
-    watch.at = last + LOST_S + 0.01
-    eventually(lambda: not cell.stream()["running"], what="the end of the stream")
+    before = cell.stream()["frames_received"]
+    again = InputPublisher(cell.lead, Leader(), hz=50)
+    again.start()
+    try:
+        eventually(lambda: cell.stream()["frames_received"] > before, what="frames again")
+        assert not cell.stream()["holding"]
+    finally:
+        again.stop()
     assert cell.world.gate.refusal("motion") is None
 
 
-def test_leader_that_pauses_for_less_than_two_seconds_leads_on(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stream_in_a_pause_ends_with_its_lifetime(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
+    cell.begin()
+    cell.publisher.stop()
+    monkeypatch.setenv("STRANDS_MESH_INPUT_STREAM_TTL_S", "1")
+    eventually(lambda: not cell.stream()["running"], what="the end of the stream")
+
+
+def test_stream_of_a_leader_that_left_the_mesh_ends_and_says_so(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
+    cell.begin()
+    cell.publisher.stop()
+    monkeypatch.setattr(input_receiver, "LOST_S", LOST_S)
+    cell.lead.stop()
+    eventually(lambda: not cell.stream()["running"], what="the end of the stream")
+    assert "left the mesh" in cell.stream()["ended"]
+    assert cell.ask(cell.agent, "acquireControl")["status"] == "success"
+
+
+def test_caller_that_moves_the_robot_in_a_pause_ends_the_stream(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
+    cell.begin()
+    cell.publisher.stop()
+    real_windows(monkeypatch)
+
+    acquired = {"action": "acquireControl", "ttl_s": 60.0}
+    eventually(lambda: cell.ask(cell.agent, **acquired).get("status") == "success", what="a robot free for the agent")
+    again = InputPublisher(cell.lead, Leader(), hz=50)
+    again.start()
+    try:
+        eventually(lambda: not cell.ask(cell.agent, "teleop_status")["streams"], what="no stream")
+    finally:
+        again.stop()
+    assert cell.world.gate.refusal("motion") is None
+
+
+def test_leader_that_pauses_leads_on(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
     cell.begin()
     cell.publisher.stop()
     monkeypatch.setattr(input_receiver, "HOLD_S", HOLD_S)

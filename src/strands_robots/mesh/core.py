@@ -423,6 +423,10 @@ class Mesh(SensorLoopsMixin):
         """Return the session that a peer claimed last, or None."""
         return self._context.registry.session_of(peer_id)
 
+    def left(self, peer_id: str, session: str) -> bool:
+        """Return True where a peer has left the mesh, or came back by another session."""
+        return self._context.registry.left(peer_id, session)
+
     @property
     def stops_waiting(self) -> int:
         """The stops of other peers that have no answer yet."""

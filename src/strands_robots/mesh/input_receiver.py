@@ -38,7 +38,10 @@ HOLD_S = 0.5
 """Silence of a leader, in seconds, after which its follower holds its position."""
 
 LOST_S = 2.0
-"""Silence after which the stream is closed, and the follower is free for others."""
+"""Silence after which others may move the follower, which ends the stream, as does a leader that left the mesh."""
+
+POSITION = ".pos"
+"""End of a key whose value a servo holds by itself, LeRobot's word for positions."""
 
 WATCH_S = 0.05
 
@@ -138,6 +141,9 @@ class InputMesh(Protocol):
     def peer_wire_zid(self, peer_id: str) -> str | None:
         """Return the session that a peer announced itself from, or None."""
 
+    def left(self, peer_id: str, session: str) -> bool:
+        """Return True where a peer is no more on the mesh by this session."""
+
     def publish(self, key: str, payload: dict[str, Any]) -> None:
         """Publish an object under a key."""
 
@@ -154,8 +160,9 @@ class InputReceiver:
     Frames are applied one after another on a thread of the stream's own, so that a slow bus holds up neither the
     transport nor a stop; a bus slower than the leader loses the oldest frames, counted as rate-dropped.
 
-    A leader that moved the follower and falls silent for 0.5 s leaves it holding its position; after 2 s the stream is
-    closed. Neither locks.
+    A leader may pause: after 0.5 s without a frame the follower holds its position, and the first frame after that is
+    bounded from where the follower then is. The stream goes on until it is stopped, its lifetime is over, its leader
+    has left the mesh, or another caller moves the robot after 2 s of silence. None of them locks.
 
     Raises:
         ValidationError: ``source_peer_id`` or ``device_name`` is no identifier.
@@ -179,7 +186,9 @@ class InputReceiver:
         self._running = False
         self._permit: Permit | None = None
         self._session: str | None = None
-        self._opened = self._ended = self._moved = 0.0
+        self._opened = self._ended = self._moved = self._came = 0.0
+        self._end = ""
+        self._led: set[str] = set()
         self._holds = False
         self._holding: threading.Thread | None = None
         self._closed = threading.Event()
@@ -202,8 +211,13 @@ class InputReceiver:
 
     @property
     def leading(self) -> bool:
-        """True while the leader moves the follower, or has just begun."""
-        return self.running and time.monotonic() - max(self._opened, self._moved) < LOST_S
+        """True while the leader may move the follower, also in a pause."""
+        return self.running
+
+    @property
+    def pauses(self) -> bool:
+        """True while the leader has been silent for so long that another may move it."""
+        return self.running and time.monotonic() - max(self._opened, self._moved) >= LOST_S
 
     @property
     def stats(self) -> dict[str, Any]:
@@ -223,6 +237,7 @@ class InputReceiver:
             "slew_rejected": counts["slew"],
             "rejected": sum(rejections.values()),
             **rejections,
+            "ended": self._end,
             "hz_actual": round(counts["received"] / elapsed, 2) if elapsed > 0 else 0.0,
         }
 
@@ -250,8 +265,9 @@ class InputReceiver:
         self.join(2.0)
         return self.stats
 
-    def void(self) -> None:
+    def void(self, why: str = "") -> None:
         """Let no frame move the robot from now on; one flag, which waits for nothing."""
+        self._end = why or self._end
         if self._permit is not None:
             self._permit.withdraw()
 
@@ -295,6 +311,7 @@ class InputReceiver:
         if self._mesh.lockout_epoch is not None:
             return f"locked by the emergency stop {self._mesh.lockout_epoch}"
         self._session, self._sequence, self._last, self._seeded = session, -1, {}, False
+        self._came, self._end, self._led = 0.0, "", set()
         self._tokens, self._refilled = BURST, time.monotonic()
         self._counts = Counter()
         self._executor = BoundedExecutor(f"mesh-follow-{self._device}", DEPTH)
@@ -312,14 +329,19 @@ class InputReceiver:
         return None
 
     def _watch(self, closed: threading.Event) -> None:
-        """Hold the follower, then close the stream, of a leader that fell silent."""
+        """Hold the follower of a leader that pauses; close the stream at its end."""
         while not closed.wait(WATCH_S) and self.running:
-            silent = time.monotonic() - self._moved
+            now = time.monotonic()
+            silent = now - max(self._opened, self._moved)
+            if self._expired(now):
+                self._counts["expired"] += 1
+                self._expire()
+                return
+            if silent >= LOST_S and self._session is not None and self._mesh.left(self._source, self._session):
+                self._lose(silent, "its leader has left the mesh")
+                return
             if not self._moved or silent < HOLD_S:
                 continue
-            if silent >= LOST_S:
-                self._lose(silent)
-                return
             if not self._holds and (self._holding is None or not self._holding.is_alive()):
                 self._holds = True
                 # It waits for the bus, which a write may block; the stream of a lost leader is closed all the same.
@@ -328,12 +350,13 @@ class InputReceiver:
                     self._holding.start()
                 except RuntimeError:
                     logger.critical("%s: the system has no thread for the hold.", self.topic, exc_info=True)
-                    self._lose(silent)
+                    self._lose(silent, "its leader is silent, and the system has no thread for a hold")
                     self._hold()
                     return
 
-    def _lose(self, silent: float) -> None:
-        logger.warning("%s: the leader is silent; the stream is closed.", self.topic)
+    def _lose(self, silent: float, why: str) -> None:
+        logger.warning("%s: the stream is closed: %s.", self.topic, why)
+        self._end = why
         self._mesh.inputs.record("input_stream_lost", self._source, device=self._device, silent_s=round(silent, 2))
         self.close()
 
@@ -342,7 +365,8 @@ class InputReceiver:
         try:
             if callable(body):
                 body().hold(self._permit)
-            elif isinstance(self._robot, Haltable):
+            elif isinstance(self._robot, Haltable) and not all(key.endswith(POSITION) for key in self._led):
+                # What it was given last may be a speed, which it keeps. A halt ends the stream.
                 stop_executor().halt(self._robot, self._source, "its leader is silent")
         except Exception:
             logger.critical("%s: the follower could not hold its position.", self.topic, exc_info=True)
@@ -359,10 +383,9 @@ class InputReceiver:
             self._counts["lockout"] += 1
             self.close()
             return
-        if time.monotonic() - self._opened > settings.number("STRANDS_MESH_INPUT_STREAM_TTL_S"):
+        if self._expired(time.monotonic()):
             self._counts["expired"] += 1
-            self.close()
-            self._mesh.inputs.record("input_stream_expired", self._source, device=self._device)
+            self._expire()
             return
         try:
             frame = wire.decode(sample.payload, topics.BY_NAME["input"].max_bytes)
@@ -372,6 +395,14 @@ class InputReceiver:
         action = self._checked(frame, received)
         if action is not None:
             self._do(action)
+
+    def _expired(self, now: float) -> bool:
+        return now - self._opened > settings.number("STRANDS_MESH_INPUT_STREAM_TTL_S")
+
+    def _expire(self) -> None:
+        if self._running:
+            self.close()
+            self._mesh.inputs.record("input_stream_expired", self._source, device=self._device)
 
     def _checked(self, frame: Mapping[str, Any], received: float) -> dict[str, float] | None:
         """Return the action of a frame that passed every guard; else count it."""
@@ -430,8 +461,12 @@ class InputReceiver:
     def _too_fast(self, action: Mapping[str, float], now: float, cap: float) -> bool:
         fastest = settings.number("STRANDS_MESH_INPUT_SLEW_ABS")
         floor = 1.0 / cap if cap > 0 else 1.0 / 100.0
+        paused, self._came = now - self._came >= HOLD_S, now
         if fastest <= 0:
             return False
+        if paused:
+            # The follower held meanwhile, and may not catch up in one step with what its leader did.
+            self._seeded = False
         if not self._seeded:
             # A leader that stands apart is let in when the slew bound would have brought the follower to it.
             try:
@@ -441,7 +476,8 @@ class InputReceiver:
                     logger.warning("%s: nothing is applied until the follower's joints are read: %s", self.topic, exc)
                 return True
             self._seeded = True
-            self._last = {joint: (value, now) for joint, value in present.items()}
+            last = {joint: value for joint, (value, _) in self._last.items()}
+            self._last = {joint: (value, now) for joint, value in {**last, **present}.items()}
         for joint, value in action.items():
             known = self._last.get(joint)
             if known is not None and abs(value - known[0]) > fastest * max(now - known[1], floor):
@@ -467,6 +503,7 @@ class InputReceiver:
         except Exception as exc:  # noqa: BLE001 - a bus raises what it likes; the frame counts as not applied
             answer = {"status": "error", "reason": f"{type(exc).__name__}: {exc}"}
         self._counts["received"] += 1
+        self._led |= action.keys()
         self._moved, self._holds = time.monotonic(), False
         if is_error(answer):
             self._counts["errors"] += 1
@@ -558,8 +595,16 @@ class TeleopReceivers:
             return self._end(lambda key, each: True)
 
     def leading(self) -> bool:
-        """Return True while a leader moves a robot."""
+        """Return True while a leader may move a robot, also in a pause."""
         return any(receiver.leading for receiver in list(self._receivers.values()))
+
+    def end_pauses(self) -> None:
+        """Void the streams of leaders that pause, because another caller wants the robot."""
+        voided = [receiver for receiver in list(self._receivers.values()) if receiver.pauses]
+        for receiver in voided:
+            receiver.void("another caller has taken the robot in its leader's pause")
+        if voided:
+            UNBOUNDED.submit(self.reap)
 
     def void(self) -> None:
         """Let no frame move anything from now on, because a robot is being stopped.

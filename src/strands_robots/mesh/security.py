@@ -51,13 +51,14 @@ def validate_peer_id(value: object) -> str:
 
 
 def validate_command(command: object) -> dict[str, Any]:
-    """Return the command with defaults filled in and unknown keys dropped.
+    """Return the command with defaults filled in and what it does not read left out.
 
     Args:
         command: an object with ``action`` and that action's fields. A ``call`` of 0.5 is returned as it is: its
             receiver checks the arguments.
 
-    A stop is refused for none of its fields: what cannot be read is dropped, which stops more. A resume's assertion
+    A motion is refused for a field that it does not read, a read never. A stop is refused for none of its fields: what
+    cannot be read is dropped, which stops more. A resume's assertion
     is passed on unchanged: the check of its signature counts refusals.
 
     Raises:

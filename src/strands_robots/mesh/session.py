@@ -241,6 +241,11 @@ class PeerRegistry:
         row = self._row(peer_id)
         return row.session if row else None
 
+    def left(self, peer_id: str, session: str) -> bool:
+        """Return True for a peer that left this session; silence alone is no leave."""
+        row = self._row(peer_id)
+        return row is None or row.gone or row.session != session
+
     def of_world(self, peer_id: str, session: str | None) -> bool:
         """True for a robot of a world, which answers by the world.
 

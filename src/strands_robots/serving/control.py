@@ -274,6 +274,7 @@ class ControlLease:
         moving: whether it moves now, None where its state is unknown; asked only while the lease of one motion is in
             the way, on a thread of its own. It may hang.
         led_by: the leader at the robot's own machine that drives it, empty without one.
+        end_pauses: ends the streams of remote leaders that pause; it waits for nothing.
         hardware: False for a simulation, which a human may take without a key where none is configured.
         clock: monotonic seconds.
         wall: wall-clock seconds, against which an assertion's age is held.
@@ -288,6 +289,7 @@ class ControlLease:
         moving: Callable[[], bool | None],
         *,
         led_by: Callable[[], str] = lambda: "",
+        end_pauses: Callable[[], None] = lambda: None,
         hardware: bool = True,
         keys: Callable[[], Sequence[bytes]] = configured_keys,
         clock: Callable[[], float] = time.monotonic,
@@ -299,7 +301,7 @@ class ControlLease:
         self._halt = halt
         self._moving = BoundedCall(moving)
         self._fault = ""
-        self._led_by = led_by
+        self._led_by, self._end_pauses = led_by, end_pauses
         self.hardware = hardware
         self._keys = keys
         self._clock, self._wall, self._watched = clock, wall, watched
@@ -350,6 +352,7 @@ class ControlLease:
             NotHolderError: another holds it.
         """
         holder = caller_name(caller) or ANONYMOUS
+        self._give_way(holder)
         self._settle()
         leader = self._led_by()
         if leader:
@@ -438,6 +441,7 @@ class ControlLease:
             NotHolderError: another holds the robot, or the lease is over.
         """
         holder = caller_name(caller) or ANONYMOUS
+        self._give_way(holder)
         if self._lease is not None:
             self._settle()
         with self._changing:
@@ -496,6 +500,7 @@ class ControlLease:
         Raises:
             NotHolderError: another holds the robot.
         """
+        self._give_way(caller_name(caller) or ANONYMOUS)
         self._settle()
         with self._changing:
             lease = self._lease
@@ -557,6 +562,12 @@ class ControlLease:
         with self._changing:
             if self._lease is lease and not self._starting.begun:
                 self._lease = None
+
+    def _give_way(self, holder: str) -> None:
+        """Let the robot of a leader that pauses be free for another caller."""
+        lease = self._lease
+        if lease is None or (lease.one_motion and lease.holder != holder):
+            self._end_pauses()
 
     def _hold(self, lease: Lease) -> Lease:
         """Make it the robot's lease, which ends in its time from now on."""

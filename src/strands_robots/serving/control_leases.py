@@ -40,10 +40,13 @@ class InputStreams(Protocol):
     """Streams of remote leaders, which move the first robot of a world."""
 
     def leading(self) -> bool:
-        """Return True while a leader moves the robot."""
+        """Return True while a leader may move the robot, also in a pause."""
 
     def void(self) -> None:
         """Let no frame move the robot from now on; wait for nothing."""
+
+    def end_pauses(self) -> None:
+        """Void the streams of leaders that pause; wait for nothing."""
 
 
 class ControlLeases:
@@ -108,6 +111,7 @@ class ControlLeases:
                     lambda reason: self._halt(name, shown_as, reason),
                     lambda: self._moves(name),
                     led_by=lambda: self._led_by(name),
+                    end_pauses=lambda: self._end_pauses(name),
                     hardware=self._hardware,
                     first_epoch=self._first_epoch,
                 )
@@ -153,6 +157,10 @@ class ControlLeases:
         robot = self._robot()
         led = getattr(body_of(robot), "teleoperated_by", None)
         return str(led(name or getattr(robot, "tool_name_str", ""))) if callable(led) else ""
+
+    def _end_pauses(self, name: str) -> None:
+        for each in self._streams_of(name):
+            each.end_pauses()
 
     def _moves(self, name: str) -> bool | None:
         if any(each.leading() for each in self._streams_of(name)):

@@ -16,6 +16,7 @@ import pytest
 from fixtures.waiting import eventually
 from tests.integration.mesh.networks import Network, network
 
+from strands_robots.mesh.input_receiver import LOST_S
 from strands_robots.mesh.resume_authority import keygen
 from strands_robots.mesh.transport import Transport
 
@@ -264,6 +265,25 @@ def test_a_leader_moves_its_follower_in_order_until_a_stop(net: Network) -> None
     time.sleep(0.1)
     assert len(arm.ask("actions")) == still
     assert console.ask("rest")["thread_alive"] is False
+    assert arm.ask("unfollow")["running"] is False
+
+
+def test_a_leaders_pause_ends_no_stream(net: Network) -> None:
+    net.needs("input")
+    console, arm = net.peers["console"], net.peers["arm-1"]
+    eventually(lambda: arm.ask("follow", "console") is None, what="the leader has announced itself")
+    console.ask("lead")
+    eventually(lambda: arm.ask("followed")["frames_received"] > 5, what="frames")
+    console.ask("rest")
+    paused = time.monotonic()
+    eventually(lambda: arm.ask("followed")["holding"], what="the hold")
+    eventually(lambda: time.monotonic() > paused + 1.5 * LOST_S, what="a pause beyond every bound")
+    before = arm.ask("followed")
+    assert before["running"]
+    console.ask("lead")
+    eventually(lambda: arm.ask("followed")["frames_received"] > before["frames_received"] + 5, what="frames again")
+    assert not arm.ask("followed")["holding"]
+    console.ask("rest")
     assert arm.ask("unfollow")["running"] is False
 
 

@@ -192,7 +192,6 @@ class FollowedPeer:
 
     def __init__(self, peer: str, receiver: InputReceiver) -> None:
         self._peer, self._receiver = peer, receiver
-        self._frames, self._received = 0, time.monotonic()
 
     @property
     def stats(self) -> dict[str, Any]:
@@ -200,13 +199,9 @@ class FollowedPeer:
         return self._receiver.stats
 
     def over(self) -> str:
-        """Return why following is over, empty while it is not."""
-        now, stats = time.monotonic(), self.stats
-        if stats["frames_received"] != self._frames:
-            self._frames, self._received = stats["frames_received"], now
-        if not stats["running"]:
-            return f"The robot stopped following: {_stream_end(stats)}."
-        return f"{self._peer} has been silent for {_SILENT_S:g} s." if now - self._received > _SILENT_S else ""
+        """Return why following is over; empty also while the leader pauses."""
+        stats = self.stats
+        return "" if stats["running"] else f"The robot stopped following {self._peer}: {_stream_end(stats)}."
 
 
 @contextmanager
@@ -278,7 +273,8 @@ def await_peer(mesh: Mesh, peer: str) -> None:
 
 def _stream_end(counters: Mapping[str, Any]) -> str:
     """Return why a stream ended, from the follower's counters."""
-    return next((text for name, text in _REASONS.items() if counters.get(name)), _STOPPED)
+    why = plain_text(counters.get("ended"), 200)
+    return why or next((text for name, text in _REASONS.items() if counters.get(name)), _STOPPED)
 
 
 def _fields(name: str, value: object) -> Mapping[str, Any]:
