@@ -99,13 +99,18 @@ def adapt(robot: Any, joints: JointReader | None = None) -> TaskRobot:
     return AdaptedRobot(checked_object(robot), joints)
 
 
+def is_value(value: object) -> bool:
+    """Return True for a text, a number, a collection, a class or a module."""
+    return issubclass(type(value), _VALUES)
+
+
 def checked_object(robot: object) -> object:
     """Return what may be another's robot.
 
     Raises:
         ValidationError: it is None or a plain value, such as a name.
     """
-    if robot is None or issubclass(type(robot), _VALUES):
+    if robot is None or is_value(robot):
         raise ValidationError(f"robot must be an object with {', '.join(_TASK_VERBS)}, not {shown(robot)}.")
     return robot
 

@@ -319,8 +319,10 @@ def driver_for(robot: Any, peer_type: str) -> DeviceDriver:
     if isinstance(robot, DeviceDriver):
         return robot
     # A test double has every attribute, and is what the caller says.
-    either = peer_type == "sim" and callable(getattr(robot, "list_robots", None))
-    driver = None if either else _driver_by_class(robot)
+    lists = callable(getattr(robot, "list_robots", None))
+    driver = None if peer_type == "sim" and lists else _driver_by_class(robot)
+    if peer_type == "sim" and not lists and callable(getattr(robot, "start_task", None)):
+        raise ValidationError(f"peer_type must be robot for {type(robot).__name__}, which has no list_robots, not sim.")
     if driver is None:
         return SimulationDeviceDriver(robot) if peer_type == "sim" else RobotDeviceDriver(robot)
     if peer_type == "sim" and not isinstance(driver, SimulationDeviceDriver):
