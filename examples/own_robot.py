@@ -31,6 +31,8 @@ class Turntable:
     def start_task(
         self, instruction: str, policy_provider: str = "mock", duration: float = 30.0, policy_port: int = 0
     ) -> Envelope:
+        if not 0 < duration <= 3600:  # nor is NaN
+            return error(f"duration must be above 0 and at most 3600 s, not {duration}.")
         with self._lock:
             if not self._still.is_set():
                 return error("The turntable turns already; stop it first.")
@@ -60,9 +62,11 @@ class Turntable:
 
     def _turn(self, duration: float) -> None:
         ends = time.monotonic() + duration
-        while time.monotonic() < ends and not self._asked_to_stop.wait(STEP_S):
-            self._angle_deg, self._steps = (self._angle_deg + STEP_DEG) % 360, self._steps + 1
-        self._still.set()
+        try:
+            while time.monotonic() < ends and not self._asked_to_stop.wait(STEP_S):
+                self._angle_deg, self._steps = (self._angle_deg + STEP_DEG) % 360, self._steps + 1
+        finally:  # also when the motor raises: it stands then, and can be started again
+            self._still.set()
 
 
 if __name__ == "__main__":

@@ -55,7 +55,7 @@ FLOORS: list[set[str]] = [
     {"serving"},
     {"device_connect", "mesh", "mesh_session"},
     {"fleet"},
-    {"cli", "tools", "mcp", "dashboard", "evaluation", "robot", "http_access"},
+    {"cli", "tools", "mcp", "dashboard", "evaluation", "robot", "http_access", "testing"},
 ]
 
 ASKS_KINDS = {"adapted", "contract"}

@@ -10,6 +10,8 @@ from __future__ import annotations
 import logging
 import math
 import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 logger = logging.getLogger(__name__)
@@ -461,6 +463,23 @@ def put(name: str, value: str) -> None:
     """Set a declared variable for this process and its children."""
     os.environ[_TABLE[name].name] = value
     _put.add(name)
+
+
+@contextmanager
+def only(values: Mapping[str, str]) -> Iterator[None]:
+    """Set these declared variables, and no others, for the block.
+
+    It is the environment of the whole process, so one block at a time.
+    """
+    before = {name: os.environ.pop(name) for name in _TABLE if name in os.environ}
+    try:
+        for name, value in values.items():
+            put(name, value)
+        yield
+    finally:
+        for name in _TABLE:
+            os.environ.pop(name, None)
+        os.environ.update(before)
 
 
 def is_set(name: str) -> bool:

@@ -1,0 +1,366 @@
+"""Bench of one robot, which is served on both networks of this process.
+
+Its ports are used by nothing else. The user's settings do not count meanwhile, and state is kept in a directory that
+is removed. Nothing leaves the machine.
+"""
+
+from __future__ import annotations
+
+import logging
+import socket
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
+from typing import Any, Self, TypeVar
+
+from strands_robots import settings
+from strands_robots.adapted import adapt, behind_contract
+from strands_robots.contract import holds_robots, robots_in
+from strands_robots.device_connect import init_device_connect_sync, stop_device_connect
+from strands_robots.device_connect.backends.config import loopback_config
+from strands_robots.errors import RefusalError, StrandsRobotsError
+from strands_robots.fleet.device_connect.network import DeviceConnectNetwork
+from strands_robots.fleet.fleet import Fleet
+from strands_robots.fleet.mesh.network import MeshNetwork
+from strands_robots.fleet.remote_robot import RemoteRobot
+from strands_robots.mesh import init_mesh
+from strands_robots.safety.estop_listener import estop_listener
+from strands_robots.safety.plane import plane
+from strands_robots.safety.stopping import StopVerdict
+from strands_robots.serving.advertised import RESUMES, AdvertisedParameter, AdvertisedVerb
+from strands_robots.testing.subject import LongMotion, Subject
+
+T = TypeVar("T")
+
+PEER = "conform-robot"
+CALLER = "conform"
+ANSWER_S = 10.0
+"""Seconds in which a read, a refusal or a start has to be answered."""
+
+_EVERY_S = 0.005
+
+TASKS = ("execute", "start")
+"""Verbs that start a task, on Device Connect and on the mesh."""
+
+TASK = {"instruction": "wave", "policy_provider": "mock", "duration": 30.0}
+
+
+class NotKeptError(StrandsRobotsError, AssertionError):
+    """A promise that is not kept; the text says what happened."""
+
+
+class NotProvenError(StrandsRobotsError):
+    """A promise that cannot be checked on this robot; the text says what is missing."""
+
+
+class DriftError(NotKeptError):
+    """The robot does something other than what it declares."""
+
+
+def within(seconds: float, call: Callable[[], T], what: str) -> T:
+    """Return what ``call`` returns, on a thread of its own.
+
+    A robot may hang in it for ever.
+
+    Raises:
+        NotKeptError: no answer in time.
+        Exception: what the call raises.
+    """
+    answer: list[T] = []
+    raised: list[BaseException] = []
+
+    def work() -> None:
+        try:
+            answer.append(call())
+        except BaseException as exc:  # noqa: BLE001 - it is raised on the thread that waits
+            raised.append(exc)
+
+    thread = threading.Thread(target=work, name="conform call", daemon=True)
+    thread.start()
+    thread.join(seconds)
+    if raised:
+        raise raised[0]
+    if not answer:
+        raise NotKeptError(f"{what} gave no answer within {seconds:g} s")
+    return answer[0]
+
+
+class ConformanceBench:
+    """A robot of a subject, served on both networks, and a caller on each.
+
+    Args:
+        subject: makes the robot.
+    """
+
+    def __init__(self, subject: Subject) -> None:
+        self.subject = subject
+        self._stack = ExitStack()
+        self.body: Any = None
+        self.on: dict[str, RemoteRobot] = {}
+        """The robot as callers have it, by network."""
+
+        self._fleets: list[Fleet] = []
+
+    def __enter__(self) -> Self:
+        with ExitStack() as stack:
+            stack.enter_context(_own_settings(self.subject.deadline_s))
+            self.body = stack.enter_context(made(self.subject))
+            runtime = init_device_connect_sync(self.body, peer_id=PEER, link=loopback_config())
+            stack.callback(stop_device_connect, runtime)
+            peer = init_mesh(self.body, PEER)
+            if peer is not None:
+                stack.callback(peer.close)
+            for network in (DeviceConnectNetwork(loopback_config(), CALLER), MeshNetwork(f"{CALLER}-mesh")):
+                fleet = stack.enter_context(Fleet([network]))
+                self._fleets.append(fleet)
+                self.on[network.name] = wait_for(partial(_found, fleet), ANSWER_S, "the robot on its network")
+            wait_for(_estops_arrive, ANSWER_S, "its e-stop link")
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._stack.__exit__(None, None, None)
+
+    @property
+    def remote(self) -> RemoteRobot:
+        """The robot on Device Connect."""
+        return next(iter(self.on.values()))
+
+    @property
+    def writes(self) -> int:
+        """Writes of its bus so far; 0 without a recorder."""
+        return 0 if self.subject.recorder is None else self.subject.recorder.count
+
+    def motions(self, network: str = "") -> list[AdvertisedVerb]:
+        """Return its verbs that may move it, on a network; by default on Device Connect."""
+        robot = self.on[network] if network else self.remote
+        return [each for each in robot.verbs.values() if each.kind == "motion" and each.name not in RESUMES]
+
+    def arguments(self, verb: AdvertisedVerb) -> dict[str, Any]:
+        """Return valid arguments of a motion, the subject's where it gives some."""
+        given = self.subject.motion
+        if given is not None and given.verb == verb.name:
+            return dict(given.arguments)
+        if verb.name in TASKS:
+            return dict(TASK)
+        return {each.name: usual_value(each) for each in verb.parameters if each.required}
+
+    def estop(self) -> None:
+        """Send an emergency stop to it, as a safety controller does."""
+        self._fleets[0].estop("emergency stop of a check")
+
+    def clear(self) -> None:
+        """Free it, as an operator at this machine does."""
+        plane().clear_local("conformance")
+
+    def halt(self, reason: str = "conformance") -> StopVerdict:
+        """Halt it by its own contract, within the deadline."""
+        body = behind_contract(self.body)
+        limit = self.subject.deadline_s + 1.0
+        return within(limit, lambda: body.halt(reason), "halt")
+
+    def rest(self) -> None:
+        """Have it stand still and unlocked, for the next check."""
+        with suppress(NotKeptError):
+            self.halt("the check is over")
+        self.clear()
+
+    @property
+    def motion(self) -> LongMotion:
+        """The motion that is stopped.
+
+        Raises:
+            NotProvenError: it has none that is known to last.
+        """
+        return self.subject.motion or usual_motion(self)
+
+    @contextmanager
+    def moving(self, network: str = "", motion: LongMotion | None = None) -> Iterator[MotionRun]:
+        """Have it move for the block, called over a network; it is halted at the end.
+
+        Raises:
+            NotProvenError: the motion ended before it could be stopped.
+        """
+        run = MotionRun(self, self.on[network] if network else self.remote, motion or self.motion)
+        try:
+            run.start()
+            yield run
+        finally:
+            with suppress(NotKeptError):
+                self.halt("the motion of a check is over")
+            run.join()
+
+    def check_still(self, verdict: StopVerdict, count: int, how: str) -> None:
+        """Check a verdict against the bus: stopped, and no write after ``count``.
+
+        Raises:
+            NotKeptError: it did not stop, or wrote after the verdict.
+        """
+        if verdict.stopped is not True:
+            raise NotKeptError(f"{how}: {verdict.envelope()['content'][0]['text']}")
+        self.check_no_write(count, how)
+
+    def check_no_write(self, count: int, how: str) -> None:
+        """Check that nothing is written after ``count`` for the subject's ``watch_s``.
+
+        Raises:
+            NotKeptError: a write followed.
+        """
+        recorder = self.subject.recorder
+        if recorder is None:
+            return
+        verdict_at = time.monotonic()
+        while time.monotonic() - verdict_at < self.subject.watch_s:
+            if late := recorder.since(count):
+                after_ms = max(0.0, (late[0].at - verdict_at) * 1000)
+                raise NotKeptError(f"{how}: {late[0].what or 'a write'} {after_ms:.0f} ms after the verdict")
+            time.sleep(_EVERY_S)
+
+
+class MotionRun:
+    """A motion under way, called over a network on a thread of its own."""
+
+    def __init__(self, bench: ConformanceBench, robot: RemoteRobot, motion: LongMotion) -> None:
+        self._bench, self._robot, self.motion = bench, robot, motion
+        self.answer: dict[str, Any] | RefusalError | None = None
+        self._thread = threading.Thread(target=self._call, name="conform motion", daemon=True)
+
+    def start(self) -> None:
+        """Start it and wait until the robot moves."""
+        before = self._bench.writes
+        self._thread.start()
+        deadline = time.monotonic() + self._bench.subject.answer_s
+        while time.monotonic() < deadline:
+            if isinstance(self.answer, RefusalError):
+                raise NotProvenError(f"{self.motion.verb} was refused: {self.answer}")
+            if self._bench.writes > before if self._bench.subject.recorder else runs(self._bench.body):
+                return
+            time.sleep(_EVERY_S)
+        raise NotProvenError(f"{self.motion.verb} did not move the robot within {self._bench.subject.answer_s:g} s")
+
+    @property
+    def over(self) -> bool:
+        """True once its call was answered."""
+        return not self._thread.is_alive()
+
+    def join(self) -> None:
+        """Wait for the answer of its call."""
+        self._thread.join(self._bench.subject.answer_s)
+
+    def _call(self) -> None:
+        try:
+            self.answer = self._robot.call(self.motion.verb, timeout=60.0, **self.motion.arguments)
+        except RefusalError as exc:
+            self.answer = exc
+
+
+@contextmanager
+def made(subject: Subject) -> Iterator[Any]:
+    """Yield a robot of the subject, and let go of it."""
+    body = subject.make()
+    try:
+        yield body
+    finally:
+        cleanup = getattr(body, "cleanup", None)
+        if callable(cleanup):
+            with suppress(NotKeptError):
+                within(ANSWER_S, cleanup, "cleanup")
+
+
+def usual_motion(bench: ConformanceBench) -> LongMotion:
+    """Return a task of the policy mock, or the first declared motion.
+
+    Raises:
+        NotProvenError: there is none whose arguments are known.
+    """
+    verbs = {each.name: each for each in bench.motions()}
+    for name in TASKS:
+        if name in verbs:
+            return LongMotion(name, TASK)
+    for verb in verbs.values():
+        if not verb.own:
+            continue
+        arguments = bench.arguments(verb)
+        if None not in arguments.values():
+            return LongMotion(verb.name, arguments)
+    raise NotProvenError("the robot declares no motion with known arguments; give the subject a motion")
+
+
+def usual_value(parameter: AdvertisedParameter) -> Any:
+    """Return a valid value of a parameter, the largest one; None for none known."""
+    if parameter.choices:
+        return parameter.choices[0]
+    if parameter.type in ("integer", "number"):
+        value = next((each for each in (parameter.high, parameter.default, parameter.low) if each is not None), 1)
+        return int(value) if parameter.type == "integer" else float(value)
+    return {"string": "conformance", "boolean": True, "array": [], "object": {}}.get(parameter.type)
+
+
+def runs(body: Any) -> bool:
+    """Return True while a task or a declared verb of the robot is under way."""
+    robot = adapt(body)
+    if robot.gate.under_way:
+        return True
+    if holds_robots(robot):
+        return any(robot.list_policies_running()) and bool(robots_in(robot))
+    status = getattr(robot, "get_task_status", None)
+    answer = within(ANSWER_S, status, "get_task_status") if callable(status) else {}
+    return isinstance(answer, Mapping) and str(answer.get("task_status", "")).lower() == "running"
+
+
+def wait_for(condition: Callable[[], T | None], seconds: float, what: str) -> T:
+    """Return the first truthy value of a condition.
+
+    Raises:
+        NotKeptError: the time is over.
+    """
+    deadline = time.monotonic() + seconds
+    while not (value := condition()):
+        if time.monotonic() >= deadline:
+            raise NotKeptError(f"{what} was not there within {seconds:g} s")
+        time.sleep(_EVERY_S)
+    return value
+
+
+def _estops_arrive() -> bool:
+    return all(each.link.up for each in estop_listener().registrations)
+
+
+def _found(fleet: Fleet) -> RemoteRobot | None:
+    try:
+        return fleet[PEER]
+    except RefusalError:
+        return None
+
+
+@contextmanager
+def _own_settings(deadline_s: float) -> Iterator[None]:
+    """Put the user's settings aside for open gates, free ports and own state."""
+    # By its level, so that whoever configured the log keeps it: each refusal and stop of a check would fill it.
+    ours = logging.getLogger("strands_robots")
+    level = ours.level
+    with tempfile.TemporaryDirectory(prefix="conform-", ignore_cleanup_errors=True) as state:
+        values = {
+            "STRANDS_STATE_DIR": state,
+            "STRANDS_DC_PORT": str(_free_port()),
+            "STRANDS_MESH_PORT": str(_free_port()),
+            "STRANDS_HALT_DEADLINE_S": str(deadline_s),
+            **dict.fromkeys(("DEVICE_CONNECT_RPC_ALLOW", "DEVICE_CONNECT_ESTOP_ALLOW"), "*"),
+            **dict.fromkeys(("BYPASS_TOOL_CONSENT", "STRANDS_ALLOW_MOCK"), "true"),
+        }
+        with settings.only(values):
+            ours.setLevel(logging.CRITICAL + 1)
+            try:
+                yield
+            finally:
+                ours.setLevel(level)
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port

@@ -1,0 +1,106 @@
+"""Results of the checks of a robot, in words and as JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from enum import Enum, StrEnum
+from typing import Any
+
+
+class Tier(Enum):
+    """Tier of a robot; each includes those below it."""
+
+    BRONZE = 1
+    SILVER = 2
+    GOLD = 3
+    PLATINUM = 4
+
+    @property
+    def label(self) -> str:
+        """Return its name in lower case."""
+        return self.name.lower()
+
+
+class CheckMark(StrEnum):
+    """Result of one check."""
+
+    PASSED = "passed"
+    FAILED = "failed"
+    DRIFT = "drift"
+    """The robot does something other than what it declares."""
+
+    NOT_PROVEN = "not proven"
+    EXEMPT = "exempt"
+    STALE = "stale exemption"
+    """The promise is kept, so its exemption has to go."""
+
+
+GOOD = frozenset({CheckMark.PASSED, CheckMark.EXEMPT})
+BAD = frozenset({CheckMark.FAILED, CheckMark.DRIFT, CheckMark.STALE})
+
+
+@dataclass(frozen=True, slots=True)
+class CheckResult:
+    """Result of a check, with the promise and where to look when it is not kept."""
+
+    check: str
+    tier: Tier
+    mark: CheckMark
+    said: str
+    promise: str
+    why: str
+    look: str
+    seconds: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class ConformanceReport:
+    """Results of all checks of one robot."""
+
+    name: str
+    results: Sequence[CheckResult]
+
+    @property
+    def tier(self) -> Tier | None:
+        """The highest tier up to which every promise is kept; None for none."""
+        reached = None
+        for tier in Tier:
+            marks = [each.mark for each in self.results if each.tier is tier]
+            if not marks or not GOOD.issuperset(marks):
+                break
+            reached = tier
+        return reached
+
+    @property
+    def failed(self) -> list[CheckResult]:
+        """Results that a test has to fail for; what is not proven is none of them."""
+        return [each for each in self.results if each.mark in BAD]
+
+    def words(self) -> str:
+        """Return the report for a person: the tier, then each promise that is not kept."""
+        tier = self.tier
+        lines = [f"{self.name}: {'no tier' if tier is None else tier.label}"]
+        for each in Tier:
+            marks = [result.mark for result in self.results if result.tier is each]
+            if marks:
+                counts = ", ".join(f"{marks.count(mark)} {mark}" for mark in CheckMark if mark in marks)
+                lines.append(f"  {each.label}: {counts}")
+        for result in self.results:
+            if result.mark is CheckMark.PASSED:
+                continue
+            lines.append(f"{result.mark.upper()} {result.check}: {result.said}")
+            if result.mark is not CheckMark.EXEMPT:
+                lines += [f"  promise: {result.promise}", f"  matters: {result.why}", f"  look at: {result.look}"]
+        return "\n".join(lines)
+
+    def facts(self) -> dict[str, Any]:
+        """Return the report as JSON can carry it."""
+        tier = self.tier
+        rows = [{**asdict(each), "tier": each.tier.label, "mark": each.mark.value} for each in self.results]
+        return {
+            "robot": self.name,
+            "tier": None if tier is None else tier.label,
+            "failed": len(self.failed),
+            "checks": rows,
+        }

@@ -1,0 +1,323 @@
+"""Silver: a halt halts, and nothing is written after its verdict."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+
+from strands_robots.adapted import behind_contract
+from strands_robots.errors import RefusalError
+from strands_robots.safety.stopping import StopVerdict
+from strands_robots.testing.bench import (
+    ConformanceBench,
+    NotKeptError,
+    NotProvenError,
+    made,
+    runs,
+    wait_for,
+    within,
+)
+from strands_robots.testing.promise import promise
+from strands_robots.testing.subject import LongMotion
+
+HUNDRED = 100
+PARALLEL = 3
+
+
+@promise(
+    "silver.halts",
+    "A halt in mid-motion says stopped, within the deadline, and no write follows.",
+    why="It is the one promise for which everything else is here.",
+    look="halt() or stop_task(): return when the last write is made; a verb: look at permit.valid before each write",
+    needs_recorder=True,
+)
+def halts(bench: ConformanceBench) -> str:
+    """Halt a motion once."""
+    with bench.moving():
+        verdict = bench.halt()
+        bench.check_still(verdict, bench.writes, "halt")
+    return f"{verdict.elapsed_ms:.1f} ms"
+
+
+@promise(
+    "silver.again",
+    "It is halted a second time as it is the first time: at rest, and in the next motion.",
+    why="A stop that works once is found out the second time.",
+    look="flags of the first halt that are not reset: an event, a thread that has ended",
+    needs_recorder=True,
+    needs="silver.halts",
+)
+def again(bench: ConformanceBench) -> str:
+    """Halt two motions, each twice."""
+    for nth in ("first", "second"):
+        with bench.moving():
+            for time_ in ("halt", "halt at rest"):
+                bench.check_still(bench.halt(), bench.writes, f"{time_} of the {nth} motion")
+    return ""
+
+
+@promise(
+    "silver.hundred",
+    "The hundredth halt is as the first.",
+    why="What is counted, pooled or remembered for each stop fills up.",
+    look="threads, locks and lists that a halt makes and leaves",
+    needs_recorder=True,
+    needs="silver.halts",
+)
+def hundred(bench: ConformanceBench) -> str:
+    """Halt a hundred times, in motion when it can be."""
+    slowest = 0.0
+    for nth in range(HUNDRED):
+        # Each tenth is in mid-motion: a robot may take its time to start.
+        if nth % 10:
+            verdict = bench.halt()
+        else:
+            with bench.moving():
+                verdict = bench.halt()
+                bench.check_no_write(bench.writes, f"halt {nth + 1}")
+        if verdict.stopped is not True:
+            raise NotKeptError(f"halt {nth + 1}: {verdict.envelope()['content'][0]['text']}")
+        slowest = max(slowest, verdict.elapsed_ms)
+    return f"slowest {slowest:.1f} ms"
+
+
+@promise(
+    "silver.threads",
+    "Three callers that halt it at once all get a verdict, and no write follows the first that says stopped.",
+    why="The operator, the safety controller and the agent press in the same second.",
+    look="a lock that a halt takes and waits under",
+    needs_recorder=True,
+    needs="silver.halts",
+)
+def threads(bench: ConformanceBench) -> str:
+    """Halt one motion from three threads."""
+    verdicts: list[StopVerdict] = []
+    problems: list[str] = []
+    with bench.moving():
+
+        def halt() -> None:
+            try:
+                verdicts.append(bench.halt())
+            except NotKeptError as exc:
+                problems.append(str(exc))
+
+        callers = [threading.Thread(target=halt, daemon=True) for _ in range(PARALLEL)]
+        for each in callers:
+            each.start()
+        for each in callers:
+            each.join(bench.subject.deadline_s + bench.subject.answer_s)
+        if problems or len(verdicts) < PARALLEL:
+            raise NotKeptError(f"{PARALLEL - len(verdicts)} of {PARALLEL} halts: {'; '.join(problems) or 'no verdict'}")
+        count = bench.writes
+        for verdict in verdicts:
+            bench.check_still(verdict, count, "one of three halts")
+    return ""
+
+
+@promise(
+    "silver.networks",
+    "A stop over each network halts as the local one does.",
+    why="Who presses is seldom at the robot's own process.",
+    look="halt() or stop_task(), which every stop calls",
+    needs_recorder=True,
+    needs="silver.halts",
+)
+def networks(bench: ConformanceBench) -> str:
+    """Stop a motion over each network, which a call over the other began."""
+    names = list(bench.on)
+    for start, stop in zip(names, reversed(names), strict=True):
+        with bench.moving(_on(start)):
+            verdict = within(
+                bench.subject.answer_s + bench.subject.deadline_s, bench.on[stop].halt, f"stop over {stop}"
+            )
+            bench.check_still(verdict, bench.writes, f"stop over {stop}")
+    return ""
+
+
+def _on(network: str) -> str:
+    # The mesh has a task's start under another name.
+    return network if network == "device_connect" else ""
+
+
+@promise(
+    "silver.verbs",
+    "Each motion of its own is halted in its middle.",
+    why="The stop of the built-in motions says nothing about those that its author wrote.",
+    look="the method with @verb: while permit.valid",
+    needs_recorder=True,
+    needs="silver.halts",
+)
+def own_verbs(bench: ConformanceBench) -> str:
+    """Halt each declared motion while it runs."""
+    halted, short = [], []
+    for verb in bench.motions():
+        if not verb.own:
+            continue
+        motion = LongMotion(verb.name, bench.arguments(verb))
+        try:
+            with bench.moving(motion=motion) as run:
+                verdict = bench.halt()
+                bench.check_still(verdict, bench.writes, f"halt of {verb.name}")
+                run.join()
+                if not run.over:
+                    raise NotKeptError(f"{verb.name} did not return after its stop")
+            halted.append(verb.name)
+        except NotProvenError as exc:
+            short.append(str(exc))
+    if short and not halted:
+        raise NotProvenError("; ".join(short))
+    return ", ".join(halted) or "it has none of its own"
+
+
+@promise(
+    "silver.unlinked",
+    "A robot that was never on a network is halted all the same.",
+    why="The first motion may begin before the first link is up.",
+    look="what halt() reads of a connection, a runtime or a peer",
+)
+def unlinked(bench: ConformanceBench) -> str:
+    """Halt another robot of the subject, which is on no network."""
+    with made(bench.subject) as body:
+        robot = behind_contract(body)
+        verdict = within(bench.subject.deadline_s + 1.0, lambda: robot.halt("conformance"), "halt")
+        if verdict.stopped is not True:
+            raise NotKeptError(f"halt of a robot on no network: {verdict.envelope()['content'][0]['text']}")
+    return ""
+
+
+@promise(
+    "silver.hung_read",
+    "A halt waits for no read: it answers while the robot's status and state hang.",
+    why="A dead sensor must not be what keeps an arm moving.",
+    look="get_task_status or get_state called by halt(), or a lock that both take",
+    needs_recorder=True,
+    needs="silver.halts",
+)
+def hung_read(bench: ConformanceBench) -> str:
+    """Halt a motion while reads of the robot hang on other threads."""
+    names = [each for each in HANGING if callable(getattr(bench.body, each, None))]
+    for name in names:
+        with bench.moving(), _hung(bench.body, name) as entered:
+            threading.Thread(target=lambda: _read(bench), name="conform read", daemon=True).start()
+            if not entered.wait(bench.subject.answer_s):
+                raise NotProvenError(f"{name} was not read")
+            verdict = bench.halt()
+            if name == STATUS:
+                # Whether it stopped is not known without its status; that it did is seen on its bus.
+                bench.check_no_write(bench.writes, f"halt beside a hung {name}")
+            else:
+                bench.check_still(verdict, bench.writes, f"halt beside a hung {name}")
+    return ", ".join(names) or "it has no state that is read"
+
+
+STATUS = "get_task_status"
+HANGING = ("get_state", "get_joints", STATUS)
+
+
+@contextmanager
+def _hung(body: object, name: str) -> Iterator[threading.Event]:
+    """Have a method of the robot hang for the block; yield its first call."""
+    own, method = vars(body).get(name), getattr(body, name)
+    entered, released = threading.Event(), threading.Event()
+
+    def hang(*values: object, **named: object) -> object:
+        entered.set()
+        released.wait()
+        return method(*values, **named)
+
+    setattr(body, name, hang)
+    try:
+        yield entered
+    finally:
+        released.set()
+        if own is None:
+            delattr(body, name)
+        else:
+            setattr(body, name, own)
+
+
+def _read(bench: ConformanceBench) -> None:
+    for read in (bench.remote.state, bench.remote.status):
+        try:
+            read()
+        except RefusalError:
+            continue
+
+
+@promise(
+    "silver.lockout",
+    "An emergency stop halts and locks it: every motion is refused until the operator's resume, reads are answered.",
+    why="A robot that moves again by itself is more dangerous than one that never stopped.",
+    look="a thread or timer of the robot that moves it without asking its gate for a permit",
+    needs_recorder=True,
+    needs="silver.halts",
+)
+def lockout(bench: ConformanceBench) -> str:
+    """Stop a motion by an emergency stop, and ask for each motion again."""
+    with bench.moving() as run:
+        sending = threading.Thread(target=bench.estop, name="conform estop", daemon=True)
+        sending.start()
+        wait_for(lambda: not runs(bench.body), bench.subject.answer_s, "the end of the motion after an emergency stop")
+        count = bench.writes
+        bench.check_no_write(count, "emergency stop")
+        sending.join()
+        run.join()
+        for robot in bench.on.values():
+            for verb in bench.motions(robot.network):
+                try:
+                    robot.call(verb.name, timeout=bench.subject.answer_s, **bench.arguments(verb))
+                except RefusalError:
+                    continue
+                raise NotKeptError(f"{verb.name} was carried out on {robot.network} while it was locked")
+            robot.status()
+        if bench.writes > count:
+            raise NotKeptError("it wrote while it was locked")
+        bench.clear()
+    with bench.moving():
+        bench.check_still(bench.halt(), bench.writes, "halt after the resume")
+    return ""
+
+
+@promise(
+    "silver.honest",
+    "While its bus raises or hangs, a halt answers in time, and says stopped only where no write follows.",
+    why="A verdict that is wrong is worse than none: people walk up to the robot.",
+    look="halt(): an exception of the bus that is swallowed, a lock that a hung write holds",
+    needs_recorder=True,
+    needs="silver.halts",
+)
+def honest(bench: ConformanceBench) -> str:
+    """Halt motions on a bus that raises, and on one that hangs."""
+    recorder = bench.subject.recorder
+    assert recorder is not None
+    faults: dict[str, Callable[[], AbstractContextManager[None]]] = {
+        "raises": lambda: recorder.raising(OSError(5, "the emulated cable is out")),
+        "hangs": recorder.hanging,
+    }
+    seen = []
+    for how, fault in faults.items():
+        with bench.moving():
+            with fault():
+                time.sleep(0.05)
+                verdict = bench.halt()
+            count = bench.writes
+            if verdict.stopped is True:
+                bench.check_no_write(count, f"halt on a bus that {how}")
+            seen.append(f"{how}: {'stopped' if verdict.stopped else 'not stopped'}")
+        _recovered(bench, how)
+    return ", ".join(seen)
+
+
+def _recovered(bench: ConformanceBench, how: str) -> None:
+    deadline = time.monotonic() + bench.subject.answer_s
+    verdict = bench.halt()
+    while verdict.stopped is not True and time.monotonic() < deadline:
+        verdict = bench.halt()
+    if verdict.stopped is not True:
+        said = verdict.envelope()["content"][0]["text"]
+        raise NotKeptError(f"after its bus {how}, no halt says stopped any more: {said}")
+
+
+PROMISES = (halts, again, hundred, threads, networks, own_verbs, unlinked, hung_read, lockout, honest)

@@ -1,0 +1,159 @@
+"""Robot under test, its long motion, and the recorder of its bus."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import wraps
+from typing import Any
+
+from strands_robots.utils import ValidationError, number, shown, text
+
+
+@dataclass(frozen=True, slots=True)
+class BusWrite:
+    """One write to a robot's bus: its moment in monotonic s, and what was written."""
+
+    at: float
+    what: str
+
+
+class BusRecorder:
+    """Writes to an emulated bus, and faults of it.
+
+    The proof of a stop is that no write follows the verdict, so record what moves the hardware at the place that
+    writes it::
+
+        recorder = BusRecorder()
+        recorder.watch(robot.bus, "write", "sync_write")     # these methods of it
+
+    or call :meth:`wrote` from the emulated bus itself, before each write.
+    """
+
+    def __init__(self) -> None:
+        self._writes: list[BusWrite] = []
+        self._fault: Callable[[], None] | None = None
+
+    def wrote(self, what: object = "") -> None:
+        """Record a write that is made now; raise what a check has the bus raise."""
+        fault = self._fault
+        if fault is not None:
+            fault()
+        self._writes.append(BusWrite(time.monotonic(), str(what)[:200]))
+
+    def watch(self, bus: Any, *methods: str) -> None:
+        """Record each call of these methods of ``bus``.
+
+        Raises:
+            ValidationError: it has no such method.
+        """
+        for name in methods:
+            method = getattr(bus, name, None)
+            if not callable(method):
+                raise ValidationError(f"methods must be methods of {shown(bus)}, not {shown(name)}.")
+            setattr(bus, name, self._recorded(name, method))
+
+    def _recorded(self, name: str, method: Callable[..., Any]) -> Callable[..., Any]:
+        @wraps(method)
+        def call(*values: Any, **named: Any) -> Any:
+            self.wrote(name)
+            return method(*values, **named)
+
+        return call
+
+    @property
+    def count(self) -> int:
+        """Writes so far."""
+        return len(self._writes)
+
+    def since(self, count: int) -> list[BusWrite]:
+        """Return the writes after the first ``count``."""
+        return self._writes[count:]
+
+    @contextmanager
+    def raising(self, problem: Exception) -> Iterator[None]:
+        """Have each write raise, as when a cable is pulled."""
+
+        def fault() -> None:
+            raise problem
+
+        with self._faulty(fault):
+            yield
+
+    @contextmanager
+    def hanging(self) -> Iterator[None]:
+        """Have each write hang until the block ends, as on a dead port."""
+        over = threading.Event()
+
+        def fault() -> None:
+            over.wait()
+
+        with self._faulty(fault):
+            try:
+                yield
+            finally:
+                over.set()
+
+    @contextmanager
+    def _faulty(self, fault: Callable[[], None]) -> Iterator[None]:
+        self._fault = fault
+        try:
+            yield
+        finally:
+            self._fault = None
+
+
+@dataclass(frozen=True, slots=True)
+class LongMotion:
+    """A motion that goes on for some 30 s unless it is stopped.
+
+    ``verb`` is its name on the wire.
+    """
+
+    verb: str
+    arguments: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A robot whose promises are checked.
+
+    Args:
+        make: makes the robot on its emulated bus, connected and standing still. It is called several times; at most
+            one robot lives at a time.
+        recorder: of that bus; without one it is not proven that a stop is followed by no write.
+        motion: for the checks that stop it; by default a task of the policy ``mock``, or the first motion that the
+            robot declares.
+        exempt: reasons by check, for promises that this robot does not make.
+        name: of the report.
+
+    Raises:
+        ValidationError: an argument outside its domain.
+    """
+
+    make: Callable[[], Any]
+    recorder: BusRecorder | None = None
+    motion: LongMotion | None = None
+    exempt: Mapping[str, str] = field(default_factory=dict)
+    name: str = "robot"
+    deadline_s: float = 2.0
+    """Seconds in which a halt has to answer; a real robot's is ``STRANDS_HALT_DEADLINE_S``."""
+
+    answer_s: float = 10.0
+    """Seconds in which a read, a refusal or the start of a motion has to be answered."""
+
+    watch_s: float = 0.25
+    """Seconds after a verdict in which no write may follow; several periods of its control loop."""
+
+    def __post_init__(self) -> None:
+        if not callable(self.make):
+            raise ValidationError(f"make must be a callable that makes the robot, not {shown(self.make)}.")
+        text("name", self.name, longest=100)
+        number("deadline_s", self.deadline_s, low=0.1, high=60)
+        number("answer_s", self.answer_s, low=0.1, high=60)
+        number("watch_s", self.watch_s, low=0.01, high=60)
+        for check, reason in self.exempt.items():
+            text(f"exempt[{check!r}]", reason, longest=500)

@@ -1,0 +1,132 @@
+"""The conformance suite on robots of this process, on real networks: it passes the good one and names each fault."""
+
+from __future__ import annotations
+
+import importlib.util
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from fixtures import faulty_robots
+from fixtures.faulty_robots import Rig, subject
+
+from strands_robots.hardware import HardwareRobot
+from strands_robots.testing import BusRecorder, CheckMark, Subject, Tier, conform
+
+EXAMPLES = Path(__file__).parents[3] / "examples"
+pytestmark = pytest.mark.system
+
+
+def example(name: str) -> Any:
+    spec = importlib.util.spec_from_file_location(f"conformed_{name}", EXAMPLES / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_robot_that_keeps_its_promises_is_gold() -> None:
+    report = conform(subject(Rig))
+    assert report.tier is Tier.GOLD, report.words()
+    assert not report.failed
+
+
+def test_nothing_of_a_run_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STRANDS_STATE_DIR", str(tmp_path))
+    monkeypatch.setenv("DEVICE_CONNECT_RPC_ALLOW", "agent")
+    conform(subject(Rig), only=["bronze.verbs"])
+    import os  # noqa: PLC0415 - the environment as it is now
+
+    assert (os.environ["STRANDS_STATE_DIR"], os.environ["DEVICE_CONNECT_RPC_ALLOW"]) == (str(tmp_path), "agent")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_without_a_recorder_silver_is_not_proven() -> None:
+    report = conform(Subject(lambda: Rig(BusRecorder())), only=["bronze.status", "silver.halts"])
+    assert [each.mark for each in report.results] == [CheckMark.PASSED, CheckMark.NOT_PROVEN]
+    assert report.tier is Tier.BRONZE
+
+
+def test_robot_that_cannot_be_made_is_named_with_its_error() -> None:
+    def make() -> Any:
+        raise OSError("no such port")
+
+    report = conform(Subject(make, name="portless"))
+    assert report.tier is None
+    assert "no such port" in report.words()
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_examples_are_gold() -> None:
+    """The robots that newcomers copy from: tasks, a device with LeRobot's methods, verbs of its own."""
+    recorder = BusRecorder()
+    barista = example("barista")
+
+    def step(seconds: float) -> None:
+        recorder.wrote("step")
+        time.sleep(seconds)
+
+    barista.time = SimpleNamespace(monotonic=time.monotonic, sleep=step)
+    own_robot = example("own_robot")
+
+    class Recorded(own_robot.Turntable):  # type: ignore[misc,name-defined]
+        def __setattr__(self, name: str, value: Any) -> None:
+            if name == "_angle_deg" and value:
+                recorder.wrote("angle")
+            super().__setattr__(name, value)
+
+    own_driver = example("own_driver")
+
+    def driver() -> HardwareRobot:
+        device = own_driver.PanTilt()
+        recorder.watch(device, "send_action")
+        robot = HardwareRobot(device, tool_name="pan-tilt")
+        robot.connect()
+        return robot
+
+    for name, make in {"barista": barista.Barista, "own_robot": Recorded, "own_driver": driver}.items():
+        report = conform(Subject(make, recorder, name=name))
+        assert report.tier is Tier.GOLD, report.words()
+
+
+FAULTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "IgnoresHalt": (("silver.halts",), ()),
+    "WritesAfterTheVerdict": (("silver.halts",), ()),
+    "BlocksInItsStop": (("silver.halts", "silver.unlinked"), ()),
+    "RaisesInItsStop": (("silver.halts", "silver.unlinked"), ()),
+    "AnswersItsStopWithText": (("silver.halts", "silver.unlinked"), ()),
+    "AnswersInAnUnknownShape": (("bronze.status", "silver.halts", "silver.unlinked"), ()),
+    "SaysMovingForEver": (("bronze.status", "silver.halts", "silver.unlinked"), ()),
+    "DropsTheSecondStop": (("silver.again",), ()),
+    "IgnoresItsPermit": (("silver.verbs",), ()),
+    "StopsUnderTheLockOfItsReads": (("silver.hung_read",), ()),
+    "MovesWhileLocked": (("silver.lockout",), ()),
+    "SaysStoppedOnAHungBus": (("silver.honest",), ()),
+    "IsDeadAfterABusError": (("silver.honest",), ("gold.recovers",)),
+    "HangsInItsStatus": (("gold.reads",), ("gold.events",)),
+    "LiesThatItIsIdle": (("gold.reads",), ("gold.events",)),
+    "IsReadUnderTheLockOfItsMotion": (("gold.reads",), ()),
+    "LeaksThreads": (("gold.starts",), ()),
+    "LeaksFiles": (("gold.starts",), ()),
+    "HoldsTheInterpreter": (("gold.threads_run",), ()),
+    "TakesNaN": (("bronze.domains",), ()),
+    "ChangesItsFeatures": (("bronze.features",), ()),
+    "LacksItsFeatures": (("bronze.features",), ()),
+    "HasUndeclaredJoints": (("bronze.features",), ()),
+    "ReadsNaN": (("bronze.features",), ()),
+    "RaisesInARead": (("bronze.reads",), ("gold.reads", "gold.own_verbs")),
+    "AnswersWhatJsonCannotCarry": (("bronze.reads",), ("gold.reads", "gold.own_verbs")),
+}
+"""Checks that find each fault, and those that it may also fail."""
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_fault_is_found_by_its_check_and_by_no_wrong_one(fault: str) -> None:
+    report = conform(subject(getattr(faulty_robots, fault)))
+    found, also = FAULTS[fault]
+    failed = {each.check for each in report.failed}
+    assert set(found) <= failed, report.words()
+    assert failed <= {*found, *also}, report.words()
