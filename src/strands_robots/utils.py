@@ -225,7 +225,7 @@ def number(
     above: float | None = None,
 ) -> float:
     """Return a finite float; ``low`` and ``high`` are included, ``above`` is not."""
-    plain = plain_value(value)
+    plain = value if type(value) in _PYTHONS_OWN else plain_value(value)
     if isinstance(plain, int | float) and not isinstance(plain, bool):
         try:
             result = float(plain)
@@ -252,7 +252,7 @@ def finite(name: str, value: object) -> None:
     left: list[tuple[str, object, int]] = [(name, value, 0)]
     while left:
         place, each, depth = left.pop()
-        each = plain_value(each)
+        each = each if type(each) in _PYTHONS_OWN else plain_value(each)
         inside: list[tuple[str, object]] = []
         if isinstance(each, Mapping):
             inside = [(f"{place}.{key}", one) for key, one in each.items()]
@@ -267,7 +267,7 @@ def finite(name: str, value: object) -> None:
 
 def whole(name: str, value: object, *, low: float | None = None, high: float | None = None) -> int:
     """Return an integer, bounds included; ``True`` is not 1 and 2.0 is not 2."""
-    plain = plain_value(value)
+    plain = value if type(value) in _PYTHONS_OWN else plain_value(value)
     if isinstance(plain, int) and not isinstance(plain, bool):
         inside = (low is None or plain >= low) and (high is None or plain <= high)
         if inside:
@@ -277,7 +277,7 @@ def whole(name: str, value: object, *, low: float | None = None, high: float | N
 
 def integral(name: str, value: object, *, low: float | None = None, high: float | None = None) -> int:
     """Return an integer of a message; 4.0 is 4, and ``True`` is not 1."""
-    plain = plain_value(value)
+    plain = value if type(value) in _PYTHONS_OWN else plain_value(value)
     if isinstance(plain, float) and plain.is_integer():
         plain = int(plain)
     return whole(name, plain if isinstance(plain, int) else value, low=low, high=high)
@@ -290,7 +290,7 @@ def duration(name: str, value: object) -> float:
 
 def flag(name: str, value: object) -> bool:
     """Return ``value`` as a boolean; a spelling of one, 0 and 1 are refused."""
-    plain = plain_value(value)
+    plain = value if type(value) in _PYTHONS_OWN else plain_value(value)
     if not isinstance(plain, bool):
         raise ValidationError(f"{name} must be true or false, not {shown(value)}.")
     return plain

@@ -208,9 +208,7 @@ class CommandReceiver:
             self._lock_first(request, sample)
             self._stop(request, verb)
             return
-        # A verb of a robot's own refuses what it does not have; the others drop it.
-        arguments = {name: value for name, value in request.command.items() if name != "action"}
-        given = arguments if verb.own else request.command
+        given = {name: value for name, value in request.command.items() if name != "action"}
         answered = partial(self._answer, request, verb)
         if verb.name == "ping":
             # It reaches nothing below the mesh, so it waits for no worker and no worker waits for it.

@@ -250,7 +250,7 @@ def _is_number_or_none(value: object) -> bool:
 
 def _float(value: object) -> float | None:
     """Return a number, or an array's one element, as a float, else None."""
-    plain = plain_value(value)
+    plain = value if type(value) is float else plain_value(value)
     while plain is not value and isinstance(plain, list) and len(plain) == 1:
         plain = plain[0]
     return float(plain) if isinstance(plain, int | float) and not isinstance(plain, bool) else None

@@ -74,7 +74,7 @@ def decode(data: bytes, limit: int) -> dict[str, Any]:
 
 def finite(value: object) -> float | None:
     """Return a finite JSON number as a float, or None; a boolean is no number."""
-    plain = plain_value(value)
+    plain = value if type(value) is float else plain_value(value)
     if isinstance(plain, bool) or not isinstance(plain, int | float):
         return None
     try:

@@ -159,7 +159,7 @@ class ControlLeases:
         return str(led(name or getattr(robot, "tool_name_str", ""))) if callable(led) else ""
 
     def _end_pauses(self, name: str) -> None:
-        for each in self._streams_of(name):
+        for each in tuple(self._streams) if name == self._first_robot else ():
             each.end_pauses()
 
     def _moves(self, name: str) -> bool | None:

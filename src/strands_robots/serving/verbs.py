@@ -240,8 +240,6 @@ class Verb:
         what is so without them.
         """
         known = self.by_name
-        if given.keys() <= known.keys():
-            return given
         if self.kind is Kind.READ or (self.leaves_out and self.kind is not Kind.MOTION):
             return {name: value for name, value in given.items() if name in known}
         return {name: value for name, value in given.items() if name in known or not _says_nothing(name, value)}
@@ -252,7 +250,8 @@ class Verb:
         Raises:
             ValidationError: naming the first argument that is unknown, missing or outside its domain.
         """
-        given = self.read(given)
+        if not given.keys() <= self.by_name.keys():
+            given = self.read(given)
         if self.leaves_out:
             given = {name: value for name, value in given.items() if value is not None}
         arguments = {**self._defaults, **checked_arguments(self.by_name, given, self._unfit)}
