@@ -190,6 +190,43 @@ def test_world_whose_robots_cannot_be_listed_did_not_stop() -> None:
     assert "torn down" in verdict.not_stopped["simulation"]
 
 
+@pytest.mark.parametrize("listed", [[{"name": "left"}], {"robots": ["left"]}, "left", None, MagicMock()])
+def test_world_whose_list_of_robots_is_not_read_did_not_stop(listed: Any) -> None:
+    class Odd(World):
+        def list_robots(self) -> Any:
+            return listed
+
+        def stop_policy(self, robot_name: str) -> Envelope:
+            return error("it goes on")
+
+    world = adapt_world(Odd())
+    assert "could not be listed" in world.halt().not_stopped["simulation"]
+    world.start_policy("left", "wave")
+    assert set(world.halt().not_stopped) == {"left", "simulation"}
+
+
+def test_robot_that_hangs_leaves_the_others_of_its_world_their_stops(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.5")
+    released = threading.Event()
+
+    class Stuck(World):
+        def stop_policy(self, robot_name: str) -> Envelope:
+            self.calls.append(robot_name)
+            if robot_name == "left":
+                released.wait(10)
+            return success("Stopped.")
+
+    foreign = Stuck()
+    world = adapt_world(foreign)
+    try:
+        for times in (1, 2):
+            verdict = world.halt()
+            assert (verdict.halted, list(verdict.not_stopped)) == (("right",), ["left"])
+            assert foreign.calls.count("right") == times
+    finally:
+        released.set()
+
+
 def test_locked_world_of_others_is_never_asked_to_move() -> None:
     foreign = World()
     world = adapt_world(foreign)

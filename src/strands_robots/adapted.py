@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import Future, wait
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import partial
 from types import ModuleType
 from typing import Any, Protocol
@@ -41,6 +43,7 @@ from strands_robots.safety.stopping import (
     halts_in_parts,
     json_blocks,
     read_verdict,
+    verdict_of,
 )
 from strands_robots.stop_log import stop_logger
 from strands_robots.utils import IdentityMap, ValidationError, shown
@@ -351,6 +354,9 @@ class AdaptedRobot(RobotWrapper):
         return ""
 
 
+ORDER_SHARE = 0.2
+"""Part of the halt deadline for which robots of a world are stopped one after another; the rest are at once."""
+
 _WORLD_VERBS = ("list_robots", "start_policy", "stop_policy", "list_policies_running", "get_state", "get_features")
 
 
@@ -422,30 +428,45 @@ class AdaptedWorld(RobotWrapper):
         """
         return stop_executor().halt(self, self.tool_name_str, reason)
 
-    def halt_here(self, reason: str, deadline: float) -> StopVerdict:
-        """Ask everything to stop: what was started from here before the world is read."""
+    def halt_here(self, reason: str, deadline: float) -> StopVerdict | PendingVerdict:
+        """Ask everything to stop: what was started from here before the world is read.
+
+        Each robot is stopped on a thread of the stop executor's, so that one that hangs leaves the others their stops.
+        """
         self.gate.revoke()
         halt, stop = self._own("halt"), self._own("stop_task")
         whole = stop if halt is None else partial(halt, reason)
         answers: dict[str, object] = {}
+        halting: dict[str, Future[StopVerdict]] = {}
         if whole is not None:
             answers[self.tool_name_str] = _answer(whole)
         elif self.halts:
-            answers |= {name: _answer(partial(self.stop_policy, name)) for name in tuple(self._shared.started)}
-            listed = _answer(self.list_robots)
-            if isinstance(listed, list):
-                for gone in answers.keys() - set(listed):
-                    del answers[gone]
-                    self._shared.started.pop(gone, None)
-                answers |= {name: _answer(partial(self.stop_policy, name)) for name in listed if name not in answers}
+            patience = time.monotonic() + ORDER_SHARE * settings.number("STRANDS_HALT_DEADLINE_S")
+            self._stop_each(tuple(self._shared.started), halting, reason, patience)
+            listed = _answer(partial(self._ask, "list_robots"))
+            names = _texts(listed)
+            if names is None:
+                answers[self.tool_name_str] = error(f"its robots could not be listed: {shown(listed)}")
             else:
-                answers[self.tool_name_str] = error(f"its robots could not be listed: {listed}")
+                for gone in halting.keys() - set(names):
+                    del halting[gone]
+                    self._shared.started.pop(gone, None)
+                self._stop_each([name for name in names if name not in halting], halting, reason, patience)
         else:
             answers[self.tool_name_str] = error(NO_STOP)
         teleoperation = self._own("stop_teleoperate")
         if teleoperation is not None:
             answers["teleoperation"] = _answer(teleoperation)
-        return halt_each({name: partial(_given, answer) for name, answer in answers.items()})
+        rest = halt_each({name: partial(_given, answer) for name, answer in answers.items()})
+        return _RobotsHalting(halting, rest, deadline) if halting else rest
+
+    def _stop_each(
+        self, names: Iterable[str], halting: dict[str, Future[StopVerdict]], reason: str, patience: float
+    ) -> None:
+        """Have each robot stopped, in order while their answers come in time."""
+        for name in names:
+            halting[name] = stop_executor().submit(_OneOfWorld(self.wrapped, name), name, reason)
+            wait([halting[name]], max(0.0, patience - time.monotonic()))
 
     def warn_endless(self, name: str) -> None:
         """Warn once in its life, where it has no way to halt."""
@@ -483,6 +504,58 @@ class AdaptedWorld(RobotWrapper):
             end = "and was stopped again" if again.stopped else "and DID NOT STOP AGAIN"
             return error(f"{verb} is refused: {self.tool_name_str} was halted meanwhile, {end}.")
         return answer
+
+
+@dataclass(frozen=True)
+class _OneOfWorld:
+    """Target of the stop executor: one robot of a foreign world."""
+
+    world: Any
+    name: str
+
+    def halt(self, reason: str = "") -> StopVerdict:
+        """Stop its policy and grade the answer."""
+        return verdict_of(lambda: _given(self.world.stop_policy(robot_name=self.name)), self.name)
+
+
+class _RobotsHalting(PendingVerdict):
+    """Verdict on robots of a foreign world that are being stopped, and on its rest."""
+
+    def __init__(self, halting: Mapping[str, Future[StopVerdict]], rest: StopVerdict, until: float) -> None:
+        super().__init__(until)
+        self._halting, self._rest = dict(halting), rest
+
+    def known(self) -> StopVerdict | None:
+        return self._verdict("") if all(each.done() for each in self._halting.values()) else None
+
+    def read(self) -> None:
+        wait(self._halting.values(), max(0.0, self.until - time.monotonic()))
+
+    def judged(self, reading: object, *, last: bool) -> StopVerdict | None:
+        return self._verdict("it has not answered its stop") if last else self.known()
+
+    def unread(self, why: str) -> StopVerdict:
+        return self._verdict(why)
+
+    def _verdict(self, why: str) -> StopVerdict:
+        ends = [
+            each.result() if each.done() else StopVerdict(not_stopped={name: why})
+            for name, each in self._halting.items()
+        ]
+        ends.append(self._rest)
+        return StopVerdict(
+            tuple(name for end in ends for name in end.halted),
+            {name: said for end in ends for name, said in end.not_stopped.items()},
+            {name: said for end in ends for name, said in end.unknown.items()},
+        )
+
+
+def _texts(listed: object) -> list[str] | None:
+    """Return the names in a list of robots; None for what may hide some."""
+    if not isinstance(listed, list | tuple | set | frozenset):
+        return None
+    names = [name for name in listed if isinstance(name, str)]
+    return names if len(names) == len(listed) else None
 
 
 def _warn_once(shared: _Shared, name: str, *, halts: bool) -> None:
