@@ -7,12 +7,16 @@ import string
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from strands_robots import utils
+from strands_robots.envelope import jsonable, uncarried
+from strands_robots.mesh.wire import WireError, encode
 from strands_robots.utils import ValidationError, near, plain_text, redacted
 
 ANYTHING = st.one_of(
@@ -53,6 +57,27 @@ def test_a_boxed_number_is_the_number_in_it_and_a_boxed_boolean_is_none() -> Non
     assert utils.canonical_json({"b": Boxed([1, 2.5]), "a": Boxed(True)}) == b'{"a":true,"b":[1,2.5]}'
     with pytest.raises(TypeError, match="object"):
         utils.canonical_json({"a": object()})
+
+
+class Torn:
+    def tolist(self) -> object:
+        raise RuntimeError("on another device")
+
+
+@pytest.mark.parametrize(
+    "value", [MagicMock(), Torn(), Boxed(Boxed(4)), np.timedelta64(4, "us"), np.datetime64("2026-01-01", "ns")]
+)
+def test_what_becomes_no_number_of_pythons_is_none_and_no_text_of_json(value: object) -> None:
+    assert utils.plain_value(value) is value
+    for check in (utils.number, utils.integral):
+        with pytest.raises(ValidationError, match="x must be"):
+            check("x", value)
+    with pytest.raises(TypeError, match="is no value of JSON"):
+        utils.canonical_json({"a": value})
+    with pytest.raises(WireError, match="is no value of JSON"):
+        encode({"a": value}, 1000)
+    assert isinstance(jsonable({"a": value})["a"], str)
+    assert uncarried({"a": value}).startswith("a is ")
 
 
 @pytest.mark.parametrize("value", [4, 4.0, Boxed(4), Boxed(4.0)])

@@ -13,7 +13,7 @@ from enum import Enum
 from typing import Any
 
 from strands_robots.errors import StrandsRobotsError
-from strands_robots.utils import shown
+from strands_robots.utils import plain_value, shown
 
 Envelope = dict[str, Any]
 
@@ -75,8 +75,8 @@ def jsonable(value: object, depth: int = DEPTH_MAX) -> Any:
         return {str(key): jsonable(item, depth - 1) for key, item in value.items()}
     if isinstance(value, list | tuple | set | frozenset):
         return [jsonable(item, depth - 1) for item in value]
-    plain = getattr(value, "tolist", None)  # numpy's scalars and arrays
-    return jsonable(plain(), depth - 1) if callable(plain) else shown(value)
+    plain = plain_value(value)
+    return shown(value) if plain is value else jsonable(plain, depth - 1)
 
 
 def uncarried(value: object, place: str = "", depth: int = DEPTH_MAX) -> str:
@@ -102,8 +102,8 @@ def uncarried(value: object, place: str = "", depth: int = DEPTH_MAX) -> str:
     if depth > 0 and getattr(getattr(value, "dtype", None), "kind", "") in ("b", "i", "u"):
         # A picture has a million numbers, none of which can be odd.
         return ""
-    plain = getattr(value, "tolist", None) if depth > 0 else None
-    return uncarried(plain(), place, inner) if callable(plain) else f"{at} is {shown(value)}"
+    plain = plain_value(value) if depth > 0 else value
+    return f"{at} is {shown(value)}" if plain is value else uncarried(plain, place, inner)
 
 
 def _content(text: str, fields: dict[str, Any]) -> list[dict[str, Any]]:

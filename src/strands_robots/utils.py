@@ -177,12 +177,21 @@ def plain_value(value: object) -> Any:
     """
     if type(value) in _PYTHONS_OWN:
         return value
-    convert = getattr(value, "tolist", None)
-    if not callable(convert):
+    try:
+        convert = getattr(value, "tolist", None)
+        # Times and durations have integers inside, and are none.
+        found = convert() if callable(convert) and _kind(value) not in ("m", "M") else value
+        # The widest float of numpy has no number of Python's own to become.
+        if type(found) not in _PYTHONS_OWN and isinstance(found, Real):
+            found = float(found)
+    except Exception:  # noqa: BLE001 - a stranger's object raises what it likes; it is no number then
         return value
-    found = convert()
-    # The widest float of numpy has no number of Python's own to become.
-    return float(found) if type(found) not in _PYTHONS_OWN and isinstance(found, Real) else found
+    # A test double answers with another one, and that with the next.
+    return found if type(found) in _PYTHONS_OWN else value
+
+
+def _kind(value: object) -> object:
+    return getattr(getattr(value, "dtype", None), "kind", "")
 
 
 def json_value(value: object) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -24,6 +25,10 @@ from strands_robots.safety.stopping import Outcome, StopVerdict, explain, grade,
         (error("No."), Outcome.REFUSED),
         (success("Stopped.", stopped=False), Outcome.REFUSED),
         (success("Stopped.", running=True), Outcome.REFUSED),
+        (success("Stopped.", stopped=np.False_), Outcome.REFUSED),
+        (success("Stopped.", running=np.True_), Outcome.REFUSED),
+        (success("Stopped.", not_stopped=np.array(["arm", "gripper"])), Outcome.REFUSED),
+        ({"status": "success", "ok": np.False_}, Outcome.REFUSED),
         (success("Stopped.", not_stopped={"arm": "wedged"}), Outcome.REFUSED),
         ({"status": "success", "content": [{"json": {"stopped": False}}]}, Outcome.REFUSED),
         ({"ok": False}, Outcome.REFUSED),

@@ -17,7 +17,7 @@ from typing import Literal, TypeVar, cast
 from strands_robots import settings
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.stop_log import stop_logger
-from strands_robots.utils import ValidationError, choice, shown
+from strands_robots.utils import ValidationError, choice, plain_value, shown
 
 logger = stop_logger(__name__)
 
@@ -281,10 +281,11 @@ def json_blocks(answer: Mapping[str, object]) -> list[Mapping[str, object]]:
 def _denies(fact: Mapping[str, object]) -> bool:
     # An error whose own verdict is unknown stays unknown when it has travelled as an envelope.
     undecided = "stopped" in fact and fact["stopped"] is None
+    ok, stopped, running = (plain_value(fact.get(name)) for name in ("ok", "stopped", "running"))
     return (
         (fact.get("status") == "error" and not undecided)
-        or fact.get("ok") is False
-        or fact.get("stopped") is False
-        or fact.get("running") is True
-        or bool(fact.get("not_stopped"))
+        or ok is False
+        or stopped is False
+        or running is True
+        or bool(plain_value(fact.get("not_stopped")))
     )
