@@ -6,9 +6,12 @@ from typing import Any
 
 import pytest
 from fixtures.mesh_robots import Arm, World
+from fixtures.waiting import eventually
 from tests.mesh.peers import Fleet
 
 from strands_robots.mesh.security import ValidationError, validate_command
+from strands_robots.mesh.transport import Sample
+from strands_robots.mesh.wire import encode
 
 
 def answer(peers: Fleet, target: str, command: dict[str, Any]) -> dict[str, Any]:
@@ -32,6 +35,23 @@ def test_called_stop_is_a_stop(peers: Fleet) -> None:
     peers.join(world, "sim-1", "sim")
     world.start_policy("left", "wave")
     assert answer(peers, "sim-1", {"action": "call", "function": "stop"})["ok"] is True
+    assert world.running == {}
+
+
+@pytest.mark.parametrize("function", ["stop", "stop_policy", "stop_task", "stop_motion", "halt"])
+@pytest.mark.parametrize("params", [None, [1], "left", {"robot_name": 5}, {"robot_name": "left", "now": float("nan")}])
+@pytest.mark.parametrize("retained", [False, True])
+def test_called_stop_is_refused_for_nothing(peers: Fleet, function: str, params: Any, retained: bool) -> None:
+    world = World("left")
+    peers.join(world, "sim-1", "sim")
+    world.start_policy("left", "wave")
+    command = {"action": "call", "function": function, "params": params}
+    if retained:
+        body = {"sender_id": "other", "turn_id": "t1", "timestamp": peers.clock(), "command": command}
+        peers.bus.deliver(peers.stranger(), Sample("strands/sim-1/cmd", encode(body, 10_000), "other", retained=True))
+        assert eventually(lambda: peers.events("command_executed"))
+    else:
+        assert answer(peers, "sim-1", command)["ok"] is True
     assert world.running == {}
 
 

@@ -12,7 +12,7 @@ from strands_robots.contract import Haltable, Robot, holds_robots
 from strands_robots.envelope import Envelope, RefusalReason, Refused, error, is_error, jsonable
 from strands_robots.mesh import topics, wire
 from strands_robots.mesh.estop_retry import ESTOP
-from strands_robots.mesh.former_actions import FORMER, as_verb
+from strands_robots.mesh.former_actions import FORMER, as_verb, stops
 from strands_robots.mesh.session import Context
 from strands_robots.mesh.transport import Sample, TransportError
 from strands_robots.mesh.wire_identity import MOTION, IdentityError
@@ -370,7 +370,7 @@ class CommandReceiver:
 def _is_stop(command: object) -> bool:
     action = command.get("action") if isinstance(command, dict) else None
     verb = PEER_VERBS.get(action) if isinstance(action, str) else None
-    return verb is not None and verb.kind is Kind.STOP
+    return verb.kind is Kind.STOP if verb is not None else isinstance(command, dict) and stops(command)
 
 
 def _wire_text(refusal: Refused) -> str:

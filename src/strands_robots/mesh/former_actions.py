@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from typing import Any
 
-from strands_robots.utils import ValidationError, mapping, shown, text
+from strands_robots.utils import ValidationError, finite, mapping, shown, text
 
 FUNCTION_MAX = 64
 
@@ -18,9 +18,12 @@ _FUNCTIONS = {
     "describe_tool": "describe",
     "get_features": "features",
     "get_state": "state",
+    "halt": "stop",
     "run_policy": "execute",
     "start_policy": "start",
+    "stop_motion": "stop",
     "stop_policy": "stop",
+    "stop_task": "stop",
 }
 
 SET_JOINTS = (
@@ -32,15 +35,28 @@ FORMER = frozenset({*_CALLS, "describe_tool", "set_joints"})
 """Actions of 0.5 releases that are no verbs here."""
 
 
+def stops(command: Mapping[str, Any]) -> bool:
+    """Return True for a call that stops, which is refused for none of its fields."""
+    action = command.get("action")
+    function = command.get(_CALLS[action]) if isinstance(action, str) and action in _CALLS else None
+    return isinstance(function, str) and _FUNCTIONS.get(function, function) == "stop"
+
+
 def checked_former(command: Mapping[str, Any]) -> dict[str, Any]:
     """Return a command of a former action as it is sent.
 
     Only its receiver knows the function.
 
     Raises:
-        ValidationError: no function, or its params are no object.
+        ValidationError: no function, its params are no object, or a number is not finite.
     """
     name = _CALLS.get(command["action"])
+    if stops(command):
+        params = command.get("params")
+        named = params.get("robot_name") if isinstance(params, Mapping) else None
+        meant = {"params": {"robot_name": named}} if isinstance(named, str) else {}
+        return {"action": command["action"], str(name): command[str(name)], **meant}
+    finite("command", command)
     if name is not None:
         text(name, command.get(name), longest=FUNCTION_MAX)
         mapping("params", command.get("params") or {})
@@ -65,7 +81,10 @@ def as_verb(command: Mapping[str, Any], verbs: Collection[str]) -> dict[str, Any
     if verb is None:
         raise ValidationError(f"{name} {shown(function)} is no verb of this peer; describe lists its verbs.")
     rest = {key: value for key, value in command.items() if key not in ("action", name, "params")}
-    return {**rest, **mapping("params", command.get("params") or {}), "action": verb}
+    params = command.get("params") or {}
+    if not stops(command):
+        mapping("params", params)
+    return {**rest, **(params if isinstance(params, Mapping) else {}), "action": verb}
 
 
 def _camel(function: str) -> str:

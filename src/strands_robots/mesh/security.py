@@ -14,7 +14,7 @@ from strands_robots.mesh.former_actions import FORMER, checked_former
 from strands_robots.moved import of_module
 from strands_robots.serving.peer_verbs import PEER_VERBS
 from strands_robots.serving.verbs import Kind
-from strands_robots.utils import ValidationError, finite, identifier, mapping, number, peer_id, shown
+from strands_robots.utils import ValidationError, identifier, mapping, number, peer_id, shown
 
 if not TYPE_CHECKING:
     __path__, __getattr__ = of_module(__name__)
@@ -68,7 +68,6 @@ def validate_command(command: object) -> dict[str, Any]:
     action = given.get("action")
     verb = PEER_VERBS.get(action) if isinstance(action, str) else None
     if isinstance(action, str) and action in FORMER:
-        finite("command", given)
         return checked_former(given)
     if verb is None:
         raise ValidationError(f"action must be one of {', '.join(PEER_VERBS)}, not {shown(action)}.")
