@@ -347,6 +347,21 @@ def test_a_status_that_raises_after_a_stop_is_unknown(monkeypatch: pytest.Monkey
     assert "idle" in verdict.unknown["task"], "it says what was expected"
 
 
+def test_own_halt_that_takes_no_reason_is_called_without() -> None:
+    class Short(Foreign):
+        def halt(self) -> Any:
+            return self.stop_task()
+
+    class ShortWorld(World):
+        def halt(self) -> Any:
+            return success("Stopped.")
+
+    short = Short()
+    assert adapt(short).halt("run ended").stopped is True
+    assert short.calls == ["stop"]
+    assert adapt_world(ShortWorld()).halt("run ended").halted == ("simulation",)
+
+
 def test_teleoperation_that_answers_none_to_its_stop_is_unknown() -> None:
     foreign = Foreign()
     foreign.stop_teleoperate = lambda: None  # type: ignore[attr-defined]

@@ -10,9 +10,10 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, wait
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
+from inspect import signature
 from types import ModuleType
 from typing import Any, Protocol
 
@@ -325,7 +326,7 @@ class AdaptedRobot(RobotWrapper):
         with self._shared.calling():
             own = getattr(self.wrapped, "halt", None)
             if callable(own):
-                answers = {self.tool_name_str: _answer(lambda: own(reason))}
+                answers = {self.tool_name_str: _answer(_with_reason(own, reason))}
             else:
                 parts = {"task": "stop_task", "teleoperation": "stop_teleoperate"}
                 stops = {name: getattr(self.wrapped, verb, None) for name, verb in parts.items()}
@@ -435,7 +436,7 @@ class AdaptedWorld(RobotWrapper):
         """
         self.gate.revoke()
         halt, stop = self._own("halt"), self._own("stop_task")
-        whole = stop if halt is None else partial(halt, reason)
+        whole = stop if halt is None else _with_reason(halt, reason)
         answers: dict[str, object] = {}
         halting: dict[str, Future[StopVerdict]] = {}
         if whole is not None:
@@ -567,6 +568,15 @@ def _warn_once(shared: _Shared, name: str, *, halts: bool) -> None:
 Adapted = AdaptedRobot | AdaptedWorld
 
 
+def simulated(robot: object, peer_type: str) -> bool:
+    """Return True for a simulation, whose motions need no operator's approval.
+
+    Worlds of ours are, and of others' those of the type ``sim``: another may be a cell of real arms.
+    """
+    ours = holds_robots(robot) and not isinstance(robot, AdaptedWorld)
+    return peer_type == "sim" or (ours and getattr(robot, "of_package", False) is not True)
+
+
 def lacks(robot: object) -> tuple[str, ...]:
     """Return the verbs of the contract that a robot refuses by name."""
     return robot.lacks if isinstance(robot, Adapted) else ()
@@ -650,6 +660,17 @@ def _answer(stop: Callable[[], object]) -> object:
         return stop()
     except Exception as exc:  # noqa: BLE001 - whatever a stop raises is graded
         return exc
+
+
+def _with_reason(halt: Callable[..., object], reason: str) -> Callable[[], object]:
+    """Return the call of a stranger's halt, which may take no reason."""
+    # One that states no signature is given the reason.
+    with suppress(ValueError):
+        try:
+            signature(halt).bind(reason)
+        except TypeError:
+            return halt
+    return partial(halt, reason)
 
 
 def _given(answer: object) -> object:

@@ -15,7 +15,7 @@ from typing import Any
 from strands_robots import settings
 from strands_robots._mesh_switch import mesh_env_request
 from strands_robots.adapted import behind_contract
-from strands_robots.contract import put_away
+from strands_robots.contract import has_gate, put_away
 from strands_robots.envelope import is_error, text_of
 from strands_robots.plug_ins import PlugIn, PlugIns, takes
 from strands_robots.safety.scope import own_cell
@@ -56,6 +56,9 @@ class Networked:
 
     tags: tuple[str, ...] | None = None
     """Tags by which callers choose robots; None asks ``STRANDS_TAGS``."""
+
+    of_package = False
+    """True for a robot of another package, which may move anything."""
 
     def run(self, **options: Any) -> StopVerdict:
         """Serve this robot on Device Connect until SIGINT or SIGTERM; see :func:`run`."""
@@ -182,7 +185,8 @@ def run(
         own_device_id("peer_id", peer_id)
     if not {"messaging_url", "messaging_backend", "link"} & network.keys():
         network["link"] = usual_link(network.get("tenant"))
-    body: Any = robot if callable(getattr(robot, "halt", None)) else behind_contract(robot)
+    # The halt of a stranger takes and answers what it likes, and may hang.
+    body: Any = robot if has_gate(robot) and callable(getattr(robot, "halt", None)) else behind_contract(robot)
     verdict: StopVerdict = StopVerdict()
     # A user who waits for Ctrl-C reads the terminal, whatever the program does about logging.
     report: Callable[[str], None] = partial(print, file=sys.stderr, flush=True) if until is None else logger.info
@@ -247,7 +251,7 @@ def _of_package(plug_in: PlugIn, mode: str, tool_name: str | None, options: dict
     if own:
         raise ValidationError(f"{plug_in} has no option {', '.join(own)}.")
     try:
-        body.__class__ = _networked(body.__class__)
+        body.__class__ = _networked(body.__class__, of_package=True)
     except TypeError as exc:
         raise ValidationError(f"{plug_in} must make an object of a class of its own, not {shown(body)}.") from exc
     named = tool_name or ("" if getattr(body, "tool_name_str", None) else _label(plug_in.name))
@@ -299,8 +303,8 @@ def _reachy(tool_name: str | None, options: dict[str, Any]) -> Any:
 
 
 @cache
-def _networked(robot_class: type[Any]) -> type[Any]:
-    return type("Robot", (Networked, robot_class), {"__doc__": robot_class.__doc__})
+def _networked(robot_class: type[Any], *, of_package: bool = False) -> type[Any]:
+    return type("Robot", (Networked, robot_class), {"__doc__": robot_class.__doc__, "of_package": of_package})
 
 
 def _construct(factory: Callable[..., Any], *args: Any, **options: Any) -> Any:

@@ -90,6 +90,20 @@ def test_robot_whose_tags_are_none_of_ours_is_served_on_both_networks(monkeypatc
     assert [mesh.peer_id for mesh in joined] == ["tagged"]
 
 
+def test_halt_of_a_stranger_ends_its_run(patient_halts: None) -> None:
+    class Stranger:
+        halted = 0
+
+        def halt(self) -> dict[str, object]:
+            self.halted += 1
+            return {"status": "success"}
+
+    stranger, until = Stranger(), threading.Event()
+    until.set()
+    verdict = run(stranger, peer_id="stranger", until=until, mesh=False, link=loopback_config(free_port()))
+    assert (verdict.stopped, stranger.halted) == (True, 1)
+
+
 def test_second_robot_of_an_id_is_refused_without_the_frames_of_its_loop(
     monkeypatch: pytest.MonkeyPatch, patient_halts: None
 ) -> None:

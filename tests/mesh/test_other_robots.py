@@ -146,3 +146,37 @@ def test_presence_names_the_kind_whose_actions_the_tool_lists(
     eventually(lambda: peers.meet() or len(console.peers) == 3, what="three peers")
     kinds = {row["peer_id"]: row.get("robot_kind") for row in console.peers}
     assert kinds == {"base-1": "navigating_base", "arm-1": "robot", "head-1": "reachy_mini"}
+
+
+class Cell:
+    """A world of others', whose arms may be real."""
+
+    def __init__(self) -> None:
+        self.calls: list[str] = []
+
+    def list_robots(self) -> list[str]:
+        return ["left", "right"]
+
+    def start_policy(self, robot_name: str, **policy: Any) -> dict[str, Any]:
+        self.calls.append(f"start {robot_name}")
+        return {"status": "success"}
+
+    def stop_policy(self, robot_name: str) -> dict[str, Any]:
+        self.calls.append(f"stop {robot_name}")
+        return {"status": "success"}
+
+
+@pytest.mark.parametrize(("peer_type", "started"), [("robot", []), ("sim", ["start left", "start left"])])
+def test_world_of_others_moves_by_itself_only_as_a_simulation(
+    peers: Fleet, console: Mesh, peer_type: str, started: list[str]
+) -> None:
+    cell = Cell()
+    peers.join(cell, "cell", peer_type)
+    assert eventually(lambda: "cell__left" in {row["peer_id"] for row in console.peers})
+    task = {"action": "start", "instruction": "wave", "policy_provider": "mock"}
+    for command, to in (({**task, "robot_name": "left"}, "cell"), (task, "cell__left")):
+        reply = console.send(to, command, timeout=20)
+        assert (reply["type"] == "error") is (peer_type == "robot"), reply
+    assert cell.calls == started
+    assert console.send("cell", {"action": "stop"}, timeout=20)["result"]["ok"] is True
+    assert cell.calls == [*started, "stop left", "stop right"]

@@ -22,7 +22,7 @@ from device_connect_edge.drivers import DeviceDriver
 from device_connect_edge.messaging import MessagingError
 
 from strands_robots import settings
-from strands_robots.adapted import behind_contract
+from strands_robots.adapted import behind_contract, simulated
 from strands_robots.contract import body_of, holds_robots, stated_name
 from strands_robots.device_connect._compat import Runtime
 from strands_robots.device_connect.backends import LinkConfig
@@ -343,8 +343,9 @@ def _driver_by_class(robot: Any) -> DeviceDriver | None:
     simulation = getattr(sys.modules.get("strands_robots.simulation"), "Simulation", None)
     if isinstance(simulation, type) and isinstance(robot, simulation):
         return SimulationDeviceDriver(robot)
-    if not callable(getattr(robot, "start_task", None)) and holds_robots(behind_contract(robot)):
-        return SimulationDeviceDriver(robot)
+    world = None if callable(getattr(robot, "start_task", None)) else behind_contract(robot)
+    if holds_robots(world):
+        return SimulationDeviceDriver(robot, hardware=not simulated(world, "robot"))
     return None
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from strands_robots import settings
 from strands_robots._mesh_switch import mesh_env_request
-from strands_robots.adapted import warn_endless
+from strands_robots.adapted import simulated, warn_endless
 from strands_robots.contract import body_of, holds_robots, stated_name
 from strands_robots.mesh import session, topics
 from strands_robots.mesh.commands import CommandReceiver, SenderCheck, execute_on, pong
@@ -122,7 +122,7 @@ class Mesh(SensorLoopsMixin):
         self._own_verbs = {} if self.robot is None else own_verbs(self.robot)
         self._parts = parts or Parts()
         self._lifecycle_lock = threading.Lock()
-        self._hardware = self.robot is not None and not holds_robots(self.robot) and peer_type != "sim"
+        self._hardware = self.robot is not None and not simulated(self.robot, peer_type)
         self.inputs = InputSide(hardware=self._hardware)
         key = _safety_key(self.robot, self.peer_id, keep=self._parts.keep)
         # A locked robot that leaves the mesh stays on the safety plane: to leave and join again must not unlock it.
@@ -189,6 +189,7 @@ class Mesh(SensorLoopsMixin):
                 robot,
                 self._pipeline,
                 kind=self.peer_type,
+                hardware=hardware,
                 safety=self._announced,
                 report=self._adapter.report,
                 own=lambda child: {"ping": own["ping"], "resume": self._resume_of(child)},

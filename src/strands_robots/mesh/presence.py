@@ -365,7 +365,7 @@ class Children:
     Args:
         context: the parent's.
         pipeline: the parent's, whose threads and pending commands the children share.
-        kind: the parent's type.
+        kind: the parent's type; ``hardware`` is False for a simulation.
         safety: returns, for a child's id, the parent's lockout, which holds it as well; ``report`` returns all of it,
             for a nonce.
         own: returns, for a child's id, the verbs that the parent answers for it.
@@ -382,6 +382,7 @@ class Children:
         pipeline: Pipeline,
         *,
         kind: str,
+        hardware: bool = False,
         safety: Callable[[str], Mapping[str, Any]],
         report: Callable[[str, str], Mapping[str, Any]],
         own: Callable[[str], Mapping[str, Own]],
@@ -395,7 +396,7 @@ class Children:
         self._context = context
         self._world = world
         self._pipeline = pipeline
-        self._kind = kind
+        self._kind, self._hardware = kind, hardware
         self._safety, self._report = safety, report
         self._own = own
         self._teleop = teleop
@@ -461,8 +462,8 @@ class Children:
         pipeline = Pipeline.of(
             robot,
             lambda: peer,
-            hardware=False,
-            authorize=SenderCheck(context, hardware=False),
+            hardware=self._hardware,
+            authorize=SenderCheck(context, hardware=self._hardware),
             own={
                 **self._own(peer),
                 **parents,

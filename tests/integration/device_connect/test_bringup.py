@@ -133,6 +133,23 @@ def test_driver_follows_from_the_object() -> None:
     assert isinstance(bringup.driver_for(Both(), "robot"), RobotDeviceDriver)
 
 
+def test_world_of_others_is_hardware_unless_it_is_said_to_be_a_simulation() -> None:
+    class Cell:
+        def list_robots(self) -> list[str]:
+            return []
+
+        def stop_policy(self, robot_name: str) -> None: ...
+
+    class Packaged(ToyWorld):
+        of_package = True
+
+    for world, served in ((Cell(), True), (Packaged(), True), (ToyWorld(), False)):
+        for peer_type, hardware in (("robot", served), ("sim", False)):
+            driver = bringup.driver_for(world, peer_type)
+            assert isinstance(driver, SimulationDeviceDriver)
+            assert driver.hardware is hardware
+
+
 def test_robot_that_is_no_simulation_refuses_to_be_served_as_one() -> None:
     base = MobileBaseRobot("base", MemoryLink(), "/cmd_vel")
     with pytest.raises(ValidationError, match="peer_type must be robot for MobileBaseRobot"):
