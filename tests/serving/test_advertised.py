@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 import pytest
@@ -65,6 +66,11 @@ def test_argument_that_a_verb_does_not_have_is_named_with_those_there_are() -> N
         "brewCoffee takes no argument 'strenght'; its arguments: cups, strength, name."
     )
     assert "lease_id" in brew().unknown(["lease_id"]), "the server holds the lease"
+
+
+@pytest.mark.parametrize("kind", ["read", "stop"])
+def test_read_and_stop_ignore_what_they_do_not_know(kind: Any) -> None:
+    assert replace(brew(), kind=kind).unknown(["strenght", "lease_id"]) == ""
 
 
 @pytest.mark.parametrize(

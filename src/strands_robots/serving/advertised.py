@@ -221,7 +221,12 @@ class AdvertisedVerb:
         return {"type": "object", "properties": properties, **({"required": required} if required else {})}
 
     def unknown(self, names: Iterable[str]) -> str:
-        """Return the refusal of arguments that it does not have, or nothing."""
+        """Return the refusal of arguments that a motion does not have, or nothing.
+
+        Reads and stops ignore what they do not know, at the robot as well.
+        """
+        if self.kind != "motion":
+            return ""
         from strands_robots.serving.verbs import LEASE_NAMES  # noqa: PLC0415 - who needs the names of our verbs loads no table
 
         known = [each.name for each in self.parameters]
