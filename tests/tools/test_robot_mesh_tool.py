@@ -25,7 +25,7 @@ from strands_robots.mesh import Mesh, init_mesh, safety
 from strands_robots.mesh.session import clear_peers
 from strands_robots.mesh.transport import config
 from strands_robots.safety.plane import plane
-from strands_robots.safety.scope import EVERY_ROBOT
+from strands_robots.safety.scope import EVERY_ROBOT, Scope
 from strands_robots.tools import robot_mesh
 
 # The package gives the tool for the module's name.
@@ -144,6 +144,8 @@ def test_broadcast_asks_every_robot_and_names_those_without_an_answer(fake: Scri
         ({"action": "send", "target": "a b", "command": {"action": "stop", "x": 1}}, ["arm-1", "base-1", "world-1"]),
         ({"action": "send", "command": '{"action": "stop"}', "timeout": -1}, ["arm-1", "base-1", "world-1"]),
         ({"action": "broadcast", "target": "arm-1", "command": '{"action": "stop"}'}, ["arm-1", "base-1", "world-1"]),
+        ({"action": "send", "target": "arm-1", "command": "stop"}, ["arm-1"]),
+        ({"action": "send", "target": "arm-1", "arguments": '{"action": "stop"}'}, ["arm-1"]),
     ],
 )
 async def test_stop_that_is_sent_or_broadcast_is_a_stop(
@@ -155,6 +157,30 @@ async def test_stop_that_is_sent_or_broadcast_is_a_stop(
     use = {"toolUseId": "1", "name": "robot_mesh", "input": given}
     events = [event async for event in robot_mesh.stream(use, {})]
     assert fake.stopped == stopped, events
+
+
+@pytest.mark.parametrize(
+    ("given", "scope"),
+    [
+        ({"action": "broadcast", "target": "arm-1", "command": '{"action": "emergency_stop"}'}, EVERY_ROBOT),
+        ({"action": "send", "target": "arm-1", "command": "emergency_stop"}, Scope(frozenset({"arm-1"}))),
+    ],
+)
+async def test_emergency_stop_that_is_sent_or_broadcast_is_one(
+    fake: ScriptedNetwork, given: dict[str, Any], scope: Scope
+) -> None:
+    use = {"toolUseId": "1", "name": "robot_mesh", "input": given}
+    events = [event async for event in robot_mesh.stream(use, {})]
+    assert [said for _, said, _ in fake.estops] == [scope], events
+
+
+@pytest.mark.parametrize("action", ["call", "rpc"])
+@pytest.mark.parametrize(
+    "given", [{"timeout": -1}, {"timeout": "soon"}, {"arguments": "[1]"}, {"arguments": {"now": object()}}, {"x": []}]
+)
+def test_no_argument_refuses_a_stop_that_is_called(fake: ScriptedNetwork, action: str, given: dict[str, Any]) -> None:
+    robot_mesh(action=action, target="arm-1", **{"verb": "stop", **given})
+    assert fake.calls == [("arm-1", "stop", {}, MODULE.STOP_S)]
 
 
 async def test_agent_reaches_a_verb_by_the_older_names(fake: ScriptedNetwork) -> None:

@@ -91,17 +91,33 @@ def _readable(given: dict[str, Any]) -> dict[str, Any]:
     if function := stated.pop("function", None):
         stated["verb"] = stated.get("verb") or function
     if command := stated.pop("command", None):
-        stated["arguments"] = stated.get("arguments") or _object(command)
+        stated["arguments"] = stated.get("arguments") or command
+    if isinstance(stated.get("arguments"), str):
+        stated["arguments"] = _object(stated["arguments"])
     body = stated.get("arguments")
-    if action in BODIES and isinstance(body, dict) and str(body.get("action")) in advertised.STOPS:
-        rest = {name: value for name, value in body.items() if name != "action"}
-        target = {"target": given.get("target")} if action == "send" else {}
-        return _readable_stop({"action": "stop", "arguments": rest, **target})
+    if action in BODIES and (stop := _stop_in(body, str(given.get("target") or "") if action == "send" else "")):
+        return _readable_stop(stop)
+    if action in ("call", "rpc") and str(stated.get("verb")) in advertised.STOPS:
+        said = {name: value for name, value in stated.items() if name not in ("timeout", "arguments")}
+        fields = body.items() if isinstance(body, dict) else ()
+        kept = {name: value for name, value in fields if isinstance(value, str | int | float | None)}
+        return {name: value for name, value in said.items() if name in INPUTS} | {"action": "call", "arguments": kept}
     known = {name: value for name, value in stated.items() if name in INPUTS}
     more = {name: value for name, value in stated.items() if name not in INPUTS and value is not None}
     if more and isinstance(body, dict | None):
         known["arguments"] = {**more, **(body or {})}
     return {**known, "action": "call"} if action == "rpc" else known
+
+
+def _stop_in(body: object, target: str) -> dict[str, Any] | None:
+    """Return the stop that a ``send`` or ``broadcast`` is, or None."""
+    fields = body if isinstance(body, dict) else {"action": body}
+    name, rest = str(fields.get("action")), {key: value for key, value in fields.items() if key != "action"}
+    if name in advertised.STOPS:
+        return {"action": "stop", "target": target, "arguments": rest}
+    if name == "emergency_stop":
+        return {"action": name, "arguments": rest | ({"only": [target]} if target else {})}
+    return None
 
 
 def _object(command: object) -> object:
@@ -116,10 +132,11 @@ def _readable_stop(given: dict[str, Any]) -> dict[str, Any]:
     """Return the input of a stop as the tool's schema has it."""
     texts = {name: given[name] for name in ("target", "instruction") if given.get(name) is not None}
     arguments = given.get("arguments")
+    fields = arguments if isinstance(arguments, dict) else {} if arguments is None else {shown(arguments): None}
     return {
         "action": given["action"],
         **{name: value if isinstance(value, str) else shown(value) for name, value in texts.items()},
-        **({"arguments": arguments if isinstance(arguments, dict) else {shown(arguments): None}} if arguments else {}),
+        **({"arguments": fields} if fields else {}),
     }
 
 
