@@ -384,6 +384,10 @@ class AdaptedWorld(RobotWrapper):
     def list_robots(self) -> list[str]:
         return [name for name in self._listed("list_robots") if isinstance(name, str)]
 
+    def listed(self) -> list[str] | None:
+        """Return the names of its robots; None for a list that cannot be read."""
+        return _texts(self._ask("list_robots"))
+
     def list_policies_running(self) -> list[dict[str, Any]]:
         return [row for row in self._listed("list_policies_running") if isinstance(row, dict)]
 

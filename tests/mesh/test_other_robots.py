@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -12,11 +14,13 @@ from fixtures.ros_memory import MemoryLink
 from fixtures.waiting import eventually
 from tests.mesh.peers import Fleet
 
+from strands_robots.adapted import adapt_world
 from strands_robots.drivers.reachy import ReachyDriver
 from strands_robots.drivers.ros.ros_bridge import RosBridgedRobot
 from strands_robots.mesh.core import Mesh
 from strands_robots.ros.link import Goal, OnMessage, Unwatch
 from strands_robots.safety.authorization import Grants
+from strands_robots.serving.stops import OneRobot, robot_stop
 from strands_robots.state_files import state_dir
 
 NAV = "/navigate_to_pose"
@@ -180,3 +184,62 @@ def test_world_of_others_moves_by_itself_only_as_a_simulation(
     assert cell.calls == started
     assert console.send("cell", {"action": "stop"}, timeout=20)["result"]["ok"] is True
     assert cell.calls == [*started, "stop left", "stop right"]
+
+
+@pytest.mark.parametrize("to", ["cell", "cell__left"])
+def test_stop_of_one_robot_does_not_wait_for_the_list_of_a_world_of_others(
+    peers: Fleet, console: Mesh, monkeypatch: pytest.MonkeyPatch, to: str
+) -> None:
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.5")
+    hangs, released = threading.Event(), threading.Event()
+
+    class Stuck(Cell):
+        def list_robots(self) -> list[str]:
+            if hangs.is_set():
+                released.wait(20)
+            return super().list_robots()
+
+    cell = Stuck()
+    peers.join(cell, "cell", "sim")
+    assert eventually(lambda: "cell__left" in {row["peer_id"] for row in console.peers})
+    hangs.set()
+    try:
+        for times in (1, 2):
+            body = {"sender_id": "other", "turn_id": f"t{times}", "timestamp": peers.clock()}
+            stop = {**body, "command": {"action": "stop", "robot_name": "left"}}
+            began = time.monotonic()
+            peers.stranger().put(f"strands/{to}/cmd", stop)
+            assert time.monotonic() - began < 5
+            assert eventually(lambda least=times: cell.calls.count("stop left") >= least)
+    finally:
+        released.set()
+
+
+@pytest.mark.parametrize(
+    ("name", "listed", "stopped"),
+    [
+        ("left", ["left"], True),
+        ("right", ["left"], False),
+        ("other", ["left"], False),
+        ("left", [{"name": "left"}], True),
+        ("left", RuntimeError("torn down"), None),
+    ],
+)
+def test_stop_of_one_robot_of_a_world_of_others_counts_where_it_is_there(
+    name: str, listed: Any, stopped: bool | None
+) -> None:
+    class Told(Cell):
+        def list_robots(self) -> Any:
+            if isinstance(listed, Exception):
+                raise listed
+            return listed
+
+        def stop_policy(self, robot_name: str) -> dict[str, Any]:
+            super().stop_policy(robot_name)
+            return {"status": "error" if robot_name == "right" else "success"}
+
+    cell = Told()
+    assert robot_stop(adapt_world(cell), name).halt().stopped is stopped
+    assert cell.calls == [f"stop {name}"]
+    gone = OneRobot(adapt_world(cell), name).halt()
+    assert gone.stopped is (True if stopped is False else stopped)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import threading
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 from strands_robots import settings
+from strands_robots.adapted import AdaptedWorld
 from strands_robots.contract import Haltable, Observer, Unsubscribe, WorldRobot, for_request
 from strands_robots.envelope import Envelope, error
 from strands_robots.recording.cameras import has_cameras
@@ -123,15 +124,41 @@ class RobotStop(StopOfRobot):
         return verdict_of(self.stop, self.name)
 
 
+@dataclass(frozen=True)
+class _StrangersStop(RobotStop):
+    """Stop of one robot of a foreign world, whose list is read after it: it may hang."""
+
+    leaves: bool
+    """True for a robot that its world had, and that stands still where it has it no more."""
+
+    def halt(self, reason: str = "") -> StopVerdict:
+        """Stop the robot's rollout; the answer counts for a robot that is there."""
+        verdict = super().halt(reason)
+        try:
+            robots = cast(AdaptedWorld, self.world).listed()
+        except Exception as exc:  # noqa: BLE001 - a stranger's list raises what it likes
+            doubt = StopVerdict(unknown={self.name: f"whether it is there is not known: {explain(exc)}"})
+            return doubt if verdict.stopped else verdict
+        if robots is None or self.name in robots:
+            return verdict
+        return StopVerdict() if self.leaves else StopVerdict(not_stopped={self.name: _no_robot(robots)})
+
+
+def _no_robot(robots: Sequence[str]) -> str:
+    return f"there is no robot of this name; the robots here are {', '.join(robots) or 'none'}"
+
+
 def robot_stop(world: WorldRobot, name: str) -> RobotStop:
     """Return the stop of the named robot of a world.
 
     Raises:
-        ValidationError: the world has no robot of this name.
+        ValidationError: the world has no robot of this name; a stranger's is asked when it is stopped.
     """
+    if isinstance(world, AdaptedWorld):
+        return _StrangersStop(world, name, leaves=False)
     robots = world.list_robots()
     if name not in robots:
-        raise ValidationError(f"there is no robot of this name; the robots here are {', '.join(robots) or 'none'}")
+        raise ValidationError(_no_robot(robots))
     return RobotStop(world, name)
 
 
@@ -321,6 +348,8 @@ class OneRobot:
         """
         if name not in ("", self.tool_name_str):
             raise ValidationError(f"there is no robot of this name; the robots here are {self.tool_name_str}")
+        if isinstance(self._world, AdaptedWorld):
+            return _StrangersStop(self._world, self.tool_name_str, leaves=True)
         return RobotStop(self._world, self.tool_name_str) if self.list_robots() else None
 
     def facts(self) -> dict[str, Any]:
