@@ -227,6 +227,28 @@ def test_robot_that_hangs_leaves_the_others_of_its_world_their_stops(monkeypatch
         released.set()
 
 
+def test_robots_that_a_world_listed_are_stopped_where_its_list_hangs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.5")
+    hangs, released = threading.Event(), threading.Event()
+
+    class Slow(World):
+        def list_robots(self) -> list[str]:
+            if hangs.is_set():
+                released.wait(10)
+            return super().list_robots()
+
+    foreign = Slow()
+    world = adapt_world(foreign)
+    assert world.list_robots() == ["left", "right"]
+    hangs.set()
+    try:
+        for times in (1, 2):
+            assert world.halt().stopped is False
+            assert sorted(foreign.calls) == sorted(["stop left", "stop right"] * times)
+    finally:
+        released.set()
+
+
 def test_locked_world_of_others_is_never_asked_to_move() -> None:
     foreign = World()
     world = adapt_world(foreign)

@@ -151,8 +151,8 @@ class _Shared:
         self.reading = threading.Lock()
         self.read: tuple[float, Joints] | None = None
         self.warned = False
-        self.started: dict[str, None] = {}
-        """Robots of a world whose policies were started from here."""
+        self.known: dict[str, None] = {}
+        """Robots of a world that it listed last, or that were started from here since."""
         self._calls: set[object] = set()
 
     @property
@@ -382,11 +382,14 @@ class AdaptedWorld(RobotWrapper):
         return tuple(verb for verb in (*_WORLD_VERBS, "step", "reset") if self._own(verb) is None)
 
     def list_robots(self) -> list[str]:
-        return [name for name in self._listed("list_robots") if isinstance(name, str)]
+        return self.listed() or []
 
     def listed(self) -> list[str] | None:
         """Return the names of its robots; None for a list that cannot be read."""
-        return _texts(self._ask("list_robots"))
+        names = _texts(self._ask("list_robots"))
+        if names is not None:
+            self._shared.known = dict.fromkeys(names)
+        return names
 
     def list_policies_running(self) -> list[dict[str, Any]]:
         return [row for row in self._listed("list_policies_running") if isinstance(row, dict)]
@@ -401,7 +404,7 @@ class AdaptedWorld(RobotWrapper):
         request: MotionRequest | None = None,
         **policy: Any,
     ) -> Envelope:
-        self._shared.started[robot_name] = None
+        self._shared.known[robot_name] = None
         named = {"robot_name": robot_name, "instruction": instruction, "policy_provider": policy_provider}
         return self._motion("start_policy", request, **named, duration=duration, **policy)
 
@@ -434,7 +437,7 @@ class AdaptedWorld(RobotWrapper):
         return stop_executor().halt(self, self.tool_name_str, reason)
 
     def halt_here(self, reason: str, deadline: float) -> StopVerdict | PendingVerdict:
-        """Ask everything to stop: what was started from here before the world is read.
+        """Ask everything to stop: the robots that are known before the world is read.
 
         Each robot is stopped on a thread of the stop executor's, so that one that hangs leaves the others their stops.
         """
@@ -447,7 +450,7 @@ class AdaptedWorld(RobotWrapper):
             answers[self.tool_name_str] = _answer(whole)
         elif self.halts:
             patience = time.monotonic() + ORDER_SHARE * settings.number("STRANDS_HALT_DEADLINE_S")
-            self._stop_each(tuple(self._shared.started), halting, reason, patience)
+            self._stop_each(tuple(self._shared.known), halting, reason, patience)
             listed = _answer(partial(self._ask, "list_robots"))
             names = _texts(listed)
             if names is None:
@@ -455,7 +458,7 @@ class AdaptedWorld(RobotWrapper):
             else:
                 for gone in halting.keys() - set(names):
                     del halting[gone]
-                    self._shared.started.pop(gone, None)
+                self._shared.known = dict.fromkeys(names)
                 self._stop_each([name for name in names if name not in halting], halting, reason, patience)
         else:
             answers[self.tool_name_str] = error(NO_STOP)
