@@ -475,6 +475,18 @@ def test_a_device_that_fails_is_counted_and_goes_on(peers: Fleet) -> None:
     assert stats["event_read_errors"] >= 3
 
 
+def test_frames_of_a_leader_that_is_off_the_mesh_count_as_errors(peers: Fleet) -> None:
+    lead = peers.join(None, "lead")
+    lead.stop()
+    publisher = InputPublisher(lead, Leader(), hz=200)
+    publisher.start()
+    try:
+        assert eventually(lambda: publisher.stats["errors"] > 1)
+    finally:
+        stats = publisher.stop()
+    assert stats["frames"] == 0
+
+
 def test_frames_of_a_local_leader_move_a_remote_follower(peers: Fleet) -> None:
     peers.clock = time.time  # type: ignore[assignment]  # these peers live in real time
     here, there = HardwareRobot(RecordingDevice()), HardwareRobot(RecordingDevice())

@@ -44,6 +44,8 @@ class MeshInputSink:
 
     def publish(self, device: str, method: str, action: Mapping[str, float], events: Mapping[str, Any] | None) -> None:
         """Publish one frame. Raises TransportError or WireError."""
+        if not self._mesh.alive:
+            raise TransportError("the mesh is not running.")
         frame = {
             "peer_id": self._mesh.peer_id,
             "device": device,

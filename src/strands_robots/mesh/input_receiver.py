@@ -135,6 +135,10 @@ class InputMesh(Protocol):
     inputs: InputSide
 
     @property
+    def alive(self) -> bool:
+        """True while the peer is on the mesh."""
+
+    @property
     def lockout_epoch(self) -> str | None:
         """The epoch that locks the peer, or None."""
 
