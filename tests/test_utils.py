@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from strands_robots import utils
 from strands_robots.envelope import jsonable, uncarried
-from strands_robots.mesh.wire import WireError, encode
+from strands_robots.mesh.wire import WireError, encode, finite
 from strands_robots.utils import ValidationError, near, plain_text, redacted
 
 ANYTHING = st.one_of(
@@ -78,6 +78,19 @@ def test_what_becomes_no_number_of_pythons_is_none_and_no_text_of_json(value: ob
         encode({"a": value}, 1000)
     assert isinstance(jsonable({"a": value})["a"], str)
     assert uncarried({"a": value}).startswith("a is ")
+
+
+def test_picture_among_numbers_is_not_unpacked() -> None:
+    class Picture(Boxed):
+        size = 900_000
+
+        def tolist(self) -> object:
+            raise AssertionError("unpacked")
+
+    for check in (utils.number, utils.whole, utils.integral, utils.flag):
+        with pytest.raises(ValidationError, match="x must be"):
+            check("x", Picture([]))
+    assert finite(Picture([])) is None
 
 
 @pytest.mark.parametrize("value", [4, 4.0, Boxed(4), Boxed(4.0)])

@@ -190,6 +190,15 @@ def plain_value(value: object) -> Any:
     return found if type(found) in _PYTHONS_OWN else value
 
 
+def plain_scalar(value: object) -> Any:
+    """Return one number or boolean of numpy's as Python's, and an array as it is.
+
+    A picture among the joints of a robot would hold the interpreter for many ms, and a stop with it.
+    """
+    size = getattr(value, "size", 1)
+    return value if isinstance(size, int) and size != 1 else plain_value(value)
+
+
 def _kind(value: object) -> object:
     return getattr(getattr(value, "dtype", None), "kind", "")
 
@@ -234,7 +243,7 @@ def number(
     above: float | None = None,
 ) -> float:
     """Return a finite float; ``low`` and ``high`` are included, ``above`` is not."""
-    plain = value if type(value) in _PYTHONS_OWN else plain_value(value)
+    plain = value if type(value) in _PYTHONS_OWN else plain_scalar(value)
     if isinstance(plain, int | float) and not isinstance(plain, bool):
         try:
             result = float(plain)
@@ -276,7 +285,7 @@ def finite(name: str, value: object) -> None:
 
 def whole(name: str, value: object, *, low: float | None = None, high: float | None = None) -> int:
     """Return an integer, bounds included; ``True`` is not 1 and 2.0 is not 2."""
-    plain = value if type(value) in _PYTHONS_OWN else plain_value(value)
+    plain = value if type(value) in _PYTHONS_OWN else plain_scalar(value)
     if isinstance(plain, int) and not isinstance(plain, bool):
         inside = (low is None or plain >= low) and (high is None or plain <= high)
         if inside:
@@ -286,7 +295,7 @@ def whole(name: str, value: object, *, low: float | None = None, high: float | N
 
 def integral(name: str, value: object, *, low: float | None = None, high: float | None = None) -> int:
     """Return an integer of a message; 4.0 is 4, and ``True`` is not 1."""
-    plain = value if type(value) in _PYTHONS_OWN else plain_value(value)
+    plain = value if type(value) in _PYTHONS_OWN else plain_scalar(value)
     if isinstance(plain, float) and plain.is_integer():
         plain = int(plain)
     return whole(name, plain if isinstance(plain, int) else value, low=low, high=high)
@@ -299,7 +308,7 @@ def duration(name: str, value: object) -> float:
 
 def flag(name: str, value: object) -> bool:
     """Return ``value`` as a boolean; a spelling of one, 0 and 1 are refused."""
-    plain = value if type(value) in _PYTHONS_OWN else plain_value(value)
+    plain = value if type(value) in _PYTHONS_OWN else plain_scalar(value)
     if not isinstance(plain, bool):
         raise ValidationError(f"{name} must be true or false, not {shown(value)}.")
     return plain

@@ -10,7 +10,7 @@ from fixtures.mesh_robots import Arm
 from fixtures.waiting import eventually
 from tests.mesh.peers import Fleet, received
 
-from strands_robots.envelope import Envelope
+from strands_robots.envelope import Envelope, success
 from strands_robots.mesh import wire
 from strands_robots.mesh.security import validate_command, validate_input_frame
 from strands_robots.utils import ValidationError
@@ -130,3 +130,24 @@ def test_message_keys_and_numbers_of_numpy_are_encoded_and_a_foreign_object_is_n
     assert wire.finite(np.bool_(True)) is None
     with pytest.raises(wire.WireError, match="object"):
         wire.encode({"handle": object()}, 4096)
+
+
+def test_picture_among_the_joints_is_left_out_and_not_unpacked(peers: Fleet) -> None:
+    class Picture:
+        size, ndim = 900_000, 3
+        unpacked = 0
+
+        def tolist(self) -> list[float]:
+            self.unpacked += 1
+            return [0.0]
+
+    picture = Picture()
+
+    class Seeing(Arm):
+        def get_state(self) -> Envelope:
+            return success("1 joint.", joints={"pan": np.float32(0.5), "front": picture})
+
+    topic = received(peers, "strands/arm-1/state")
+    peers.join(Seeing(), "arm-1", "sim")
+    state = eventually(lambda: topic and topic[0], what="a state")
+    assert (state["joints"], picture.unpacked) == ({"pan": 0.5}, 0)

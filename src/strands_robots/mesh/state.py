@@ -29,7 +29,7 @@ from strands_robots.rate_limits import RateLimiter
 from strands_robots.safety.gate import MotionGate
 from strands_robots.serving.peer_verbs import kind_of
 from strands_robots.threads import BoundedExecutor
-from strands_robots.utils import plain_value
+from strands_robots.utils import plain_scalar
 
 logger = logging.getLogger(__name__)
 
@@ -250,7 +250,7 @@ def _is_number_or_none(value: object) -> bool:
 
 def _float(value: object) -> float | None:
     """Return a number, or an array's one element, as a float, else None."""
-    plain = value if type(value) is float else plain_value(value)
+    plain = value if type(value) is float else plain_scalar(value)
     while plain is not value and isinstance(plain, list) and len(plain) == 1:
         plain = plain[0]
     return float(plain) if isinstance(plain, int | float) and not isinstance(plain, bool) else None
@@ -324,7 +324,7 @@ def _world_features(features: Fields) -> Fields:
 
 
 def _typed(device: Any, field: str, name: str, kind: type) -> Fields:
-    value = plain_value(getattr(device, name, None))
+    value = plain_scalar(getattr(device, name, None))
     return {field: value} if isinstance(value, kind) and value != "" else {}
 
 

@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 from strands_robots.bounded_json import OutOfBoundsError, parsed
 from strands_robots.errors import StrandsRobotsError
-from strands_robots.utils import ValidationError, identifier, json_value, peer_id, plain_value, shown
+from strands_robots.utils import ValidationError, identifier, json_value, peer_id, plain_scalar, plain_value, shown
 
 FRESH_S = 60.0
 AHEAD_S = 5.0
@@ -74,7 +74,7 @@ def decode(data: bytes, limit: int) -> dict[str, Any]:
 
 def finite(value: object) -> float | None:
     """Return a finite JSON number as a float, or None; a boolean is no number."""
-    plain = value if type(value) is float else plain_value(value)
+    plain = value if type(value) is float else plain_scalar(value)
     if isinstance(plain, bool) or not isinstance(plain, int | float):
         return None
     try:

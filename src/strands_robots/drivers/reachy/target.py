@@ -14,7 +14,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
-from strands_robots.utils import ValidationError, number, plain_value, shown
+from strands_robots.utils import ValidationError, number, plain_scalar, shown
 
 TILT, TILT_SUM = math.radians(40), math.radians(60)
 """Largest pitch or roll of the head, and largest sum of the two."""
@@ -201,7 +201,7 @@ def bounded(key: str, value: object, *, unit: str = "", scale: float = 1.0, name
     label = f"{name or key} ({unit})" if unit else name or key
     # A conversion between degrees and radians may miss a bound by its last digit.
     slack = _ROUNDING * max(1.0, scale)
-    value = plain_value(value)
+    value = plain_scalar(value)
     if isinstance(value, int | float) and not isinstance(value, bool) and low - slack <= value <= high + slack:
         return min(high, max(low, float(value))) / scale
     return number(label, value, low=round(low, 6), high=round(high, 6)) / scale
