@@ -368,9 +368,9 @@ def plain(message: Any) -> dict[str, Any]:
 
 
 def _value(kind: str, value: Any, place: str, new: NewMessage, zero: Any = None) -> Any:
-    value = plain_value(value)
     if (several := _several(kind)) is not None:
         return _items(*several, value, place, new)
+    value = plain_value(value)
     if "/" in kind:
         if not isinstance(value, Mapping):
             raise RosError(f"{place} must be an object of fields, not {shown(value)}.")
