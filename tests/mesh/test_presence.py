@@ -343,10 +343,13 @@ def test_peer_that_fails_to_join_releases_the_session(peers: Fleet, monkeypatch:
     first.close()
 
 
-def test_id_of_a_peer_that_was_never_started_is_free_for_another_robot(peers: Fleet) -> None:
+def test_id_of_a_peer_that_was_never_started_is_free_for_another_robot(
+    peers: Fleet, caplog: pytest.LogCaptureFixture
+) -> None:
     other, parts = peers.parts("arm-1"), peers.parts("arm-1")
     forgotten = Mesh(Arm(), "arm-1", parts=replace(other, plane=parts.plane))
     joined = Mesh(Arm(), "arm-1", parts=parts)
+    assert "no emergency stop halts the one of this id that never joined" in caplog.text
     peers.meshes += [forgotten, joined]
     joined.start()
     assert joined.alive

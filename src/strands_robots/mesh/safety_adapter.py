@@ -124,6 +124,11 @@ class SafetyAdapter:
                         raise
                     for each in [*others]:
                         each._close()
+                        logger.warning(
+                            "%s is another robot from now on: no emergency stop halts the one of this id that never "
+                            "joined, until it joins by an id of its own.",
+                            self._peer_id,
+                        )
                     self._entry = self._registered()
             if joins:
                 self._no_longer_idle()
