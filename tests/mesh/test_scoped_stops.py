@@ -59,6 +59,18 @@ def test_stop_of_one_robot_goes_to_it_alone_and_locks_it(peers: Fleet) -> None:
     assert mesh._adapter.lockouts()[0]["scope"] == {"only": ["arm-1"]}
 
 
+def test_robot_whose_token_has_not_come_is_locked_all_the_same(peers: Fleet) -> None:
+    """It looks like an older peer for a moment, and says by its heartbeat that it is none."""
+    console = peers.join(None, "console")
+    arm, mesh = join(peers, "arm-1")
+    console._context.registry.update(
+        "arm-1", "robot", "", {"locked": False}, session=mesh._context.session_id(), older=True
+    )
+    (answer,) = console.emergency_stop(scope=ONLY_ARM_1)
+    assert (answer["result"]["locked"], locked(peers)) == (True, {"arm-1"})
+    assert arm.halts
+
+
 def test_stop_of_a_cell_reaches_it_and_robots_without_one(peers: Fleet) -> None:
     console = peers.join(None, "console")
     robots = {name: join(peers, name, cell)[0] for name, cell in (("a", "cell-1"), ("b", "cell-2"), ("c", ""))}

@@ -229,8 +229,12 @@ class PeerRegistry:
             return sorted(peer for peer in self._older if self._rows[peer].living(now))
 
     def is_older(self, peer_id: str) -> bool:
-        """Return True for a peer of a 0.5 release, however long it is silent."""
-        return peer_id in self._older
+        """Return True for a peer of a 0.5 release, however long it is silent.
+
+        One of ours whose token is not here yet would not be locked by the stop of an older peer.
+        """
+        row = self._row(peer_id)
+        return row is not None and row.older
 
     def knows_ours(self, peer_id: str) -> bool:
         """Return True for a peer known to read what 0.5 releases refuse."""
