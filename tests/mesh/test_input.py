@@ -308,6 +308,35 @@ def test_follower_that_may_keep_a_speed_is_halted_in_a_pause(stream: Stream, mon
     assert not stream.receiver.running
 
 
+def test_stranger_that_may_keep_a_speed_is_stopped_in_a_pause(
+    peers: Fleet, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(input_receiver, "HOLD_S", 0.05)
+
+    class Base:
+        stops = 0
+
+        def send_action(self, action: dict[str, float]) -> None: ...
+
+        def stop_task(self) -> dict[str, Any]:
+            self.stops += 1
+            return {"status": "error"}
+
+    base = Base()
+    follower, leader = peers.join(base, "follower"), peers.stranger()
+    leader.put("strands/lead/presence", {"robot_id": "lead", "timestamp": peers.clock()})
+    receiver = InputReceiver(follower, base, "lead")
+    receiver.start()
+    frame = {"peer_id": "lead", "device": "leader", "method": "arm", "t": peers.clock(), "seq": 1, "events": None}
+    leader.put("strands/lead/input/leader", signed(peers, {**frame, "action": {"x.vel": 0.5}}))
+    try:
+        assert eventually(lambda: base.stops)
+        assert eventually(lambda: not receiver.running)
+        assert eventually(lambda: "in its leader's pause the follower did not stop" in caplog.text)
+    finally:
+        receiver.stop()
+
+
 def test_no_frame_is_applied_while_the_followers_joints_cannot_be_read(stream: Stream) -> None:
     report = {"joints": {"shoulder.pos": 90.0}, "joints_error": "The bus was busy for 1 s."}
     stream.arm.get_state = lambda: success("state", **report)  # type: ignore[method-assign]

@@ -22,6 +22,7 @@ from strands_robots.mesh.wire_identity import INPUT
 from strands_robots.policies.base import numbers
 from strands_robots.safety.gate import MotionGate, MotionRefused, MotionRequest, Permit
 from strands_robots.safety.stop_executor import stop_executor
+from strands_robots.safety.stopping import explain
 from strands_robots.serving.verbs import Arguments
 from strands_robots.serving.workers import UNBOUNDED
 from strands_robots.stop_log import stop_logger
@@ -366,12 +367,18 @@ class InputReceiver:
 
     def _hold(self) -> None:
         body = getattr(self._robot, "body", None)
+        # A stranger without a halt is stopped as its contract has it.
+        robot = self._robot if isinstance(self._robot, Haltable) else self._mesh.robot
         try:
             if callable(body):
                 body().hold(self._permit)
-            elif isinstance(self._robot, Haltable) and not all(key.endswith(POSITION) for key in self._led):
+            elif isinstance(robot, Haltable) and not all(key.endswith(POSITION) for key in self._led):
                 # What it was given last may be a speed, which it keeps. A halt ends the stream.
-                stop_executor().halt(self._robot, self._source, "its leader is silent")
+                verdict = stop_executor().halt(robot, self._mesh.peer_id, "its leader is silent")
+                if not verdict.stopped:
+                    logger.critical(
+                        "%s: in its leader's pause the follower %s.", self.topic, explain(verdict.envelope())
+                    )
         except Exception:
             logger.critical("%s: the follower could not hold its position.", self.topic, exc_info=True)
 
