@@ -265,6 +265,7 @@ COMMANDS = {
     "audit": ("audit",),
     "keys": ("keys", "mesh"),
     "doctor": ("doctor",),
+    "conform": ("conform", "new"),
     "mcp": ("mcp",),
 }
 """Words of the command line, by the module that has them."""

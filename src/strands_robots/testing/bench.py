@@ -17,7 +17,7 @@ from functools import partial
 from typing import Any, Self, TypeVar
 
 from strands_robots import settings
-from strands_robots.adapted import adapt, behind_contract
+from strands_robots.adapted import behind_contract
 from strands_robots.contract import holds_robots, robots_in
 from strands_robots.device_connect import init_device_connect_sync, stop_device_connect
 from strands_robots.device_connect.backends.config import loopback_config
@@ -301,7 +301,7 @@ def usual_value(parameter: AdvertisedParameter) -> Any:
 
 def runs(body: Any) -> bool:
     """Return True while a task or a declared verb of the robot is under way."""
-    robot = adapt(body)
+    robot = behind_contract(body)
     if robot.gate.under_way:
         return True
     if holds_robots(robot):

@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from strands_robots.adapted import adapt
+from strands_robots.adapted import behind_contract
 from strands_robots.contract import AT_REST, RUNNING, holds_robots
 from strands_robots.errors import NoAnswerError, RefusalError, RobotError
 from strands_robots.serving.advertised import AdvertisedVerb
@@ -100,7 +100,7 @@ def reads(bench: ConformanceBench) -> str:
 )
 def status(bench: ConformanceBench) -> str:
     """Read the status of a robot that was asked for nothing."""
-    robot = adapt(bench.body)
+    robot = behind_contract(bench.body)
     if holds_robots(robot):
         return "a world"
     own = getattr(robot, "get_task_status", None)
@@ -123,7 +123,7 @@ def status(bench: ConformanceBench) -> str:
 )
 def features(bench: ConformanceBench) -> str:
     """Compare the declared observations with the state."""
-    robot = adapt(bench.body)
+    robot = behind_contract(bench.body)
     if holds_robots(robot):
         return "a world"
     first, second = (within(bench.subject.answer_s, robot.get_features, "get_features") for _ in range(2))

@@ -90,7 +90,7 @@ class ConformanceReport:
             if result.mark is CheckMark.PASSED:
                 continue
             lines.append(f"{result.mark.upper()} {result.check}: {result.said}")
-            if result.mark is not CheckMark.EXEMPT:
+            if result.mark in BAD:
                 lines += [f"  promise: {result.promise}", f"  matters: {result.why}", f"  look at: {result.look}"]
         return "\n".join(lines)
 

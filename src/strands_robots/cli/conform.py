@@ -1,0 +1,124 @@
+"""``conform``: check a robot. ``new``: write a package with one that conforms."""
+
+from __future__ import annotations
+
+import keyword
+import re
+import sys
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from string import Template
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from strands_robots.cli.app import assignments
+from strands_robots.cli.output import CliError, Screen
+from strands_robots.utils import ValidationError, choice, shown
+
+if TYPE_CHECKING:
+    from strands_robots.testing import CheckResult, Subject
+
+TIERS = ("bronze", "silver", "gold")
+
+_STYLES = {"passed": "green", "exempt": "cyan", "not proven": "yellow"}
+
+
+def conform(
+    screen: Screen,
+    *,
+    target: Annotated[
+        str, typer.Argument(help="module:NAME of a Subject, or of what makes the robot; or a robot's name.")
+    ],
+    tier: Annotated[str, typer.Option("--tier", help="The highest that is checked: bronze, silver or gold.")] = "gold",
+    only: Annotated[list[str] | None, typer.Option("--only", help="A check, such as silver.halts (repeat).")] = None,
+    options: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="An option of a robot that was named.", metavar="KEY=VALUE"),
+    ] = None,
+) -> None:
+    """Check a robot on its emulated bus, where it moves. Exits 1 on a failure."""
+    from strands_robots.testing import Tier  # noqa: PLC0415 - loads both networks
+    from strands_robots.testing import conform as check  # noqa: PLC0415 - as above
+
+    most = Tier[choice("--tier", tier, TIERS).upper()]
+    subject = _subject(target, assignments(options or []))
+
+    def tell(result: CheckResult) -> None:
+        screen.data({"event": "checked", "check": result.check, "mark": result.mark.value, "said": result.said})
+        style = _STYLES.get(result.mark.value, "bold red")
+        screen.say(f"{result.mark.value:>16}  {result.check}  {result.said}", style)
+
+    report = check(subject, most, only=only or (), report=tell)
+    screen.data({"event": "report", **report.facts()})
+    for line in report.words().splitlines():
+        screen.say(line)
+    if report.failed:
+        names = ", ".join(each.check for each in report.failed)
+        raise CliError(f"{report.name} does not keep {len(report.failed)} of its promises: {names}.")
+
+
+def _subject(target: str, options: dict[str, Any]) -> Subject:
+    """Return the subject that a target names.
+
+    Raises:
+        ValidationError: it cannot be loaded, or it is real hardware.
+    """
+    from strands_robots.robot import LEROBOT, Robot  # noqa: PLC0415 - heavy, and needed by this command alone
+    from strands_robots.testing import Subject  # noqa: PLC0415 - as above
+
+    module, colon, attribute = target.partition(":")
+    if not colon:
+        if target == "reachy_mini" or options.get("mode") == "real":
+            raise ValidationError(
+                f"{target} is real hardware; give module:NAME of a Subject whose robot is on an emulated bus."
+            )
+        return Subject(lambda: Robot(target, **options), name=target)
+    if target.startswith(LEROBOT):
+        raise ValidationError(
+            f"{target} is real hardware; give module:NAME of a Subject whose robot is on an emulated bus."
+        )
+    # As a module that is run: the package that is being written need not be installed.
+    sys.path.insert(0, str(Path.cwd()))
+    try:
+        named = getattr(import_module(module), attribute)
+        made = named(**options) if callable(named) else named
+    except Exception as exc:
+        raise ValidationError(f"{shown(target)} cannot be made: {type(exc).__name__}: {exc}") from exc
+    if isinstance(made, Subject):
+        return made
+    if not callable(named):
+        raise ValidationError(f"{shown(target)} must be a Subject, or make one or a robot, not {shown(named)}.")
+    first = [made]
+    return Subject(lambda: first.pop() if first else named(**options), name=attribute)
+
+
+TEMPLATE = Path(__file__).parent / "new_robot"
+
+
+def new(
+    screen: Screen,
+    *,
+    name: Annotated[str, typer.Argument(help="Of the robot, such as my_robot: lower case letters, digits and _.")],
+    folder: Annotated[
+        Path | None, typer.Option("--folder", help="Where it is written; it must not exist. By default the name.")
+    ] = None,
+) -> None:
+    """Write a package with a robot of your own, its emulated bus and its tests."""
+    if not re.fullmatch(r"[a-z][a-z0-9_]{0,49}", name) or keyword.iskeyword(name):
+        raise ValidationError(f"name must begin with a letter and have a-z, 0-9 and _ alone, not {shown(name)}.")
+    if find_spec(name) is not None:
+        raise ValidationError(f"name must be free: there is a package {name} already.")
+    root = folder or Path(name)
+    if root.exists():
+        raise ValidationError(f"--folder must not exist: {root} does.")
+    words = {"name": name, "title": name.replace("_", " "), "Name": "".join(map(str.capitalize, name.split("_")))}
+    for source in sorted(TEMPLATE.rglob("*.tmpl")):
+        relative = str(source.relative_to(TEMPLATE)).removesuffix(".tmpl").replace("NAME", name)
+        written = root / relative
+        written.parent.mkdir(parents=True, exist_ok=True)
+        written.write_text(Template(source.read_text(encoding="utf-8")).substitute(words), encoding="utf-8")
+        screen.say(f"  {written}")
+    screen.data({"status": "success", "folder": str(root)})
+    screen.say(f"cd {root}, then pip install -e . and pytest. Serve it: strands-robots serve {name}", "bold")

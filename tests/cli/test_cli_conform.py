@@ -1,0 +1,57 @@
+"""``conform`` and ``new``: what they refuse, by name, before anything is made or moves."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from tests.cli.conftest import Run
+
+from strands_robots.cli.output import Exit
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("reachy_mini",), "reachy_mini is real hardware; give module:NAME"),
+        (("lerobot:so100",), "lerobot:so100 is real hardware; give module:NAME"),
+        (("so100", "--set", "mode=real"), "so100 is real hardware"),
+        (("no_such_module:subject",), "ModuleNotFoundError: No module named 'no_such_module'"),
+        (("json:no_such_name",), "AttributeError"),
+        (("math:pi",), "must be a Subject, or make one or a robot, not 3.14"),
+        (("so100", "--tier", "iron"), "--tier must be one of bronze, silver, gold, not 'iron'"),
+        (("math:tau", "--only", "silver.halt"), "must be a Subject"),
+    ],
+    ids=str,
+)
+def test_conform_refuses_by_name(run: Run, arguments: tuple[str, ...], said: str) -> None:
+    refused = run("conform", *arguments, "--json")
+    assert refused.exit_code == Exit.USAGE
+    assert said in json.loads(refused.stdout)["reason"]
+
+
+@pytest.mark.parametrize("name", ["", "My_Robot", "my-robot", "1robot", "a" * 51, "../x", "class", "json", "numpy"])
+def test_new_refuses_a_name_that_is_no_free_package(run: Run, name: str, tmp_path: Path) -> None:
+    refused = run("new", name, "--folder", str(tmp_path / "made"), "--json")
+    assert refused.exit_code == Exit.USAGE
+    assert "name must" in json.loads(refused.stdout)["reason"]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_new_writes_into_no_folder_that_exists(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "kept").write_text("mine")
+    refused = run("new", "my_robot", "--folder", str(tmp_path), "--json")
+    assert refused.exit_code == Exit.USAGE
+    assert "--folder must not exist" in json.loads(refused.stdout)["reason"]
+    assert [each.name for each in tmp_path.iterdir()] == ["kept"]
+
+
+def test_new_writes_a_package_with_its_entry_point(run: Run, tmp_path: Path) -> None:
+    made = run("new", "left_arm", "--folder", str(tmp_path / "made"), "--json")
+    assert json.loads(made.stdout) == {"status": "success", "folder": str(tmp_path / "made")}
+    assert 'left_arm = "left_arm:LeftArm"' in (tmp_path / "made" / "pyproject.toml").read_text()
+    files = {str(each.relative_to(tmp_path / "made")) for each in (tmp_path / "made").rglob("*") if each.is_file()}
+    assert {"README.md", "src/left_arm/robot.py", "src/left_arm/bus.py", "tests/test_left_arm.py"} <= files
+    for each in (tmp_path / "made").rglob("*.py"):
+        compile(each.read_text(), str(each), "exec")

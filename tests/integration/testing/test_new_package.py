@@ -1,0 +1,50 @@
+"""A package as ``new`` writes it: its tests pass as written, it conforms, and it is served by its name."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from fixtures.command_line import WITHIN_S, Machine
+
+pytestmark = pytest.mark.system
+
+
+@pytest.fixture
+def machine(tmp_path: Path) -> Machine:
+    """A machine on which the package is installed: its module and its metadata are on the path."""
+    made = tmp_path / "my_robot"
+    path = os.pathsep.join(filter(None, (str(made / "src"), os.environ.get("PYTHONPATH"))))
+    allowed = {"DEVICE_CONNECT_RPC_ALLOW": "*", "STRANDS_ROBOT_COMMAND_ALLOW": "spin"}
+    machine = Machine(tmp_path / "state", PYTHONPATH=path, **allowed)
+    machine.forked = False
+    assert machine.run("new", "my_robot", "--folder", str(made)).returncode == 0
+    metadata = made / "src" / "my_robot-0.1.0.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: my_robot\nVersion: 0.1.0\n")
+    (metadata / "entry_points.txt").write_text("[strands_robots.robots]\nmy_robot = my_robot:MyRobot\n")
+    return machine
+
+
+def test_its_tests_pass_as_written(machine: Machine, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(tmp_path / "my_robot" / "tests")]
+    folder = tmp_path / "my_robot"
+    ran = subprocess.run(
+        command, cwd=folder, env=machine.environment, capture_output=True, text=True, timeout=WITHIN_S, check=False
+    )
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+
+
+def test_it_conforms_and_the_report_is_json(machine: Machine) -> None:
+    code, report = machine.last_json("conform", "my_robot.conformance:subject", "--tier", "silver")
+    assert (code, report["tier"], report["failed"]) == (0, "silver", 0)
+
+
+def test_it_is_served_by_its_name_and_called(machine: Machine) -> None:
+    with machine.serving("spinner", robot="my_robot"):
+        code, answer = machine.json("call", "spinner", "spin", "seconds=0.2")
+        assert (code, answer["task_status"]) == (0, "completed"), answer
+        assert answer["angle_deg"] > 0
