@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -98,7 +99,19 @@ def test_words_name_the_promise_the_reason_and_the_place_of_what_failed() -> Non
         "  promise: It stops.",
         "  matters: People stand beside it.",
         "  look at: halt()",
+        "To silver: x.y.",
     ]
+
+
+def test_words_say_what_waits_for_which_check() -> None:
+    failed = kept(Tier.SILVER, "silver.halts").result(CheckMark.FAILED, "it wrote")
+    waiting = [
+        replace(kept(tier, name).result(CheckMark.NOT_PROVEN, "it waits"), waits_for="silver.halts")
+        for tier, name in ((Tier.SILVER, "silver.again"), (Tier.GOLD, "gold.starts"))
+    ]
+    lines = ConformanceReport("rig", [failed, *waiting]).words().splitlines()
+    assert lines[-2:] == ["To silver: silver.halts.", "Waiting for that: silver.again, gold.starts."]
+    assert not any(line.startswith("NOT PROVEN") for line in lines)
 
 
 def test_every_promise_says_what_why_and_where_and_its_name_begins_with_its_tier() -> None:
@@ -119,7 +132,7 @@ def test_unknown_check_is_refused_with_the_near_one(arguments: dict[str, Any]) -
 
 @pytest.mark.parametrize(
     "arguments",
-    [{"make": 3}, {"deadline_s": 0}, {"watch_s": float("nan")}, {"name": ""}, {"exempt": {"x": ""}}],
+    [{"make": 3}, {"deadline_s": 0}, {"watch_s": float("nan")}, {"name": 3}, {"exempt": {"x": ""}}],
     ids=str,
 )
 def test_bad_argument_of_a_subject_is_refused_by_name(arguments: dict[str, Any]) -> None:

@@ -18,6 +18,7 @@ from typing import Any, Self, TypeVar
 
 from strands_robots import settings
 from strands_robots.adapted import behind_contract
+from strands_robots.audit import flush_audit
 from strands_robots.contract import holds_robots, robots_in
 from strands_robots.device_connect import init_device_connect_sync, stop_device_connect
 from strands_robots.device_connect.backends.config import loopback_config
@@ -29,6 +30,7 @@ from strands_robots.fleet.remote_robot import RemoteRobot
 from strands_robots.mesh import init_mesh
 from strands_robots.safety.estop_listener import estop_listener
 from strands_robots.safety.plane import plane
+from strands_robots.safety.sightings import flush_sightings
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.advertised import RESUMES, AdvertisedParameter, AdvertisedVerb
 from strands_robots.testing.subject import LongMotion, Subject
@@ -218,6 +220,9 @@ class ConformanceBench:
                 after_ms = max(0.0, (late[0].at - verdict_at) * 1000)
                 raise NotKeptError(f"{how}: {late[0].what or 'a write'} {after_ms:.0f} ms after the verdict")
             time.sleep(_EVERY_S)
+        if self.subject.moving is not None and self.subject.moving():
+            after_ms = (time.monotonic() - verdict_at) * 1000
+            raise NotKeptError(f"{how}: its motor moves {after_ms:.0f} ms after the verdict")
 
 
 class MotionRun:
@@ -239,6 +244,9 @@ class MotionRun:
             if self._bench.writes > before if self._bench.subject.recorder else runs(self._bench.body):
                 return
             time.sleep(_EVERY_S)
+        if self._bench.subject.recorder is not None and runs(self._bench.body):
+            look = "is recorder.wrote() called where the motor is written?"
+            raise NotProvenError(f"{self.motion.verb} runs, and the recorder saw no write: {look}")
         raise NotProvenError(f"{self.motion.verb} did not move the robot within {self._bench.subject.answer_s:g} s")
 
     @property
@@ -356,6 +364,9 @@ def _own_settings(deadline_s: float) -> Iterator[None]:
             try:
                 yield
             finally:
+                # What is still queued belongs into the directory that is removed.
+                flush_audit()
+                flush_sightings()
                 ours.setLevel(level)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 
 from strands_robots.testing import bronze, gold, silver
 from strands_robots.testing.bench import ConformanceBench
@@ -11,10 +12,21 @@ from strands_robots.testing.report import GOOD, CheckMark, CheckResult, Conforma
 from strands_robots.testing.subject import Subject
 from strands_robots.utils import ValidationError, near
 
+MADE = Promise(
+    "bronze.made",
+    Tier.BRONZE,
+    "It is made, and served on both networks.",
+    "Whatever else it promises begins there.",
+    "the callable that makes it, and its __init__",
+    lambda bench: type(bench.body).__name__,
+)
+
 
 def promises(most: Tier = Tier.PLATINUM) -> tuple[Promise, ...]:
     """Return the promises of each tier up to ``most``, in their order."""
-    return tuple(each for each in (*bronze.PROMISES, *silver.PROMISES, *gold.PROMISES) if each.tier.value <= most.value)
+    return tuple(
+        each for each in (MADE, *bronze.PROMISES, *silver.PROMISES, *gold.PROMISES) if each.tier.value <= most.value
+    )
 
 
 def conform(
@@ -42,14 +54,16 @@ def conform(
         if name not in known:
             raise ValidationError(f"there is no check {name}.{near(name, known)}")
     results: list[CheckResult] = []
+    name = subject.name or "robot"
     try:
         with ConformanceBench(subject) as bench:
+            name = subject.name or type(bench.body).__name__
             for each in chosen:
                 if wanted and each.name not in wanted:
                     continue
                 if any(result.check == each.needs and result.mark not in GOOD for result in results):
                     said = f"{each.needs} is not proven, without which it cannot be checked"
-                    results.append(each.result(CheckMark.NOT_PROVEN, said))
+                    results.append(replace(each.result(CheckMark.NOT_PROVEN, said), waits_for=each.needs))
                     report(results[-1])
                     continue
                 results.append(each.check(bench))
@@ -59,6 +73,6 @@ def conform(
         if results and not isinstance(exc, AssertionError):
             raise
         said = f"it could not be served: {type(exc).__name__}: {exc}"
-        results.append(chosen[0].result(CheckMark.FAILED, said))
+        results.append(MADE.result(CheckMark.FAILED, said))
         report(results[-1])
-    return ConformanceReport(subject.name, tuple(results))
+    return ConformanceReport(name, tuple(results))

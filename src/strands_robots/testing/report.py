@@ -52,6 +52,8 @@ class CheckResult:
     why: str
     look: str
     seconds: float = 0.0
+    waits_for: str = ""
+    """The check without which this one cannot be made."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +80,7 @@ class ConformanceReport:
         return [each for each in self.results if each.mark in BAD]
 
     def words(self) -> str:
-        """Return the report for a person: the tier, then each promise that is not kept."""
+        """Return the report for a person: the tier, each promise not kept, the way on."""
         tier = self.tier
         lines = [f"{self.name}: {'no tier' if tier is None else tier.label}"]
         for each in Tier:
@@ -87,12 +89,23 @@ class ConformanceReport:
                 counts = ", ".join(f"{marks.count(mark)} {mark}" for mark in CheckMark if mark in marks)
                 lines.append(f"  {each.label}: {counts}")
         for result in self.results:
-            if result.mark is CheckMark.PASSED:
+            if result.mark is CheckMark.PASSED or result.waits_for:
                 continue
             lines.append(f"{result.mark.upper()} {result.check}: {result.said}")
             if result.mark in BAD:
                 lines += [f"  promise: {result.promise}", f"  matters: {result.why}", f"  look at: {result.look}"]
-        return "\n".join(lines)
+        return "\n".join([*lines, *self._way_on(tier)])
+
+    def _way_on(self, tier: Tier | None) -> list[str]:
+        """Return what the next tier needs, and what waits for that."""
+        lacking = [each for each in self.results if each.mark not in GOOD]
+        if not lacking:
+            return []
+        up = min(each.tier.value for each in lacking)
+        first = ", ".join(each.check for each in lacking if each.tier.value == up and not each.waits_for)
+        waiting = [each.check for each in lacking if each.waits_for]
+        lines = [f"To {Tier(up).label}: {first}."] if first else []
+        return [*lines, *([f"Waiting for that: {', '.join(waiting)}."] if waiting else [])]
 
     def facts(self) -> dict[str, Any]:
         """Return the report as JSON can carry it."""

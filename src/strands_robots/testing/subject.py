@@ -125,10 +125,11 @@ class Subject:
         make: makes the robot on its emulated bus, connected and standing still. It is called several times; at most
             one robot lives at a time.
         recorder: of that bus; without one it is not proven that a stop is followed by no write.
+        moving: returns True while the emulated motor moves. A motor that is told a speed or a torque goes on without a
+            write, so for those it is needed: it must be False after every verdict that says stopped.
         motion: for the checks that stop it; by default a task of the policy ``mock``, or the first motion that the
             robot declares.
         exempt: reasons by check, for promises that this robot does not make.
-        name: of the report.
 
     Raises:
         ValidationError: an argument outside its domain.
@@ -138,7 +139,10 @@ class Subject:
     recorder: BusRecorder | None = None
     motion: LongMotion | None = None
     exempt: Mapping[str, str] = field(default_factory=dict)
-    name: str = "robot"
+    name: str = ""
+    """Of the report; that of the robot's class by default."""
+
+    moving: Callable[[], bool] | None = None
     deadline_s: float = 2.0
     """Seconds in which a halt has to answer; a real robot's is ``STRANDS_HALT_DEADLINE_S``."""
 
@@ -151,7 +155,9 @@ class Subject:
     def __post_init__(self) -> None:
         if not callable(self.make):
             raise ValidationError(f"make must be a callable that makes the robot, not {shown(self.make)}.")
-        text("name", self.name, longest=100)
+        text("name", self.name, longest=100, empty=True)
+        if self.moving is not None and not callable(self.moving):
+            raise ValidationError(f"moving must be a callable, not {shown(self.moving)}.")
         number("deadline_s", self.deadline_s, low=0.1, high=60)
         number("answer_s", self.answer_s, low=0.1, high=60)
         number("watch_s", self.watch_s, low=0.01, high=60)

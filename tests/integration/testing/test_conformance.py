@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import tempfile
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -31,17 +32,21 @@ def example(name: str) -> Any:
 def test_robot_that_keeps_its_promises_is_gold() -> None:
     report = conform(subject(Rig))
     assert report.tier is Tier.GOLD, report.words()
+    assert report.name == "Rig"
     assert not report.failed
 
 
 def test_nothing_of_a_run_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("STRANDS_STATE_DIR", str(tmp_path))
     monkeypatch.setenv("DEVICE_CONNECT_RPC_ALLOW", "agent")
+    temporary = tmp_path / "tmp"
+    temporary.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
     conform(subject(Rig), only=["bronze.verbs"])
     import os  # noqa: PLC0415 - the environment as it is now
 
     assert (os.environ["STRANDS_STATE_DIR"], os.environ["DEVICE_CONNECT_RPC_ALLOW"]) == (str(tmp_path), "agent")
-    assert list(tmp_path.iterdir()) == []
+    assert [*tmp_path.iterdir(), *temporary.iterdir()] == [temporary]
 
 
 def test_without_a_recorder_silver_is_not_proven() -> None:
@@ -56,6 +61,7 @@ def test_robot_that_cannot_be_made_is_named_with_its_error() -> None:
 
     report = conform(Subject(make, name="portless"))
     assert report.tier is None
+    assert [(each.check, each.mark) for each in report.results] == [("bronze.made", CheckMark.FAILED)]
     assert "no such port" in report.words()
 
 
@@ -94,6 +100,7 @@ def test_examples_are_gold() -> None:
 
 FAULTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "IgnoresHalt": (("silver.halts",), ()),
+    "KeepsItsSpeed": (("silver.halts",), ()),
     "WritesAfterTheVerdict": (("silver.halts",), ()),
     "BlocksInItsStop": (("silver.halts", "silver.unlinked"), ()),
     "RaisesInItsStop": (("silver.halts", "silver.unlinked"), ()),
