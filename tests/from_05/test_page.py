@@ -29,6 +29,7 @@ def test_program_of_the_page_prints_what_the_page_says(program: str, says: tuple
     environment = Machine(tmp_path).environment
     run = subprocess.run(line, env=environment, capture_output=True, text=True, timeout=100.0, check=False)
     assert run.returncode == 0, run.stderr
+    assert "Traceback" not in run.stderr, run.stderr
     rest = run.stdout
     for part in says:
         assert part in rest, run.stdout

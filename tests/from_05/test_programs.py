@@ -62,6 +62,7 @@ def test_program_runs_or_says_what_to_change(program: Path, folder: Path, daemon
     ended = run(program, folder, str(daemon.port))
     if program.stem not in ENDS:
         assert ended.returncode == 0, ended.stdout + ended.stderr
+        assert "Traceback" not in ended.stderr, ended.stderr
         return
     last = ended.stderr.strip().splitlines()[-1]
     assert re.fullmatch(rf"[\w.]+: {re.escape(ENDS[program.stem])}", last), ended.stdout + ended.stderr

@@ -137,6 +137,30 @@ def test_failing_job_is_run_again() -> None:
     assert scheduler.stop(20) == []
 
 
+def test_end_of_the_process_begins_no_job_and_waits_for_no_wedged_one(caplog: pytest.LogCaptureFixture) -> None:
+    timer, begun, release, left = Timer("end"), threading.Event(), threading.Event(), threading.Event()
+
+    def read() -> None:
+        begun.set()
+        release.wait(20)
+        left.set()
+        raise OSError("the session is closed.")
+
+    wedged = Scheduler("wedged", timer)
+    wedged.every("state", 100, read)
+    wedged.every("presence", 100, lambda: None, quick=True)
+    wedged.start()
+    assert begun.wait(20)
+    timer.end()
+    assert not left.is_set()
+    begun.clear()
+    release.set()
+    assert wedged.stop(20) == []
+    assert left.is_set()
+    assert not begun.is_set()
+    assert not caplog.records
+
+
 def test_stopped_mesh_leaves_no_thread(peers: Fleet) -> None:
     before = set(threading.enumerate())
     mesh: Mesh = peers.join(World("left"), "leaver", "sim")

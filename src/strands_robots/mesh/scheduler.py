@@ -117,6 +117,9 @@ TICK_S = 0.01
 SPREAD = (math.sqrt(5) - 1) / 2
 """Each further peer reads by this share of a period later: Zenoh drops readings that come close together on a link."""
 
+END_S = 0.5
+"""Seconds that the end of the process waits for jobs that run; one that reads a wedged bus is left to itself."""
+
 RELIEF_S = 0.02
 """Work that waits this long for a worker gets another one."""
 
@@ -229,6 +232,13 @@ class Timer:
             self._finished.wait_for(lambda: not running(), timeout)
             return running()
 
+    def end(self) -> None:
+        """Begin no job any more, and wait a moment for those that run."""
+        with self._lock:
+            jobs = [job for _, _, job in self._heap if not job.over]
+        self.remove(jobs)
+        self.wait(jobs, END_S)
+
     def _begun(self, target: Callable[[], None], kind: str) -> threading.Thread:
         thread = threading.Thread(target=target, name=f"{self._name}-{kind}", daemon=True)
         thread.start()
@@ -325,7 +335,8 @@ class Timer:
         except Exception:
             job.failures += 1
             # A sensor that fails at 50 Hz must not fill the log.
-            if job.failures & (job.failures - 1) == 0:
+            # One that goes on after its end finds what it needs closed.
+            if job.failures & (job.failures - 1) == 0 and not job.over:
                 logger.exception("%s failed (%d times).", job.name, job.failures)
         else:
             job.failures = 0
@@ -337,6 +348,8 @@ class Timer:
 
 _timer = Timer()
 _peers = count()
+
+end_jobs = _timer.end
 
 
 class Scheduler:

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 from strands_robots import settings
 from strands_robots._mesh_switch import mesh_env_request
 from strands_robots.mesh import wire
-from strands_robots.mesh.scheduler import AuditThrottle
+from strands_robots.mesh.scheduler import AuditThrottle, end_jobs
 from strands_robots.mesh.transport import Sample, Transport, TransportError
 from strands_robots.mesh.transport.config import stated_endpoints
 from strands_robots.mesh.transport.factory import make_transport
@@ -520,6 +520,8 @@ class _Shared:
 
 _shared = _Shared()
 atexit.register(_shared.close)
+# Before it: a job that publishes then would log a session that is closed.
+atexit.register(end_jobs)
 
 
 acquire = _shared.acquire
