@@ -17,6 +17,7 @@ from strands_robots.contract import TaskRobot, for_request, holds_robots, put_aw
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.safety.gate import MotionGate, MotionRequest, answered
 from strands_robots.safety.stopping import StopVerdict, grade
+from strands_robots.serving.stops import robot_stop
 from strands_robots.utils import ValidationError
 
 
@@ -247,6 +248,30 @@ def test_robots_that_a_world_listed_are_stopped_where_its_list_hangs(monkeypatch
             assert sorted(foreign.calls) == sorted(["stop left", "stop right"] * times)
     finally:
         released.set()
+
+
+@pytest.mark.parametrize(("looks", "stopped"), [(0, True), (2, True), (10**6, False)])
+def test_robot_that_its_world_goes_on_listing_as_running_did_not_stop(
+    monkeypatch: pytest.MonkeyPatch, looks: int, stopped: bool
+) -> None:
+    monkeypatch.setenv("STRANDS_HALT_DEADLINE_S", "0.5")
+
+    class Listing(World):
+        left = 0
+
+        def list_policies_running(self) -> list[dict[str, Any]]:
+            self.left -= 1
+            return [{"robot": "left"}] if self.left >= 0 else []
+
+        def stop_policy(self, robot_name: str) -> Envelope:
+            self.left = looks
+            return success("Stopped.")
+
+    world = adapt_world(Listing())
+    for stop in (world, robot_stop(world, "left")):
+        verdict = stop.halt()
+        assert verdict.stopped is stopped
+        assert ("lists it as running" in verdict.not_stopped.get("left", "")) is not stopped
 
 
 def test_locked_world_of_others_is_never_asked_to_move() -> None:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from functools import partial
 from inspect import signature
 from types import ModuleType
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 from strands_robots import settings
 from strands_robots.contract import (
@@ -306,10 +306,8 @@ class AdaptedRobot(RobotWrapper):
 
     def subscribe(self, observer: Observer) -> Unsubscribe:
         subscribe = getattr(self.wrapped, "subscribe", None)
-        if callable(subscribe):
-            unsubscribe: Unsubscribe = subscribe(observer)
-            return unsubscribe
-        return lambda: None
+        unsubscribe: Unsubscribe = subscribe(observer) if callable(subscribe) else lambda: None
+        return unsubscribe
 
     @halts_in_parts
     def halt(self, reason: str = "") -> StopVerdict:
@@ -355,6 +353,8 @@ class AdaptedRobot(RobotWrapper):
         return ""
 
 
+RUNS_ON, SILENT = "its world lists it as running after the stop", "it has not answered its stop"
+
 ORDER_SHARE = 0.2
 """Part of the halt deadline for which robots of a world are stopped one after another; the rest are at once."""
 
@@ -390,6 +390,13 @@ class AdaptedWorld(RobotWrapper):
         if names is not None:
             self._shared.known = dict.fromkeys(names)
         return names
+
+    @property
+    def runs(self) -> Callable[[], set[str]] | None:
+        """Reads the names of robots whose policies run; None where it cannot say."""
+        if self._own("list_policies_running") is None:
+            return None
+        return lambda: {row["robot"] for row in self.list_policies_running() if isinstance(row.get("robot"), str)}
 
     def list_policies_running(self) -> list[dict[str, Any]]:
         return [row for row in self._listed("list_policies_running") if isinstance(row, dict)]
@@ -466,7 +473,7 @@ class AdaptedWorld(RobotWrapper):
         if teleoperation is not None:
             answers["teleoperation"] = _answer(teleoperation)
         rest = halt_each({name: partial(_given, answer) for name, answer in answers.items()})
-        return _RobotsHalting(halting, rest, deadline) if halting else rest
+        return _RobotsHalting(self, halting, rest) if halting or self.runs is not None else rest
 
     def _stop_each(
         self, names: Iterable[str], halting: dict[str, Future[StopVerdict]], reason: str, patience: float
@@ -527,33 +534,35 @@ class _OneOfWorld:
 
 
 class _RobotsHalting(PendingVerdict):
-    """Verdict on robots of a foreign world that are being stopped, and on its rest."""
+    """Verdict on a foreign world: its robots that are being stopped, then what runs."""
 
-    def __init__(self, halting: Mapping[str, Future[StopVerdict]], rest: StopVerdict, until: float) -> None:
-        super().__init__(until)
-        self._halting, self._rest = dict(halting), rest
+    def __init__(self, world: AdaptedWorld, halting: Mapping[str, Future[StopVerdict]], rest: StopVerdict) -> None:
+        super().__init__(time.monotonic() + STATUS_SHARE * settings.number("STRANDS_HALT_DEADLINE_S"))
+        self._runs, self._halting, self._rest = world.runs, dict(halting), rest
 
     def known(self) -> StopVerdict | None:
-        return self._verdict("") if all(each.done() for each in self._halting.values()) else None
+        return self._verdict({}) if self._runs is None and self._answered() else None
 
-    def read(self) -> None:
+    def read(self) -> set[str]:
         wait(self._halting.values(), max(0.0, self.until - time.monotonic()))
+        return set() if self._runs is None else self._runs()
 
     def judged(self, reading: object, *, last: bool) -> StopVerdict | None:
-        return self._verdict("it has not answered its stop") if last else self.known()
+        running = cast("set[str]", reading)
+        return self._verdict(dict.fromkeys(running, RUNS_ON)) if last or (self._answered() and not running) else None
 
     def unread(self, why: str) -> StopVerdict:
-        return self._verdict(why)
+        return self._verdict({} if self._runs is None else dict.fromkeys(self._halting, why))
 
-    def _verdict(self, why: str) -> StopVerdict:
-        ends = [
-            each.result() if each.done() else StopVerdict(not_stopped={name: why})
-            for name, each in self._halting.items()
-        ]
-        ends.append(self._rest)
+    def _answered(self) -> bool:
+        return all(each.done() for each in self._halting.values())
+
+    def _verdict(self, goes_on: Mapping[str, str]) -> StopVerdict:
+        silent = {name: StopVerdict(not_stopped={name: SILENT}) for name, each in self._halting.items()}
+        ends = [each.result() if each.done() else silent[name] for name, each in self._halting.items()] + [self._rest]
         return StopVerdict(
-            tuple(name for end in ends for name in end.halted),
-            {name: said for end in ends for name, said in end.not_stopped.items()},
+            tuple(name for end in ends for name in end.halted if name not in goes_on),
+            {**goes_on, **{name: said for end in ends for name, said in end.not_stopped.items()}},
             {name: said for end in ends for name, said in end.unknown.items()},
         )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
@@ -11,7 +12,7 @@ from functools import partial
 from typing import Any, cast
 
 from strands_robots import settings
-from strands_robots.adapted import AdaptedWorld
+from strands_robots.adapted import RUNS_ON, STATUS_SHARE, AdaptedWorld
 from strands_robots.contract import Haltable, Observer, Unsubscribe, WorldRobot, for_request
 from strands_robots.envelope import Envelope, error
 from strands_robots.recording.cameras import has_cameras
@@ -19,6 +20,7 @@ from strands_robots.safety.gate import MotionRequest
 from strands_robots.safety.stop_executor import StopExecutor, stop_executor
 from strands_robots.safety.stop_targets import StopOfRobot
 from strands_robots.safety.stopping import (
+    READ_EVERY_S,
     PendingVerdict,
     StopVerdict,
     explain,
@@ -140,8 +142,18 @@ class _StrangersStop(RobotStop):
             doubt = StopVerdict(unknown={self.name: f"whether it is there is not known: {explain(exc)}"})
             return doubt if verdict.stopped else verdict
         if robots is None or self.name in robots:
-            return verdict
+            return self._at_rest(verdict)
         return StopVerdict() if self.leaves else StopVerdict(not_stopped={self.name: _no_robot(robots)})
+
+    def _at_rest(self, verdict: StopVerdict) -> StopVerdict:
+        """Return the verdict unless the world goes on listing the robot as running."""
+        runs = cast(AdaptedWorld, self.world).runs
+        until = time.monotonic() + STATUS_SHARE * settings.number("STRANDS_HALT_DEADLINE_S")
+        while verdict.stopped and runs is not None and self.name in runs():
+            if time.monotonic() >= until:
+                return StopVerdict(not_stopped={self.name: RUNS_ON})
+            time.sleep(READ_EVERY_S)
+        return verdict
 
 
 def _no_robot(robots: Sequence[str]) -> str:
