@@ -228,7 +228,9 @@ def _simulated(name: str, tool_name: str | None, options: dict[str, Any]) -> Any
     answer = simulation.add_robot(label, model=name, tip=tip)
     if is_error(answer):
         simulation.cleanup()
-        raise ValidationError(str(answer["reason"]), NO_SUCH_MODEL)
+        installed = PLUG_INS.names()
+        known = f" Robots of other packages: {', '.join(installed)}." if installed else ""
+        raise ValidationError(f"{answer['reason']}{known}", NO_SUCH_MODEL)
     if scene is not None:
         try:
             furnish(simulation, scene)

@@ -37,6 +37,13 @@ def test_what_the_robot_lacks_comes_first() -> None:
     assert drawn(ARM, "The bus does not answer.")[0] == "NOT READY. The bus does not answer."
 
 
+@pytest.mark.parametrize(("allowed", "may"), [("", "read it and stop it"), ("strands-robots", "drive and read it")])
+def test_banner_says_drive_where_a_caller_may(allowed: str, may: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DEVICE_CONNECT_RPC_ALLOW", allowed)
+    lines = drawn(replace(ARM, hardware=True))
+    assert lines[1] == f"Every program of this machine can {may}, no other machine can."
+
+
 def test_a_simulation_needs_no_grant() -> None:
     assert list(commands(ARM)) == [
         "strands-robots peers arm-1",

@@ -55,6 +55,7 @@ if TYPE_CHECKING:
     from strands_robots.threads import StopSignal
 
 EVERY_PROGRAM_HERE = "Every program of this machine can drive and read it, no other machine can."
+READ_BY_EVERY_PROGRAM = "Every program of this machine can read it and stop it, no other machine can."
 
 NO_CALLER = f"No command here may move it. With --rpc-allow {SOURCE} this command line may, after a grant."
 
@@ -89,7 +90,7 @@ def show_banner(screen: Screen, served: ServedRobot, lacking: Sequence[str]) -> 
         screen.say(f"NOT READY. {each}", "bold red")
     screen.say(f"{served.peer_id}. {described(link)}", "bold red" if lacking else "bold green")
     if link.loopback_only and not link.authenticated:
-        screen.say(EVERY_PROGRAM_HERE)
+        screen.say(READ_BY_EVERY_PROGRAM if _caller_refusal(served) else EVERY_PROGRAM_HERE)
     named = {"Tenant": "" if link.tenant == "default" else link.tenant, "Cell": settings.raw("STRANDS_CELL")}
     if any(named.values()):
         screen.say(" ".join(f"{what} {name}." for what, name in named.items() if name))

@@ -133,6 +133,7 @@ def test_device_of_a_package_becomes_a_robot(machine: Machine) -> None:
         (("pan_tilt",), "robot pan_tilt of my-robots 1.0 cannot be made: missing a required argument: 'port'"),
         (("turntable", "--set", "speed=3"), "robot turntable of my-robots 1.0 cannot be made: got an unexpected"),
         (("turntable", "--speed-limit", "3"), "robot turntable of my-robots 1.0 has no option speed_limit"),
+        (("turntabel",), "Robots of other packages: gone, pan_tilt, turntable."),
         (("gone",), "robot gone of my-robots 1.0 cannot be loaded: AttributeError"),
     ],
 )
