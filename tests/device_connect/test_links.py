@@ -71,10 +71,16 @@ def test_argument_out_of_its_domain_is_refused_by_name(arguments: tuple[Any, ...
         link_for(*arguments)
 
 
-def test_unauthenticated_transport_is_refused_with_both_remedies() -> None:
+def test_unauthenticated_transport_is_refused_with_every_remedy() -> None:
     with pytest.raises(ValidationError) as refused:
         insecure_opt_in(None, LinkConfig(), stated=False)
-    for way in ("allow_insecure=True", "DEVICE_CONNECT_ALLOW_INSECURE=true", "MESSAGING_TLS_CA_FILE", "CREDENTIALS"):
+    for way in (
+        "link=loopback_config()",
+        "allow_insecure=True",
+        "DEVICE_CONNECT_ALLOW_INSECURE=true",
+        "MESSAGING_TLS_CA_FILE",
+        "CREDENTIALS",
+    ):
         assert way in str(refused.value)
 
 

@@ -408,8 +408,8 @@ def insecure_opt_in(allow_insecure: bool | None, link: LinkConfig, *, stated: bo
         )
         return True
     raise ValidationError(
-        "This transport is not authenticated: either opt in with allow_insecure=True "
-        "(or DEVICE_CONNECT_ALLOW_INSECURE=true), or give certificates (MESSAGING_TLS_CA_FILE, "
+        "This transport is not authenticated: either stay on this machine with link=loopback_config(), or opt in with "
+        "allow_insecure=True (or DEVICE_CONNECT_ALLOW_INSECURE=true), or give certificates (MESSAGING_TLS_CA_FILE, "
         "MESSAGING_TLS_CERT_FILE, MESSAGING_TLS_KEY_FILE) or, to a NATS server, TLS (tls://host:port) and "
         "credentials (MESSAGING_CREDENTIALS_FILE).",
         "INSECURE_TRANSPORT",
