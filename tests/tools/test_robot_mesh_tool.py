@@ -301,6 +301,11 @@ def test_every_action_on_an_empty_mesh_is_an_error(on_the_mesh: None) -> None:
         assert robot_mesh(**arguments)["status"] == "error"
 
 
+def test_answer_without_robots_names_where_they_were_looked_for(on_the_mesh: None) -> None:
+    told = robot_mesh(action="peers")["content"][0]["text"]
+    assert told == "No robot answered. They were looked for on the native mesh."
+
+
 def test_disabled_mesh_is_reported_as_off(on_the_mesh: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("STRANDS_MESH", "false")
     answer = robot_mesh(action="stop")

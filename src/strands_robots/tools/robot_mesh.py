@@ -228,7 +228,7 @@ def _peers(there: Networks) -> Envelope:
     rows = [_row(each, network.name, functions.get(name)) for name, (each, network) in sorted(found.items())]
     missing = there.missing
     fields: dict[str, Any] = {"peers": rows, **({"absent": missing} if missing else {})}
-    who = f"{len(rows)} robots: {', '.join(sorted(found))}." if rows else "No robot answered."
+    who = f"{len(rows)} robots: {', '.join(sorted(found))}." if rows else f"No robot answered. {there.reach}".rstrip()
     told = " ".join(filter(None, [who, there.stale, _not_reached(missing)]))
     return success(told, **fields) if rows else error(told, **fields)
 
