@@ -25,6 +25,9 @@ logger = logging.getLogger(__name__)
 
 UNAVAILABLE = "unavailable"
 
+CONNECT_S = 1.0
+"""Longest time in seconds that a program's ``connect`` waits for the link."""
+
 FRESH_S = 1.0
 """Age in seconds below which joints count as fresh; a state is told when they cease to be."""
 
@@ -92,9 +95,21 @@ class ReachyMiniDriver(RobotDriver):
         return {**fields, "availability": UNAVAILABLE} if activity.fault else fields
 
     async def connect(self) -> None:
-        """Begin to connect; a daemon that is away is connected to when it appears."""
-        self.reachy.connection.start()
+        """Begin to connect; a daemon that is away is connected to when it appears.
+
+        A program that calls this itself has the link afterwards, or a warning that there is none.
+        """
+        connection = self.reachy.connection
+        connection.start()
         await super().connect()
+        # A runtime announces the device at once, and its state says when the robot is there.
+        if self.runtime is None and not await asyncio.to_thread(connection.wait, CONNECT_S):
+            logger.warning(
+                "No link to the Reachy Mini at %s:%d within %g s: its motions are refused until there is one.",
+                connection.host,
+                connection.port,
+                CONNECT_S,
+            )
 
     async def disconnect(self) -> None:
         """Halt what we started, let go of the robot, and refuse every motion from now on."""
