@@ -8,6 +8,7 @@ import threading
 from collections.abc import Iterator, Mapping
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 from fixtures.ros_bases import OPEN, SHUT, TOPIC, FaultyLink, Made, memory, none_left, velocities
@@ -362,3 +363,34 @@ def test_base_accepts_the_next_drive_once_the_last_is_reported_over(made: Made) 
         assert answer["status"] == "success", answer
         while robot.get_task_status()["task_status"] == "running":
             pass
+
+
+class WireOf05:
+    """A transport as strands-robots 0.5 has it."""
+
+    def publish(self, **message: Any) -> dict[str, Any]:
+        return {"status": "success"}
+
+    def echo(self, **topic: Any) -> dict[str, Any]:
+        return {"status": "success"}
+
+
+def test_link_without_the_methods_of_a_link_is_refused_with_what_it_lacks() -> None:
+    wire: Any = WireOf05()
+    lacks = r"^link must be .*, and WireOf05 has no read, call, watch, close\.$"
+    with pytest.raises(ValidationError, match=lacks):
+        RosBridgedRobot("rover", TOPIC, "/odom", link=wire)
+    with pytest.raises(ValidationError, match=lacks):
+        MobileBaseRobot("rover", wire, TOPIC)
+    MobileBaseRobot("rover", MagicMock(), TOPIC)
+
+
+def test_words_of_an_earlier_release_are_refused_as_its_order_is() -> None:
+    base: Any = MobileBaseRobot
+    sentence = f"not {TOPIC!r}: give MobileBaseRobot its node_name, link and command_topic in this order"
+    with pytest.raises(ValidationError, match=sentence):
+        base("rover", TOPIC, WireOf05())
+    with pytest.raises(ValidationError, match=sentence):
+        base(node_name="rover", cmd_vel_topic=TOPIC, transport=WireOf05())
+    with pytest.raises(ValidationError, match="give MobileBaseRobot its node_name, link"):
+        base("rover", TOPIC, transport=WireOf05())

@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 from strands_robots import settings
 from strands_robots.contract import Observer, Unsubscribe, for_request
@@ -44,6 +44,10 @@ _HASHED = 8
 
 AgentVerb = tuple[Callable[..., Envelope], str]
 _Motion = TypeVar("_Motion", bound=BaseMotion)
+_P = ParamSpec("_P")
+
+LINK_METHODS = ("publish", "read", "call", "watch", "close")
+"""Methods of a :class:`RosLink`, all of which a base's link has."""
 
 
 def tool_suffix(node_name: str) -> str:
@@ -53,6 +57,37 @@ def tool_suffix(node_name: str) -> str:
         return plain
     digest = hashlib.sha256(node_name.encode()).hexdigest()[:_HASHED]
     return f"{plain[: TOOL_SUFFIX_MAX - _HASHED - 1]}_{digest}"
+
+
+def _checked_link(link: object) -> Any:
+    if isinstance(link, str):
+        # The order of strands-robots 0.5: node_name, cmd_vel_topic, transport.
+        raise _no_link(link)
+    missing = [name for name in LINK_METHODS if not callable(getattr(link, name, None))]
+    if missing:
+        raise ValidationError(
+            f"link must be a link of strands_robots.ros.link, and {type(link).__name__} has no {', '.join(missing)}."
+        )
+    return link
+
+
+def _no_link(link: object) -> ValidationError:
+    return ValidationError(
+        f"link must be a link of strands_robots.ros.link, not {shown(link)}: give MobileBaseRobot its "
+        "node_name, link and command_topic in this order."
+    )
+
+
+def _without_transport(init: Callable[_P, None]) -> Callable[_P, None]:
+    """Refuse the keywords of strands-robots 0.5 as its positions are refused."""
+
+    @functools.wraps(init)
+    def checked(*args: _P.args, **kwargs: _P.kwargs) -> None:
+        if "transport" in kwargs or "cmd_vel_topic" in kwargs:
+            raise _no_link(kwargs.get("cmd_vel_topic", kwargs.get("transport")))
+        init(*args, **kwargs)
+
+    return checked
 
 
 class MobileBaseRobot:
@@ -80,6 +115,7 @@ class MobileBaseRobot:
     takes_tasks = False
     """It follows no policy: :meth:`start_task` refuses."""
 
+    @_without_transport
     def __init__(
         self,
         node_name: str,
@@ -98,13 +134,7 @@ class MobileBaseRobot:
         command_gate: CommandGate | None = None,
     ) -> None:
         self.tool_name_str = self.node_name = identifier("node_name", node_name)
-        if isinstance(link, str):
-            # The order of strands-robots 0.5: node_name, cmd_vel_topic, transport.
-            raise ValidationError(
-                f"link must be a link of strands_robots.ros.link, not {shown(link)}: give MobileBaseRobot its "
-                "node_name, link and command_topic in this order."
-            )
-        self.link = link
+        self.link = _checked_link(link)
         self._topic = graph_name("command_topic", command_topic)
         self._kind = interface("command_type", command_type)
         self._scan = (_optional(graph_name, "scan_topic", scan_topic), _optional(interface, "scan_type", scan_type))
