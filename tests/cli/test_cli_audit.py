@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
 from tests.cli.conftest import Run
 
 from strands_robots.audit import audit_head, flush_audit, log_safety_event
@@ -55,6 +56,21 @@ def test_changed_record_fails_verification(run: Run, state_directory: Path) -> N
     result = run("audit", "verify", "--json")
     assert result.exit_code == 1
     assert json.loads(result.stdout)["broken"] == 1
+
+
+@pytest.mark.parametrize("secret", ["", "a-secret-of-the-operator"])
+def test_log_of_another_writer_alone_is_not_called_intact(
+    run: Run, state_directory: Path, monkeypatch: pytest.MonkeyPatch, secret: str
+) -> None:
+    if secret:
+        monkeypatch.setenv("STRANDS_MESH_AUDIT_PSK", secret)
+    older = {"event": "emergency_stop", "payload": {}, "peer_id": "arm-1", "seq": 0, "ts": 1.0}
+    (state_directory / "mesh_audit.jsonl").write_text(3 * (json.dumps(older) + "\n"), encoding="utf-8")
+    result = run("audit", "verify")
+    assert result.exit_code == 1
+    assert "3 lines of another writer, perhaps strands-robots 0.5: use a new STRANDS_MESH_AUDIT_DIR." in result.output
+    assert "intact" not in result.output
+    assert json.loads(run("audit", "verify", "--json").stdout)["ok"] is False
 
 
 def test_audit_is_compared_with_the_files_of_other_machines(run: Run, tmp_path: Path) -> None:

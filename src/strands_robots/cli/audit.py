@@ -33,6 +33,7 @@ REPLACED = "The audit is not complete: the facts of {} of {} records could not b
 NOT_WRITTEN = "The audit is not complete: records of this process are not on the disk yet."
 GRAVE = ("bad", "missing", "gaps", "broken", "tampered")
 NEVER_BEGUN = "There is no audit: nothing was recorded here with this secret yet, or all of it was deleted."
+NOT_OURS = "{} lines of another writer, perhaps strands-robots 0.5: use a new STRANDS_MESH_AUDIT_DIR."
 FIRST_FIELDS = ("stopped", "source", "who", "why", "reason", "estop_id", "epoch")
 HIDDEN_FIELDS = ("device_id", "epochs", "issued", "pressed_at", "timing", "repeated", "late", "road", "persisted")
 
@@ -104,6 +105,8 @@ def verify(
         screen.say(f"{each['where']}: {each['why']}", "red")
     if not found["ok"]:
         raise CliError(_verdict(found), **found)
+    if found["torn"] and not found["total"]:
+        raise CliError(NOT_OURS.format(found["torn"]), **found | {"ok": False})
     screen.data({"status": "success", **found})
     end = "" if found["head"] == "ok" else " A cut at its end cannot be excluded: its head is missing."
     screen.say(f"The audit is intact: {found['total']} records.{end}", "yellow" if end else "green")
@@ -115,7 +118,7 @@ def _verdict(found: Mapping[str, Any]) -> str:
     lesser = [each for each in found["breaks"] if each["why"] in {FACTS_REPLACED, NOT_ON_DISK}]
     lesser += [each for each in found["breaks"] if each["where"].endswith(SIGNATURES)]
     if found["head"] == "missing" and not total:
-        return NEVER_BEGUN
+        return f"{NOT_OURS.format(found['torn'])} {NEVER_BEGUN}" if found["torn"] else NEVER_BEGUN
     if len(lesser) < len(found["breaks"]) or any(found[name] for name in GRAVE) or found["head"] in ("cut", "older"):
         return NOT_INTACT
     if unverified:
