@@ -216,10 +216,9 @@ _INSTEAD = (
         _IDENTITY,
     ),
     ("bus_access", "motor_norm_modes read_observation write_action", "bus_access has read_joints and write_joints"),
-    (
-        "drivers.reachy_transport",
-        "HardwareLink ImuCallback JointsCallback identity_pose resolve_host rpy_to_pose",
-        _REACHY,
+    *(
+        (each, "HardwareLink ImuCallback JointsCallback identity_pose resolve_host rpy_to_pose", _REACHY)
+        for each in ("device_connect.reachy_transport", "drivers.reachy_transport")
     ),
     (
         "policies.base",
