@@ -6,11 +6,14 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
+from textwrap import dedent
 from types import ModuleType
 from typing import Any
 
 import pytest
 from fixtures.devices import RecordingDevice
+from fixtures.installed import install
 from fixtures.waiting import eventually
 
 import strands_robots
@@ -149,3 +152,31 @@ def test_tip_of_a_model_is_the_site_or_body_that_the_caller_names() -> None:
     robot.cleanup()
     with pytest.raises(ValidationError, match=r"tip must be a site or a body of .*gripper_tip, .*, not 'claw'"):
         Robot("so100", tip="claw")
+
+
+def test_robot_given_to_an_agent_as_a_tool_says_which_tool_to_give() -> None:
+    registry = pytest.importorskip("strands.tools.registry").ToolRegistry()
+    robot = Robot("so100")
+    try:
+        with pytest.raises(ValueError, match=r"no agent tool.*from strands_robots\.tools import robot_mesh"):
+            registry.process_tools([robot])
+        with pytest.raises(TypeError, match="robot_mesh"):
+            robot(action="list_robots")
+    finally:
+        robot.cleanup()
+
+
+def test_robot_of_a_package_that_can_be_called_and_iterated_over_keeps_both(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = """
+    class Body:
+        def __call__(self): return "called"
+        def __iter__(self): return iter(["part"])
+        def halt(self, reason=""): return {"status": "success"}
+    """
+    install(tmp_path, "callable-robot", dedent(source), {"strands_robots.robots": {"caller": "callable_robot:Body"}})
+    monkeypatch.syspath_prepend(tmp_path)
+    robot = Robot("caller")
+    assert robot() == "called"
+    assert list(robot) == ["part"]

@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection, Mapping
 from contextlib import nullcontext
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from strands_robots import settings
 from strands_robots._mesh_switch import mesh_env_request
@@ -39,6 +39,11 @@ PLUG_INS = PlugIns("robot", ("so100", "so101", "rover", "so100_follower", "so101
 
 _DEVICE = ("connect", "disconnect", "get_observation", "send_action")
 """Methods of LeRobot's robot interface, by which a device is known."""
+
+NO_TOOL = (
+    "A robot is no agent tool, and nothing to iterate over: serve it, or give Robot mesh=True, and give the agent "
+    "robot_mesh (from strands_robots.tools import robot_mesh)."
+)
 
 NO_SUCH_MODEL = "NO_SUCH_MODEL"
 """Error code for a simulated robot whose model is unknown or cannot be loaded."""
@@ -71,6 +76,17 @@ class Networked:
             peer.stop()
         own = getattr(super(), "cleanup", None)
         return own() if callable(own) else behind_contract(self).halt("cleanup").envelope()
+
+
+class Former:
+    """Answers to programs for strands-robots 0.5, behind what a robot has itself."""
+
+    def __call__(self, *args: Any, **options: Any) -> NoReturn:
+        raise TypeError(NO_TOOL)
+
+    def __iter__(self) -> NoReturn:
+        # Strands looks for tools in what it can iterate over, and only logs what it cannot use.
+        raise TypeError(NO_TOOL)
 
 
 def Robot(  # the factory reads as the class it stands for
@@ -306,7 +322,7 @@ def _reachy(tool_name: str | None, options: dict[str, Any]) -> Any:
 
 @cache
 def _networked(robot_class: type[Any], *, of_package: bool = False) -> type[Any]:
-    return type("Robot", (Networked, robot_class), {"__doc__": robot_class.__doc__, "of_package": of_package})
+    return type("Robot", (Networked, robot_class, Former), {"__doc__": robot_class.__doc__, "of_package": of_package})
 
 
 def _construct(factory: Callable[..., Any], *args: Any, **options: Any) -> Any:
