@@ -180,3 +180,56 @@ def test_robot_of_a_package_that_can_be_called_and_iterated_over_keeps_both(
     robot = Robot("caller")
     assert robot() == "called"
     assert list(robot) == ["part"]
+
+
+_PACKAGE = """
+import dataclasses
+
+
+class Plain:
+    made = None
+
+    @classmethod
+    def again(cls):
+        cls.made = cls.made or cls()
+        return cls.made
+
+
+class Slotted:
+    __slots__ = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class Frozen:
+    width: float = 1.0
+"""
+
+
+@pytest.fixture
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """A package with robots of four kinds."""
+    parts = {"plain": "Plain", "again": "Plain.again", "slotted": "Slotted", "frozen": "Frozen", "number": "Plain.mro"}
+    entries = {name: f"robots_of_a_test:{reference}" for name, reference in parts.items()}
+    install(tmp_path, "robots-of-a-test", _PACKAGE, {"strands_robots.robots": entries})
+    monkeypatch.syspath_prepend(tmp_path)
+    yield
+    sys.modules.pop("robots_of_a_test", None)
+
+
+def test_robot_of_a_package_has_an_identity_and_a_mesh(package: None) -> None:
+    robot = Robot("plain", peer_id="mine", tags="mobile")
+    assert type(robot).__mro__[2].__name__ == "Plain"
+    assert (robot.peer_id, robot.tags, robot.mesh, robot.tool_name_str) == ("mine", ("mobile",), None, "plain")
+    assert robot.cleanup()["status"] == "error", "it has no way to halt, and says so"
+
+
+@pytest.mark.parametrize("name", ["slotted", "frozen", "number"])
+def test_object_that_cannot_be_given_an_identity_is_refused_by_name(package: None, name: str) -> None:
+    with pytest.raises(ValidationError, match=f"robot {name} of robots-of-a-test 1.0 must make an object of a class"):
+        Robot(name)
+
+
+def test_package_that_makes_one_robot_twice_is_refused(package: None) -> None:
+    Robot("again")
+    with pytest.raises(ValidationError, match="must make a new robot at each call"):
+        Robot("again")

@@ -268,9 +268,12 @@ def _of_package(plug_in: PlugIn, mode: str, tool_name: str | None, options: dict
         return _of_device(plug_in.name, body, tool_name, own)
     if own:
         raise ValidationError(f"{plug_in} has no option {', '.join(own)}.")
+    if isinstance(body, Networked):
+        raise ValidationError(f"{plug_in} must make a new robot at each call, and has made this one before.")
     try:
         body.__class__ = _networked(body.__class__, of_package=True)
-    except TypeError as exc:
+        body.peer_id = None
+    except (TypeError, AttributeError) as exc:  # of C, with slots, or frozen
         raise ValidationError(f"{plug_in} must make an object of a class of its own, not {shown(body)}.") from exc
     named = tool_name or ("" if getattr(body, "tool_name_str", None) else _label(plug_in.name))
     if named:
