@@ -19,6 +19,7 @@ from fixtures.waiting import eventually
 import strands_robots
 from strands_robots import HardwareRobot, Robot, Simulation
 from strands_robots.contract import TaskRobot, WorldRobot
+from strands_robots.moved import METHODS
 from strands_robots.utils import MissingExtraError, ValidationError
 
 
@@ -164,6 +165,35 @@ def test_robot_given_to_an_agent_as_a_tool_says_which_tool_to_give() -> None:
             robot(action="list_robots")
     finally:
         robot.cleanup()
+
+
+def test_method_of_an_earlier_release_is_absent_and_says_what_to_use() -> None:
+    robot = Robot("so100")
+    try:
+        for name, instead in METHODS.items():
+            if name != "run_policy":  # a real robot has none
+                assert not hasattr(robot, name)
+                with pytest.raises(AttributeError) as refused:
+                    getattr(robot, name)
+                assert str(refused.value) == f"{name} of a robot is not in this release: {instead}."
+        assert not hasattr(robot, "never_was")
+        with pytest.raises(AttributeError, match=r"^'Robot' object has no attribute 'never_was'$"):
+            _ = robot.never_was
+    finally:
+        robot.cleanup()
+
+
+def test_property_of_a_robot_that_fails_tells_its_own_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source = """
+    class Body:
+        @property
+        def size(self): raise AttributeError("no ruler")
+        def halt(self, reason=""): return {"status": "success"}
+    """
+    install(tmp_path, "failing-robot", dedent(source), {"strands_robots.robots": {"failing": "failing_robot:Body"}})
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(AttributeError, match="no ruler"):
+        _ = Robot("failing").size
 
 
 def test_robot_of_a_package_that_can_be_called_and_iterated_over_keeps_both(

@@ -337,6 +337,66 @@ GONE = {
 }
 """What is not here, by its path in 0.5, and what to use instead. A package stands for what is in it."""
 
+_STREAMS = "strands_robots.mesh.input has InputPublisher and InputReceiver (docs/mesh.md)"
+_CAMERAS = "a model's file has its cameras; get_features lists them, and in simulation render draws what one sees"
+_MODEL_FILE = "Robot takes the path of an MJCF or URDF file, and add_object puts objects into its world"
+
+_METHODS = (
+    ("stop", "halt stops the robot, and cleanup frees it"),
+    ("destroy close_viewer", "cleanup frees the robot and its world"),
+    ("start_teleop_publish start_teleop_receive", _STREAMS),
+    (
+        "stop_teleop",
+        "the stop of InputPublisher and InputReceiver ends a stream, stop_teleoperate a leader here, and halt all",
+    ),
+    ("get_teleop_status", "InputPublisher and InputReceiver have stats, and teleop_status tells of leaders here"),
+    ("get_teleoperate_status list_teleops", "teleop_status lists the leaders"),
+    ("detach_teleop", "stop_teleoperate ends a leader, and attach_teleop replaces one of the same name"),
+    ("start_recording stop_recording get_recording_status save_episode verify_dataset_episodes", _RECORD),
+    ("foxglove_link foxglove_url", "Foxglove opens the MCAP files of 'strands-robots record'"),
+    (
+        "start_cameras_recording start_cameras_recording_synchronous stop_cameras_recording "
+        "get_cameras_recording_status",
+        "strands_robots.simulation.rendering.Recording makes an animation of a world (docs/simulation.md)",
+    ),
+    ("stream_dataset", _STREAM),
+    ("replay_episode", "'strands-robots replay' plays a recording to a robot"),
+    (
+        "eval_policy evaluate_benchmark list_benchmarks register_benchmark_from_file register_builtin_benchmarks",
+        _EVALUATE,
+    ),
+    (
+        "add_camera remove_camera list_cameras list_cameras_info get_camera_params get_frame render_all render_depth",
+        _CAMERAS,
+    ),
+    ("open_viewer", "'strands-robots dashboard' shows a robot that is served"),
+    ("list_objects list_bodies get_body_state", "get_objects lists the objects with their places"),
+    ("move_object", "remove_object takes an object away, and add_object puts it elsewhere"),
+    ("list_robots_info get_robot_state get_status", "get_state has the joints and tasks of each robot"),
+    ("robot_joint_names robot_action_keys actuator_ranges capabilities", "get_features has joints and their ranges"),
+    ("actuate_robot set_joint_positions rotate_wrist", "send_action and move_joints move the joints"),
+    ("policy_result", "outcomes has how the last policy of each robot ended"),
+    ("run_multi_policy", "start_policy starts one for each robot, and returns at once"),
+    ("run_policy", "start_task runs a policy"),
+    ("load_scene replace_scene_mjcf patch_scene_mjcf register_urdf list_urdfs", _MODEL_FILE),
+    ("set_gravity set_timestep physics_timestep", "Robot takes gravity and timestep for a simulation"),
+    ("publish_ros_observation", "strands_robots.hardware_ros_bridge.HardwareRosBridge publishes a robot to ROS 2"),
+    (
+        "tool_name tool_spec tool_type stream wire_tool_spec",
+        "the tool is robot_mesh (from strands_robots.tools import robot_mesh)",
+    ),
+    (
+        "apply_force attach_bodies detach_bodies export_xml forward_kinematics get_contact_forces get_contacts "
+        "get_energy get_ground_height get_jacobian get_mass_matrix get_sensor_data get_total_mass get_world_point "
+        "inverse_dynamics load_state mj_data mj_model multi_raycast randomize raycast saturated_actuators save_state "
+        "set_body_properties set_geom_properties set_joint_velocities set_obs_noise zero_dynamics",
+        _KEEPS,
+    ),
+)
+
+METHODS = {name: instead for names, instead in _METHODS for name in names.split()}
+"""What a robot of 0.5 had and none has here, and what to use instead."""
+
 
 def moved_name(package: str, name: str) -> Any:
     """Return what was called ``name`` in a package of 0.5.

@@ -17,6 +17,7 @@ from strands_robots._mesh_switch import mesh_env_request
 from strands_robots.adapted import behind_contract
 from strands_robots.contract import has_gate, put_away
 from strands_robots.envelope import is_error, text_of
+from strands_robots.moved import METHODS
 from strands_robots.plug_ins import PlugIn, PlugIns, takes
 from strands_robots.safety.scope import own_cell
 from strands_robots.safety.stopping import StopVerdict
@@ -87,6 +88,13 @@ class Former:
     def __iter__(self) -> NoReturn:
         # Strands looks for tools in what it can iterate over, and only logs what it cannot use.
         raise TypeError(NO_TOOL)
+
+    def __getattr__(self, name: str) -> Any:
+        instead = METHODS.get(name)
+        if instead is None:
+            # Refuses as ever; for a property that failed by its own error.
+            return object.__getattribute__(self, name)
+        raise AttributeError(f"{name} of a robot is not in this release: {instead}.")
 
 
 def Robot(  # the factory reads as the class it stands for

@@ -45,3 +45,6 @@ def test_page_has_every_name_that_moved_and_every_one_that_is_gone() -> None:
             row for row in PAGE.splitlines() if row.startswith(f"| `{package}` |") and row.endswith(f"| {instead} |")
         ]
         assert any(f"`{name}`" in row for row in rows), path
+    for name, instead in moved.METHODS.items():
+        rows = [row for row in PAGE.splitlines() if row.startswith("| `") and row.endswith(f"` | {instead} |")]
+        assert any(f"`{name}`" in row for row in rows), name
