@@ -28,11 +28,23 @@ ENDS = {
 }
 """The sentence that a program ends in; one that is not here runs."""
 
+SETTINGS = {
+    "reachy_mini": {"DEVICE_CONNECT_RPC_ALLOW": "anonymous", "STRANDS_ROBOT_COMMAND_ALLOW": "look,antennas,nod"},
+}
+"""What the page says to set for a program."""
+
+REFUSED = {
+    "device_connect_driver": {"stop"},
+    "robot_mesh_tool": {"subscribe", "inbox", "unsubscribe"},
+    "ros_tool": {"echo", "publish"},
+}
+"""The calls of a program that are refused, or find nothing; every other call succeeds."""
+
 
 def run(program: Path, folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, program, str(folder), *arguments],
-        env=Machine(folder / "state").environment,
+        env={**Machine(folder / "state").environment, **SETTINGS.get(program.stem, {})},
         cwd=folder,
         capture_output=True,
         text=True,
@@ -63,6 +75,15 @@ def test_program_runs_or_says_what_to_change(program: Path, folder: Path, daemon
     if program.stem not in ENDS:
         assert ended.returncode == 0, ended.stdout + ended.stderr
         assert "Traceback" not in ended.stderr, ended.stderr
+        failed = set(re.findall(r"^(\w+):? (?:error|False)\b", ended.stdout, flags=re.MULTILINE))
+        assert failed == REFUSED.get(program.stem, set()), ended.stdout + ended.stderr
         return
     last = ended.stderr.strip().splitlines()[-1]
     assert re.fullmatch(rf"[\w.]+: {re.escape(ENDS[program.stem])}", last), ended.stdout + ended.stderr
+
+
+def test_page_names_the_settings_of_each_program() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "from-0.5.md").read_text(encoding="utf-8")
+    for settings in SETTINGS.values():
+        for name, value in settings.items():
+            assert f"`{name}={value}`" in page
