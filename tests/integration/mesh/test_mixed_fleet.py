@@ -7,6 +7,7 @@ import signal
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -81,9 +82,13 @@ class Fleet:
     def move(self) -> None:
         """Have the console of ours start every robot."""
         for robot in ("new-arm", "new-sim", "old-arm", "old-sim"):
-            answer = self["new-console"].ask("send", robot, START, 20)
-            assert answer["result"]["status"] == "success", answer
+            eventually(partial(self._moves, robot), what=f"{robot} moves")
         assert all(moving for peer_id, moving in self.each("moving").items() if not peer_id.endswith("console"))
+
+    def _moves(self, robot: str) -> bool:
+        """Start a robot, again where 0.5.3 dropped the command or a resume is still on its way."""
+        told = self["new-console"].ask("send", robot, START, 2.0)
+        return told.get("result", {}).get("status") == "success" or self[robot].ask("moving") is True
 
     def locked(self) -> str:
         """Wait until all are locked, and return the one epoch that they share."""

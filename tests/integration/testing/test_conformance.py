@@ -114,7 +114,7 @@ FAULTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "SaysStoppedOnAHungBus": (("silver.honest",), ()),
     "IsDeadAfterABusError": (("silver.honest",), ("gold.recovers",)),
     "HangsInItsStatus": (("gold.reads",), ("gold.events",)),
-    "LiesThatItIsIdle": (("gold.reads",), ("gold.events",)),
+    "LiesThatItIsIdle": (("gold.reads",), ("gold.events", "silver.lockout")),
     "IsReadUnderTheLockOfItsMotion": (("gold.reads",), ()),
     "LeaksThreads": (("gold.starts",), ()),
     "LeaksFiles": (("gold.starts",), ()),
