@@ -373,10 +373,11 @@ def _plug_ins() -> Iterator[Finding]:
     from strands_robots.hardware.lerobot_device import lerobot_plug_ins  # noqa: PLC0415 - as above
 
     for stated in (robot.PLUG_INS, teleoperators.PLUG_INS, policies.PLUG_INS):
-        for name, why in stated.refused().items():
+        refused = stated.refused()
+        for name, why in refused.items():
             yield Finding(f"{stated.kind} {name}", Mark.WARN, why, "uninstall the package that you do not mean")
         for name in stated.names():
-            plug_in = None if name in stated.refused() else stated.get(name)
+            plug_in = None if name in refused else stated.get(name)
             if plug_in is None:
                 continue
             if problem := _load_problem(stated.group, name):

@@ -22,6 +22,7 @@ from strands_robots.audit import flush_audit
 from strands_robots.contract import holds_robots, robots_in
 from strands_robots.device_connect import init_device_connect_sync, stop_device_connect
 from strands_robots.device_connect.backends.config import loopback_config
+from strands_robots.envelope import text_of
 from strands_robots.errors import RefusalError, StrandsRobotsError
 from strands_robots.fleet.device_connect.network import DeviceConnectNetwork
 from strands_robots.fleet.fleet import Fleet
@@ -141,6 +142,11 @@ class ConformanceBench:
         robot = self.on[network] if network else self.remote
         return [each for each in robot.verbs.values() if each.kind == "motion" and each.name not in RESUMES]
 
+    def plain_reads(self, network: str) -> list[AdvertisedVerb]:
+        """Return its reads on a network that need no argument."""
+        verbs = self.on[network].verbs.values()
+        return [each for each in verbs if each.reads and not any(named.required for named in each.parameters)]
+
     def arguments(self, verb: AdvertisedVerb) -> dict[str, Any]:
         """Return valid arguments of a motion, the subject's where it gives some."""
         given = self.subject.motion
@@ -180,13 +186,13 @@ class ConformanceBench:
         return self.subject.motion or usual_motion(self)
 
     @contextmanager
-    def moving(self, network: str = "", motion: LongMotion | None = None) -> Iterator[MotionRun]:
-        """Have it move for the block, called over a network; it is halted at the end.
+    def moving(self, motion: LongMotion | None = None) -> Iterator[MotionRun]:
+        """Have it move for the block, by a call on Device Connect, and halt it.
 
         Raises:
             NotProvenError: the motion ended before it could be stopped.
         """
-        run = MotionRun(self, self.on[network] if network else self.remote, motion or self.motion)
+        run = MotionRun(self, self.remote, motion or self.motion)
         try:
             run.start()
             yield run
@@ -202,7 +208,7 @@ class ConformanceBench:
             NotKeptError: it did not stop, or wrote after the verdict.
         """
         if verdict.stopped is not True:
-            raise NotKeptError(f"{how}: {verdict.envelope()['content'][0]['text']}")
+            raise NotKeptError(f"{how}: {text_of(verdict.envelope())}")
         self.check_no_write(count, how)
 
     def check_no_write(self, count: int, how: str) -> None:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 
 from strands_robots.adapted import behind_contract
+from strands_robots.envelope import text_of
 from strands_robots.errors import RefusalError
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.testing.bench import (
@@ -78,7 +79,7 @@ def hundred(bench: ConformanceBench) -> str:
                 verdict = bench.halt()
                 bench.check_no_write(bench.writes, f"halt {nth + 1}")
         if verdict.stopped is not True:
-            raise NotKeptError(f"halt {nth + 1}: {verdict.envelope()['content'][0]['text']}")
+            raise NotKeptError(f"halt {nth + 1}: {text_of(verdict.envelope())}")
         slowest = max(slowest, verdict.elapsed_ms)
     return f"slowest {slowest:.1f} ms"
 
@@ -125,20 +126,13 @@ def threads(bench: ConformanceBench) -> str:
     needs="silver.halts",
 )
 def networks(bench: ConformanceBench) -> str:
-    """Stop a motion over each network, which a call over the other began."""
-    names = list(bench.on)
-    for start, stop in zip(names, reversed(names), strict=True):
-        with bench.moving(_on(start)):
-            verdict = within(
-                bench.subject.answer_s + bench.subject.deadline_s, bench.on[stop].halt, f"stop over {stop}"
-            )
-            bench.check_still(verdict, bench.writes, f"stop over {stop}")
+    """Stop a motion over each network."""
+    limit = bench.subject.answer_s + bench.subject.deadline_s
+    for name, robot in bench.on.items():
+        with bench.moving():
+            verdict = within(limit, robot.halt, f"stop over {name}")
+            bench.check_still(verdict, bench.writes, f"stop over {name}")
     return ""
-
-
-def _on(network: str) -> str:
-    # The mesh has a task's start under another name.
-    return network if network == "device_connect" else ""
 
 
 @promise(
@@ -157,7 +151,7 @@ def own_verbs(bench: ConformanceBench) -> str:
             continue
         motion = LongMotion(verb.name, bench.arguments(verb))
         try:
-            with bench.moving(motion=motion) as run:
+            with bench.moving(motion) as run:
                 verdict = bench.halt()
                 bench.check_still(verdict, bench.writes, f"halt of {verb.name}")
                 run.join()
@@ -183,7 +177,7 @@ def unlinked(bench: ConformanceBench) -> str:
         robot = behind_contract(body)
         verdict = within(bench.subject.deadline_s + 1.0, lambda: robot.halt("conformance"), "halt")
         if verdict.stopped is not True:
-            raise NotKeptError(f"halt of a robot on no network: {verdict.envelope()['content'][0]['text']}")
+            raise NotKeptError(f"halt of a robot on no network: {text_of(verdict.envelope())}")
     return ""
 
 
@@ -316,7 +310,7 @@ def _recovered(bench: ConformanceBench, how: str) -> None:
     while verdict.stopped is not True and time.monotonic() < deadline:
         verdict = bench.halt()
     if verdict.stopped is not True:
-        said = verdict.envelope()["content"][0]["text"]
+        said = text_of(verdict.envelope())
         raise NotKeptError(f"after its bus {how}, no halt says stopped any more: {said}")
 
 
