@@ -49,7 +49,7 @@ def tasks_refused(robot: Any, verb: Verb, name: str) -> str | None:
     """
     if POLICY_PROVIDER.name not in verb.by_name or holds_robots(robot) or _offers(robot, verb, None):
         return None
-    return no_tasks(robot, name)
+    return no_tasks(lacks(robot), name)
 
 
 def unoffered(robot: Any, verb: Verb, name: str) -> str | None:
