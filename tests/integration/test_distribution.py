@@ -1,53 +1,36 @@
 """The wheel and the source archive: their contents, their metadata, and the demo run from the installed wheel.
 
-Nothing here needs a network: the build runs in this environment, and the empty environment gets the packages of
-``requirements/demo.lock`` as links to the files of this one.
+Nothing here needs a network.
 """
 
 from __future__ import annotations
 
 import json
-import os
 import re
 import subprocess
-import sys
 import tarfile
-import venv
 import zipfile
 from email.message import Message
 from email.parser import HeaderParser
-from importlib import metadata
 from pathlib import Path
 from urllib.request import urlopen
 
 import pytest
 from fixtures.command_line import Machine
-from packaging.requirements import Requirement
+from fixtures.empty_environment import ROOT, build, empty_environment, run
 
-from strands_robots import __version__, settings
+from strands_robots import __version__
 
-ROOT = Path(__file__).resolve().parents[2]
 DEMO_S = 200.0
 NOT_SHIPPED = (".ci/", ".github/", ".gitignore", ".pre-commit-config.yaml")
 pytestmark = pytest.mark.timeout(600)
-
-
-def run(*words: object, cwd: Path, **variables: str) -> str:
-    """Run a command away from this checkout and the user's settings, and return its standard output."""
-    ours = {setting.name for setting in settings.declared()} | {"PYTHONPATH", "VIRTUAL_ENV"}
-    environment = {name: value for name, value in os.environ.items() if name not in ours} | variables
-    done = subprocess.run(
-        [str(word) for word in words], cwd=cwd, env=environment, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, f"{words}: {done.stdout}{done.stderr}"
-    return done.stdout
 
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder with the wheel and the source archive of this checkout."""
     folder = tmp_path_factory.mktemp("dist")
-    run(sys.executable, "-m", "hatchling", "build", "--directory", folder, cwd=ROOT)
+    build(ROOT, folder)
     return folder
 
 
@@ -67,28 +50,7 @@ def about(wheel: Path) -> Message:
 @pytest.fixture(scope="module")
 def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of commands of an environment that holds the wheel, what demo.lock names, and nothing else."""
-    folder = tmp_path_factory.mktemp("empty")
-    venv.create(folder, symlinks=True)
-    site = next((folder / "lib").glob("python*/site-packages"))
-    for name in locked(ROOT / "requirements" / "demo.lock"):
-        for file in metadata.distribution(name).files or ():
-            link = site / file
-            # Distributions of one project may share files.
-            if ".." not in file.parts and "__pycache__" not in file.parts and not link.exists():
-                link.parent.mkdir(parents=True, exist_ok=True)
-                link.symlink_to(file.locate())
-    python = folder / "bin" / "python"
-    pip = (sys.executable, "-m", "pip", "--disable-pip-version-check", "--python", python)
-    run(*pip, "install", "--quiet", "--no-index", "--no-deps", wheel, cwd=folder)
-    run(*pip, "check", cwd=folder)
-    return folder / "bin"
-
-
-def locked(lock: Path) -> list[str]:
-    """Return the packages of a lock file that this interpreter and platform need."""
-    lines = re.findall(r"^([a-z0-9].*?) *\\?$", lock.read_text(encoding="utf-8"), flags=re.MULTILINE)
-    needed = [Requirement(line) for line in lines]
-    return [each.name for each in needed if each.marker is None or each.marker.evaluate()]
+    return empty_environment(tmp_path_factory.mktemp("empty"), wheel)
 
 
 def tracked() -> set[str]:

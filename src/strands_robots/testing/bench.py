@@ -247,8 +247,11 @@ class MotionRun:
         while time.monotonic() < deadline:
             if isinstance(self.answer, RefusalError):
                 raise NotProvenError(f"{self.motion.verb} was refused: {self.answer}")
+            over = self.over and self._returns_at_its_end
             if self._bench.writes > before if self._bench.subject.recorder else runs(self._bench.body):
                 return
+            if over:
+                raise NotProvenError(f"{self.motion.verb} ended before it moved the robot: {self._said}")
             time.sleep(_EVERY_S)
         if self._bench.subject.recorder is not None and runs(self._bench.body):
             look = "is recorder.wrote() called where the motor is written?"
@@ -263,6 +266,16 @@ class MotionRun:
     def join(self) -> None:
         """Wait for the answer of its call."""
         self._thread.join(self._bench.subject.answer_s)
+
+    @property
+    def _returns_at_its_end(self) -> bool:
+        """True for a verb of the robot's own; a task was started when its call returns."""
+        verb = self._robot.verbs.get(self.motion.verb)
+        return verb is not None and verb.own
+
+    @property
+    def _said(self) -> str:
+        return text_of(self.answer) if isinstance(self.answer, dict) else "it gave no answer"
 
     def _call(self) -> None:
         try:

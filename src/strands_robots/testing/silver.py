@@ -162,7 +162,7 @@ def own_verbs(bench: ConformanceBench) -> str:
             short.append(str(exc))
     if short and not halted:
         raise NotProvenError("; ".join(short))
-    return ", ".join(halted) or "it has none of its own"
+    return "; ".join([", ".join(halted), *short] if halted else ["it has none of its own"])
 
 
 @promise(
