@@ -21,6 +21,13 @@ from strands_robots.cli.output import Exit
         (("json:no_such_name",), "AttributeError"),
         (("math:pi",), "must be a Subject, or make one or a robot, not 3.14"),
         (("so100", "--tier", "iron"), "--tier must be one of bronze, silver, gold, not 'iron'"),
+        (("arm-1", "--live", "--motion", "1up"), "--motion must be VERB KEY=VALUE"),
+        (("arm-1", "--live", "--motion", "wave 'to me"), "--motion must be VERB KEY=VALUE"),
+        (("arm-1", "--live", "--motion", "wave speed=NaN"), "speed must be finite"),
+        (("arm-1", "--live", "--motion", "wave", "--approve-motions", "00"), "which names this list, not '00'"),
+        (("arm 1", "--live"), "TARGET must"),
+        (("so100", "--motion", "wave"), "--motion is for --live"),
+        (("so100", "--port", "4711"), "give --live with it"),
         (("math:tau", "--only", "silver.halt"), "must be a Subject"),
     ],
     ids=str,
@@ -28,7 +35,7 @@ from strands_robots.cli.output import Exit
 def test_conform_refuses_by_name(run: Run, arguments: tuple[str, ...], said: str) -> None:
     refused = run("conform", *arguments, "--json")
     assert refused.exit_code == Exit.USAGE
-    assert said in json.loads(refused.stdout)["reason"]
+    assert said in json.loads(refused.stdout.splitlines()[-1])["reason"]
 
 
 @pytest.mark.parametrize("name", ["", "My_Robot", "my-robot", "1robot", "a" * 51, "../x", "class", "json", "numpy"])

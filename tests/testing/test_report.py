@@ -167,3 +167,11 @@ def test_write_that_raises_does_not_reach_the_bus_and_is_not_recorded() -> None:
         bus.write(3)
     assert (bus.sent, recorder.count) == ([], 0)
     assert LongMotion("turn").arguments == {}
+
+
+def test_words_name_together_what_is_not_proven_for_one_reason() -> None:
+    results = [kept(Tier.SILVER, name).result(CheckMark.NOT_PROVEN, "no recorder") for name in ("x.a", "x.b")]
+    failed = [kept(Tier.SILVER, name).result(CheckMark.FAILED, "it wrote") for name in ("x.c", "x.d")]
+    lines = ConformanceReport("rig", [*results, *failed]).words().splitlines()
+    assert "NOT PROVEN x.a, x.b: no recorder" in lines
+    assert [each for each in lines if each.startswith("FAILED")] == ["FAILED x.c: it wrote", "FAILED x.d: it wrote"]

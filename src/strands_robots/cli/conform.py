@@ -5,6 +5,8 @@ from __future__ import annotations
 import keyword
 import re
 import sys
+from collections.abc import Callable
+from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -14,11 +16,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from strands_robots.cli.app import assignments
+from strands_robots.cli.motion_approval import FLAG, MotionList, lines_of, parse_motion
+from strands_robots.cli.network import Network, answering
 from strands_robots.cli.output import CliError, Screen
-from strands_robots.utils import ValidationError, choice, shown
+from strands_robots.utils import ValidationError, choice, identifier, shown
 
 if TYPE_CHECKING:
-    from strands_robots.testing import CheckResult, Subject
+    from strands_robots.testing import CheckResult, ConformanceReport, LongMotion, Subject, Tier
 
 TIERS = ("bronze", "silver", "gold")
 
@@ -27,9 +31,10 @@ _STYLES = {"passed": "green", "exempt": "cyan", "not proven": "yellow"}
 
 def conform(
     screen: Screen,
+    network: Network,
     *,
     target: Annotated[
-        str, typer.Argument(help="module:NAME of a Subject, or of what makes the robot; or a robot's name.")
+        str, typer.Argument(help="module:NAME of a Subject, or of what makes the robot; a robot's name; or an id.")
     ],
     tier: Annotated[str, typer.Option("--tier", help="The highest that is checked: bronze, silver or gold.")] = "gold",
     only: Annotated[list[str] | None, typer.Option("--only", help="A check, such as silver.halts (repeat).")] = None,
@@ -37,26 +42,79 @@ def conform(
         list[str] | None,
         typer.Option("--set", help="An option of a robot that was named.", metavar="KEY=VALUE"),
     ] = None,
+    live: Annotated[
+        bool, typer.Option("--live", help="TARGET is the id of a robot in reach; without --motion it is not moved.")
+    ] = False,
+    motion: Annotated[
+        str | None,
+        typer.Option("--motion", help="Move it by this, once you approve the list.", metavar='"VERB KEY=VALUE ..."'),
+    ] = None,
+    approve_motions: Annotated[
+        str | None, typer.Option(FLAG, help="Approve the printed list, by its digest.", metavar="DIGEST")
+    ] = None,
 ) -> None:
     """Check a robot on its emulated bus, where it moves. Exits 1 on a failure."""
     from strands_robots.testing import Tier  # noqa: PLC0415 - loads both networks
     from strands_robots.testing import conform as check  # noqa: PLC0415 - as above
 
     most = Tier[choice("--tier", tier, TIERS).upper()]
-    subject = _subject(target, assignments(options or []))
+    chosen = _Chosen(most, tuple(only or ()), None if motion is None else parse_motion(motion), approve_motions)
 
     def tell(result: CheckResult) -> None:
         screen.data({"event": "checked", "check": result.check, "mark": result.mark.value, "said": result.said})
         style = _STYLES.get(result.mark.value, "bold red")
         screen.say(f"{result.mark.value:>16}  {result.check}  {result.said}", style)
 
-    report = check(subject, most, only=only or (), report=tell)
+    if live:
+        report = _live(screen, network, target, chosen, tell)
+    else:
+        if network != Network():
+            raise ValidationError("a network is stated for a robot in reach; give --live with it.")
+        if motion is not None:
+            raise ValidationError("--motion is for --live; a Subject has its motion.")
+        report = check(_subject(target, assignments(options or [])), most, only=chosen.only, report=tell)
     screen.data({"event": "report", **report.facts()})
     for line in report.words().splitlines():
         screen.say(line)
     if report.failed:
         names = ", ".join(each.check for each in report.failed)
         raise CliError(f"{report.name} does not keep {len(report.failed)} of its promises: {names}.")
+
+
+@dataclass(frozen=True, slots=True)
+class _Chosen:
+    """Checks that were chosen, and the motion for them."""
+
+    most: Tier
+    only: tuple[str, ...]
+    motion: LongMotion | None
+    approval: str | None
+
+    def motions(self) -> list[str]:
+        """Return the sentences of the list to approve; none without a motion."""
+        from strands_robots.testing.live import MOTIONS, WRONG_ARGUMENTS  # noqa: PLC0415 - loads both networks
+
+        if self.motion is None:
+            return []
+        starts = sum(times for name, times in MOTIONS.items() if self._checks(name))
+        return lines_of(self.motion, starts, wrong=any(map(self._checks, WRONG_ARGUMENTS)))
+
+    def _checks(self, name: str) -> bool:
+        from strands_robots.testing import promises  # noqa: PLC0415 - as above
+
+        return any(name == each.name for each in promises(self.most)) and (not self.only or name in self.only)
+
+
+def _live(
+    screen: Screen, network: Network, robot: str, chosen: _Chosen, tell: Callable[[CheckResult], None]
+) -> ConformanceReport:
+    from strands_robots.testing import conform_live  # noqa: PLC0415 - loads both networks
+
+    robot = identifier("TARGET", robot)
+    if moved := chosen.motions():
+        MotionList(robot, moved).approve(screen, chosen.approval)
+    with network.joined() as there, answering(there, robot, ""):
+        return conform_live(there, robot, chosen.most, motion=chosen.motion, only=chosen.only, report=tell)
 
 
 def _subject(target: str, options: dict[str, Any]) -> Subject:

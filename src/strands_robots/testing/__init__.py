@@ -11,7 +11,7 @@ A robot is made on its emulated bus, served on both networks of this process, an
 
 from __future__ import annotations
 
-from strands_robots.testing.conformance import conform, promises
+from strands_robots.testing.conformance import conform, conform_live, promises
 from strands_robots.testing.report import CheckMark, CheckResult, ConformanceReport, Tier
 from strands_robots.testing.subject import BusRecorder, BusWrite, LongMotion, Subject
 
@@ -25,5 +25,6 @@ __all__ = [
     "Subject",
     "Tier",
     "conform",
+    "conform_live",
     "promises",
 ]

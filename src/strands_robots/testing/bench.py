@@ -23,11 +23,12 @@ from strands_robots.contract import holds_robots, robots_in
 from strands_robots.device_connect import init_device_connect_sync, stop_device_connect
 from strands_robots.device_connect.backends.config import loopback_config
 from strands_robots.envelope import text_of
-from strands_robots.errors import RefusalError, StrandsRobotsError
+from strands_robots.errors import NoAnswerError, RefusalError, RobotError, StrandsRobotsError, UnreachableError
 from strands_robots.fleet.device_connect.network import DeviceConnectNetwork
 from strands_robots.fleet.fleet import Fleet
 from strands_robots.fleet.mesh.network import MeshNetwork
 from strands_robots.fleet.remote_robot import RemoteRobot
+from strands_robots.fleet.reports import runs as says_it_runs
 from strands_robots.mesh import init_mesh
 from strands_robots.safety.estop_listener import estop_listener
 from strands_robots.safety.plane import plane
@@ -91,54 +92,28 @@ def within(seconds: float, call: Callable[[], T], what: str) -> T:
     return answer[0]
 
 
-class ConformanceBench:
-    """A robot of a subject, served on both networks, and a caller on each.
+class NetworkBench:
+    """A robot as its callers have it, on each network.
 
-    Args:
-        subject: makes the robot.
+    Attributes:
+        subject: limits, exemptions and the motion of its checks.
+        on: the robot by network.
+        poll_s: seconds between two looks whether it moves.
     """
+
+    poll_s = _EVERY_S
 
     def __init__(self, subject: Subject) -> None:
         self.subject = subject
-        self._stack = ExitStack()
-        self.body: Any = None
         self.on: dict[str, RemoteRobot] = {}
-        """The robot as callers have it, by network."""
-
-        self._fleets: list[Fleet] = []
-
-    def __enter__(self) -> Self:
-        with ExitStack() as stack:
-            stack.enter_context(_own_settings(self.subject.deadline_s))
-            self.body = stack.enter_context(made(self.subject))
-            runtime = init_device_connect_sync(self.body, peer_id=PEER, link=loopback_config())
-            stack.callback(stop_device_connect, runtime)
-            peer = init_mesh(self.body, PEER)
-            if peer is not None:
-                stack.callback(peer.close)
-            for network in (DeviceConnectNetwork(loopback_config(), CALLER), MeshNetwork(f"{CALLER}-mesh")):
-                fleet = stack.enter_context(Fleet([network]))
-                self._fleets.append(fleet)
-                self.on[network.name] = wait_for(partial(_found, fleet), ANSWER_S, "the robot on its network")
-            wait_for(_estops_arrive, ANSWER_S, "its e-stop link")
-            self._stack = stack.pop_all()
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self._stack.__exit__(None, None, None)
 
     @property
     def remote(self) -> RemoteRobot:
-        """The robot on Device Connect."""
+        """The robot on its first network, Device Connect where it is there."""
         return next(iter(self.on.values()))
 
-    @property
-    def writes(self) -> int:
-        """Writes of its bus so far; 0 without a recorder."""
-        return 0 if self.subject.recorder is None else self.subject.recorder.count
-
     def motions(self, network: str = "") -> list[AdvertisedVerb]:
-        """Return its verbs that may move it, on a network; by default on Device Connect."""
+        """Return its verbs that may move it, on a network; by default on the first one."""
         robot = self.on[network] if network else self.remote
         return [each for each in robot.verbs.values() if each.kind == "motion" and each.name not in RESUMES]
 
@@ -156,25 +131,22 @@ class ConformanceBench:
             return dict(TASK)
         return {each.name: usual_value(each) for each in verb.parameters if each.required}
 
-    def estop(self) -> None:
-        """Send an emergency stop to it, as a safety controller does."""
-        self._fleets[0].estop("emergency stop of a check")
-
-    def clear(self) -> None:
-        """Free it, as an operator at this machine does."""
-        plane().clear_local("conformance")
+    @property
+    def writes(self) -> int:
+        """Writes of its bus so far; 0 without a recorder."""
+        return 0 if self.subject.recorder is None else self.subject.recorder.count
 
     def halt(self, reason: str = "conformance") -> StopVerdict:
-        """Halt it by its own contract, within the deadline."""
-        body = behind_contract(self.body)
-        limit = self.subject.deadline_s + 1.0
-        return within(limit, lambda: body.halt(reason), "halt")
+        """Halt it over its networks."""
+        return self.remote.halt(reason)
 
     def rest(self) -> None:
-        """Have it stand still and unlocked, for the next check."""
-        with suppress(NotKeptError):
-            self.halt("the check is over")
-        self.clear()
+        """Have it stand still, for the next check."""
+        self.halt("the check is over")
+
+    def runs(self) -> bool:
+        """Return True while its status says that it moves."""
+        return says_it_runs(self.remote.status())
 
     @property
     def motion(self) -> LongMotion:
@@ -197,9 +169,69 @@ class ConformanceBench:
             run.start()
             yield run
         finally:
-            with suppress(NotKeptError):
-                self.halt("the motion of a check is over")
+            # Of a robot that refused it, another caller's motion may be under way.
+            if not run.refused:
+                with suppress(NotKeptError):
+                    self.halt("the motion of a check is over")
             run.join()
+
+
+class ConformanceBench(NetworkBench):
+    """A robot of a subject, served on both networks, and a caller on each.
+
+    Args:
+        subject: makes the robot.
+    """
+
+    def __init__(self, subject: Subject) -> None:
+        super().__init__(subject)
+        self._stack = ExitStack()
+        self.body: Any = None
+        self._fleets: list[Fleet] = []
+
+    def __enter__(self) -> Self:
+        with ExitStack() as stack:
+            stack.enter_context(_own_settings(self.subject.deadline_s))
+            self.body = stack.enter_context(made(self.subject))
+            runtime = init_device_connect_sync(self.body, peer_id=PEER, link=loopback_config())
+            stack.callback(stop_device_connect, runtime)
+            peer = init_mesh(self.body, PEER)
+            if peer is not None:
+                stack.callback(peer.close)
+            for network in (DeviceConnectNetwork(loopback_config(), CALLER), MeshNetwork(f"{CALLER}-mesh")):
+                fleet = stack.enter_context(Fleet([network]))
+                self._fleets.append(fleet)
+                self.on[network.name] = wait_for(partial(_found, fleet), ANSWER_S, "the robot on its network")
+            wait_for(_estops_arrive, ANSWER_S, "its e-stop link")
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._stack.__exit__(None, None, None)
+
+    def estop(self) -> None:
+        """Send an emergency stop to it, as a safety controller does."""
+        self._fleets[0].estop("emergency stop of a check")
+
+    def clear(self) -> None:
+        """Free it, as an operator at this machine does."""
+        plane().clear_local("conformance")
+
+    def halt(self, reason: str = "conformance") -> StopVerdict:
+        """Halt it by its own contract, within the deadline."""
+        body = behind_contract(self.body)
+        limit = self.subject.deadline_s + 1.0
+        return within(limit, lambda: body.halt(reason), "halt")
+
+    def rest(self) -> None:
+        """Have it stand still and unlocked, for the next check."""
+        with suppress(NotKeptError):
+            self.halt("the check is over")
+        self.clear()
+
+    def runs(self) -> bool:
+        """Return True while a task or a declared verb of it is under way."""
+        return runs(self.body)
 
     def check_still(self, verdict: StopVerdict, count: int, how: str) -> None:
         """Check a verdict against the bus: stopped, and no write after ``count``.
@@ -234,7 +266,7 @@ class ConformanceBench:
 class MotionRun:
     """A motion under way, called over a network on a thread of its own."""
 
-    def __init__(self, bench: ConformanceBench, robot: RemoteRobot, motion: LongMotion) -> None:
+    def __init__(self, bench: NetworkBench, robot: RemoteRobot, motion: LongMotion) -> None:
         self._bench, self._robot, self.motion = bench, robot, motion
         self.answer: dict[str, Any] | RefusalError | None = None
         self._thread = threading.Thread(target=self._call, name="conform motion", daemon=True)
@@ -248,15 +280,21 @@ class MotionRun:
             if isinstance(self.answer, RefusalError):
                 raise NotProvenError(f"{self.motion.verb} was refused: {self.answer}")
             over = self.over and self._returns_at_its_end
-            if self._bench.writes > before if self._bench.subject.recorder else runs(self._bench.body):
+            if self._bench.writes > before if self._bench.subject.recorder else self._bench.runs():
                 return
             if over:
                 raise NotProvenError(f"{self.motion.verb} ended before it moved the robot: {self._said}")
-            time.sleep(_EVERY_S)
-        if self._bench.subject.recorder is not None and runs(self._bench.body):
+            time.sleep(self._bench.poll_s)
+        if self._bench.subject.recorder is not None and self._bench.runs():
             look = "is recorder.wrote() called where the motor is written?"
             raise NotProvenError(f"{self.motion.verb} runs, and the recorder saw no write: {look}")
         raise NotProvenError(f"{self.motion.verb} did not move the robot within {self._bench.subject.answer_s:g} s")
+
+    @property
+    def refused(self) -> bool:
+        """True where the robot refused to begin it."""
+        unknown = RobotError, NoAnswerError, UnreachableError
+        return isinstance(self.answer, RefusalError) and not isinstance(self.answer, unknown)
 
     @property
     def over(self) -> bool:
@@ -297,7 +335,7 @@ def made(subject: Subject) -> Iterator[Any]:
                 within(ANSWER_S, cleanup, "cleanup")
 
 
-def usual_motion(bench: ConformanceBench) -> LongMotion:
+def usual_motion(bench: NetworkBench) -> LongMotion:
     """Return a task of the policy mock, or the first declared motion.
 
     Raises:

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from strands_robots.adapted import behind_contract
 from strands_robots.contract import AT_REST, RUNNING, holds_robots
 from strands_robots.errors import NoAnswerError, RefusalError, RobotError
+from strands_robots.fleet.remote_robot import RemoteRobot
 from strands_robots.serving.advertised import AdvertisedVerb
 from strands_robots.testing.bench import (
     ConformanceBench,
     DriftError,
+    NetworkBench,
     NotKeptError,
     NotProvenError,
     within,
@@ -29,7 +31,7 @@ NUMBERS = ("integer", "number")
     why="An agent calls what it finds; a verb that one network lacks is a robot that is another one there.",
     look="docs/own-robots.md: the methods with @verb and their docstrings",
 )
-def verbs(bench: ConformanceBench) -> str:
+def verbs(bench: NetworkBench) -> str:
     """Compare the lists of both networks."""
     own = {name: sorted(each.name for each in robot.verbs.values() if each.own) for name, robot in bench.on.items()}
     if len({tuple(names) for names in own.values()}) > 1:
@@ -51,7 +53,7 @@ def verbs(bench: ConformanceBench) -> str:
     why="Callers make their forms and checks of the schema; a wrong one lets a wrong value through.",
     look="the hints of the verb's method: Annotated[float, Domain(low, high, unit)]",
 )
-def schemas(bench: ConformanceBench) -> str:
+def schemas(bench: NetworkBench) -> str:
     """Look at the schema of each verb on each network."""
     count = 0
     for robot in bench.on.values():
@@ -72,7 +74,7 @@ def schemas(bench: ConformanceBench) -> str:
     why="A status that raises or hangs is what an operator looks at in the worst minute.",
     look="get_task_status, get_state, get_features and the verbs with motion=False",
 )
-def reads(bench: ConformanceBench) -> str:
+def reads(bench: NetworkBench) -> str:
     """Call each read on each network."""
     asked = 0
     for robot in bench.on.values():
@@ -104,13 +106,22 @@ def status(bench: ConformanceBench) -> str:
     own = getattr(robot, "get_task_status", None)
     if not callable(own):
         return "it has no tasks"
-    answer = within(bench.subject.answer_s, own, "get_task_status")
+    state = known_state(within(bench.subject.answer_s, own, "get_task_status"))
+    if state in RUNNING:
+        raise NotKeptError(f"task_status is {state} before it was asked for a motion")
+    return state
+
+
+def known_state(answer: object) -> str:
+    """Return the ``task_status`` of a status, in lower case.
+
+    Raises:
+        NotKeptError: it is none of those that are known.
+    """
     state = answer.get("task_status") if isinstance(answer, Mapping) else None
     if not isinstance(state, str) or state.lower() not in AT_REST | RUNNING:
         raise NotKeptError(f"task_status is {state!r:.100} in {answer!r:.200}")
-    if state.lower() in RUNNING:
-        raise NotKeptError(f"task_status is {state} before it was asked for a motion")
-    return state
+    return state.lower()
 
 
 @promise(
@@ -124,7 +135,19 @@ def features(bench: ConformanceBench) -> str:
     robot = behind_contract(bench.body)
     if holds_robots(robot):
         return "a world"
-    first, second = (within(bench.subject.answer_s, robot.get_features, "get_features") for _ in range(2))
+    return check_features(
+        lambda: within(bench.subject.answer_s, robot.get_features, "get_features"),
+        lambda: within(bench.subject.answer_s, robot.get_state, "get_state"),
+    )
+
+
+def check_features(features: Callable[[], Any], state: Callable[[], Any]) -> str:
+    """Compare features with the joints of the state; return their number.
+
+    Raises:
+        NotKeptError: they are not what features and states have to be, or differ.
+    """
+    first, second = features(), features()
     stated: dict[str, Mapping[str, Any]] = {}
     for kind in ("observation_features", "action_features"):
         given = first.get(kind) if isinstance(first, Mapping) else None
@@ -133,8 +156,8 @@ def features(bench: ConformanceBench) -> str:
         if given != second.get(kind):
             raise DriftError(f"{kind} differ from one call to the next")
         stated[kind] = given
-    state = within(bench.subject.answer_s, robot.get_state, "get_state")
-    joints = state.get("joints") if isinstance(state, Mapping) else None
+    measured = state()
+    joints = measured.get("joints") if isinstance(measured, Mapping) else None
     if joints is None:
         return "no joints"
     if not isinstance(joints, Mapping):
@@ -161,9 +184,9 @@ def domains(bench: ConformanceBench) -> str:
     before = bench.writes
     for robot in bench.on.values():
         for verb in bench.motions(robot.network):
-            for name, wrong in _wrong(verb):
+            for name, wrong in wrong_numbers(verb):
                 tried += 1
-                _refused(bench, robot, verb, name, wrong)
+                check_refused(bench, robot, verb, name, wrong)
     start = getattr(bench.body, "start_task", None)
     if callable(start):
         for wrong in (math.nan, math.inf, -1.0):
@@ -188,16 +211,25 @@ def unknown(bench: ConformanceBench) -> str:
     """Call each motion with an argument too many."""
     for robot in bench.on.values():
         for verb in bench.motions(robot.network):
-            _refused(bench, robot, verb, "no_such_argument", 1)
-        try:
-            robot.call("noSuchVerb", timeout=bench.subject.answer_s)
-        except RefusalError:
-            continue
-        raise NotKeptError(f"noSuchVerb was carried out on {robot.network}")
+            check_refused(bench, robot, verb, "no_such_argument", 1)
+        check_unknown_verb(bench, robot)
     return ""
 
 
-def _wrong(verb: AdvertisedVerb) -> Iterator[tuple[str, object]]:
+def check_unknown_verb(bench: NetworkBench, robot: RemoteRobot) -> None:
+    """Call a verb that the robot does not have.
+
+    Raises:
+        NotKeptError: it was carried out.
+    """
+    try:
+        robot.call("noSuchVerb", timeout=bench.subject.answer_s)
+    except RefusalError:
+        return
+    raise NotKeptError(f"noSuchVerb was carried out on {robot.network}")
+
+
+def wrong_numbers(verb: AdvertisedVerb) -> Iterator[tuple[str, object]]:
     """Yield the numbers of a verb, each with wrong values."""
     for each in verb.parameters:
         if each.type not in NUMBERS:
@@ -211,7 +243,12 @@ def _wrong(verb: AdvertisedVerb) -> Iterator[tuple[str, object]]:
             yield each.name, each.high + 1
 
 
-def _refused(bench: ConformanceBench, robot: Any, verb: AdvertisedVerb, name: str, wrong: object) -> None:
+def check_refused(bench: NetworkBench, robot: RemoteRobot, verb: AdvertisedVerb, name: str, wrong: object) -> None:
+    """Call a motion with one wrong argument.
+
+    Raises:
+        NotKeptError: it took it, gave no answer, or refused it without its name.
+    """
     arguments = bench.arguments(verb) | {name: wrong}
     try:
         robot.call(verb.name, timeout=bench.subject.answer_s, **arguments)

@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 
+from strands_robots.fleet.networks import Networks
 from strands_robots.testing import bronze, gold, silver
-from strands_robots.testing.bench import ConformanceBench
+from strands_robots.testing.bench import ConformanceBench, NotProvenError
+from strands_robots.testing.live import LiveBench, check_live
 from strands_robots.testing.promise import Promise
 from strands_robots.testing.report import GOOD, CheckMark, CheckResult, ConformanceReport, Tier
-from strands_robots.testing.subject import Subject
+from strands_robots.testing.subject import LongMotion, Subject
 from strands_robots.utils import ValidationError, near
 
 MADE = Promise(
@@ -35,6 +37,8 @@ def conform(
     *,
     only: Iterable[str] = (),
     report: Callable[[CheckResult], None] = lambda result: None,
+    checking: Callable[[str], None] = lambda check: None,
+    hardware: bool = False,
 ) -> ConformanceReport:
     """Check the promises of a robot on its emulated bus; it moves.
 
@@ -43,36 +47,104 @@ def conform(
         most: the highest tier that is checked.
         only: names of checks; all by default.
         report: called with each result.
+        checking: called with the name of each check before it begins.
+        hardware: it moves metal, so that only its motion is called, which its operator has approved.
 
     Raises:
         ValidationError: a check or an exemption that does not exist.
     """
-    chosen = promises(most)
+    chosen = _chosen(most, only, subject)
+    results: list[CheckResult] = []
+
+    def tell(result: CheckResult) -> None:
+        results.append(result)
+        report(result)
+
+    name = subject.name or "robot"
+    try:
+        checking(MADE.name)
+        with ConformanceBench(subject) as bench:
+            name = subject.name or type(bench.body).__name__
+            if hardware:
+                _check_each(chosen, lambda each: check_live(each, bench), tell, checking, waits=False)
+            else:
+                _check_each(chosen, lambda each: each.check(bench), tell, checking, then=bench.rest)
+    except Exception as exc:
+        if results and not isinstance(exc, AssertionError):
+            raise
+        tell(MADE.result(CheckMark.FAILED, f"it could not be served: {type(exc).__name__}: {exc}"))
+    return ConformanceReport(name, tuple(results))
+
+
+def conform_live(
+    networks: Networks,
+    robot: str,
+    most: Tier = Tier.PLATINUM,
+    *,
+    motion: LongMotion | None = None,
+    only: Iterable[str] = (),
+    report: Callable[[CheckResult], None] = lambda result: None,
+) -> ConformanceReport:
+    """Check the promises of a robot that another process serves, as far as may be.
+
+    Without a motion nothing moves it. With one, what the network says of its stops is told; no stop is proven.
+
+    Args:
+        networks: joined.
+        robot: its id.
+        motion: one that its operator has approved; it is started several times and stopped.
+        most: as of :func:`conform`, and so are the others.
+
+    Raises:
+        RefusalError: no network has it; or with a motion, two robots have the id.
+        ValidationError: a check that does not exist.
+    """
+    subject = Subject(_made_elsewhere, name=robot, motion=motion)
+    chosen = _chosen(most, only, subject)
+    results: list[CheckResult] = []
+
+    def tell(result: CheckResult) -> None:
+        results.append(result)
+        report(result)
+
+    bench = LiveBench(networks, robot, subject)
+    _check_each(chosen, lambda each: check_live(each, bench), tell, waits=False)
+    return ConformanceReport(robot, tuple(results))
+
+
+def _made_elsewhere() -> object:
+    raise NotProvenError("another process makes it")
+
+
+def _chosen(most: Tier, only: Iterable[str], subject: Subject) -> list[Promise]:
     known = [each.name for each in promises()]
     wanted = frozenset(only)
     for name in (*wanted, *subject.exempt):
         if name not in known:
             raise ValidationError(f"there is no check {name}.{near(name, known)}")
-    results: list[CheckResult] = []
-    name = subject.name or "robot"
-    try:
-        with ConformanceBench(subject) as bench:
-            name = subject.name or type(bench.body).__name__
-            for each in chosen:
-                if wanted and each.name not in wanted:
-                    continue
-                if any(result.check == each.needs and result.mark not in GOOD for result in results):
-                    said = f"{each.needs} is not proven, without which it cannot be checked"
-                    results.append(replace(each.result(CheckMark.NOT_PROVEN, said), waits_for=each.needs))
-                    report(results[-1])
-                    continue
-                results.append(each.check(bench))
-                report(results[-1])
-                bench.rest()
-    except Exception as exc:
-        if results and not isinstance(exc, AssertionError):
-            raise
-        said = f"it could not be served: {type(exc).__name__}: {exc}"
-        results.append(MADE.result(CheckMark.FAILED, said))
-        report(results[-1])
-    return ConformanceReport(name, tuple(results))
+    return [each for each in promises(most) if not wanted or each.name in wanted]
+
+
+def _check_each(
+    chosen: Iterable[Promise],
+    check: Callable[[Promise], CheckResult],
+    tell: Callable[[CheckResult], None],
+    checking: Callable[[str], None] = lambda check: None,
+    *,
+    then: Callable[[], None] = lambda: None,
+    waits: bool = True,
+) -> None:
+    """Check one promise after the other; ``waits`` for those that each needs."""
+    lacking = set()
+    for each in chosen:
+        if waits and each.needs in lacking:
+            said = f"{each.needs} is not proven, without which it cannot be checked"
+            tell(replace(each.result(CheckMark.NOT_PROVEN, said), waits_for=each.needs))
+            lacking.add(each.name)
+            continue
+        checking(each.name)
+        result = check(each)
+        if result.mark not in GOOD:
+            lacking.add(each.name)
+        tell(result)
+        then()

@@ -13,6 +13,7 @@ from strands_robots.fleet.reports import EventFeed
 from strands_robots.testing.bench import (
     ConformanceBench,
     DriftError,
+    NetworkBench,
     NotKeptError,
     NotProvenError,
     runs,
@@ -222,7 +223,7 @@ def recovers(bench: ConformanceBench) -> str:
     why="A robot is a robot, near and far.",
     look="reads that look at who calls",
 )
-def own_verbs(bench: ConformanceBench) -> str:
+def own_verbs(bench: NetworkBench) -> str:
     """Compare the answers of both networks."""
     own = [each for each in bench.plain_reads(bench.remote.network) if each.own]
     for verb in own:

@@ -51,16 +51,21 @@ class Promise:
     def _judged(self, bench: ConformanceBench) -> tuple[CheckMark, str]:
         if self.needs_recorder and bench.subject.recorder is None:
             return CheckMark.NOT_PROVEN, "the subject has no recorder of its bus"
-        try:
-            return CheckMark.PASSED, self.proof(bench) or ""
-        except NotProvenError as exc:
-            return CheckMark.NOT_PROVEN, str(exc)
-        except DriftError as exc:
-            return CheckMark.DRIFT, str(exc)
-        except (NotKeptError, StrandsRobotsError) as exc:
-            return CheckMark.FAILED, str(exc)
-        except Exception as exc:  # noqa: BLE001 - a robot of a stranger raises what it likes
-            return CheckMark.FAILED, f"{type(exc).__name__}: {exc}"
+        return judged(lambda: self.proof(bench))
+
+
+def judged(proof: Callable[[], str | None]) -> tuple[CheckMark, str]:
+    """Return the mark of a proof, and what it said."""
+    try:
+        return CheckMark.PASSED, proof() or ""
+    except NotProvenError as exc:
+        return CheckMark.NOT_PROVEN, str(exc)
+    except DriftError as exc:
+        return CheckMark.DRIFT, str(exc)
+    except (NotKeptError, StrandsRobotsError) as exc:
+        return CheckMark.FAILED, str(exc)
+    except Exception as exc:  # noqa: BLE001 - a robot of a stranger raises what it likes
+        return CheckMark.FAILED, f"{type(exc).__name__}: {exc}"
 
 
 def promise(

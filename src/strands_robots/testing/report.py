@@ -88,13 +88,22 @@ class ConformanceReport:
             if marks:
                 counts = ", ".join(f"{marks.count(mark)} {mark}" for mark in CheckMark if mark in marks)
                 lines.append(f"  {each.label}: {counts}")
-        for result in self.results:
-            if result.mark is CheckMark.PASSED or result.waits_for:
-                continue
-            lines.append(f"{result.mark.upper()} {result.check}: {result.said}")
+        for alike in self._alike():
+            result = alike[0]
+            lines.append(f"{result.mark.upper()} {', '.join(each.check for each in alike)}: {result.said}")
             if result.mark in BAD:
                 lines += [f"  promise: {result.promise}", f"  matters: {result.why}", f"  look at: {result.look}"]
         return "\n".join([*lines, *self._way_on(tier)])
+
+    def _alike(self) -> list[list[CheckResult]]:
+        """Return what a person has to read; one line for one reason."""
+        groups: dict[tuple[str, ...], list[CheckResult]] = {}
+        for result in self.results:
+            if result.mark is CheckMark.PASSED or result.waits_for:
+                continue
+            together = result.mark is CheckMark.NOT_PROVEN
+            groups.setdefault((result.said,) if together else (result.said, result.check), []).append(result)
+        return list(groups.values())
 
     def _way_on(self, tier: Tier | None) -> list[str]:
         """Return what the next tier needs, and what waits for that."""
