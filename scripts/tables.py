@@ -1,20 +1,23 @@
-"""Write the tables of settings and extras in docs/reference.md and of old names in docs/from-0.5.md from the code.
+"""Write the tables of settings, extras, old names and promises in the pages of docs/ from the code.
 
 ``python scripts/tables.py`` rewrites them in place; ``--check`` only compares them.
 """
 
 from __future__ import annotations
 
+import inspect
 import re
 import sys
 import tomllib
 from pathlib import Path
 
 from strands_robots import moved, settings
+from strands_robots.testing import promises
 
 ROOT = Path(__file__).resolve().parent.parent
 REFERENCE = ROOT / "docs" / "reference.md"
 FROM_05 = ROOT / "docs" / "from-0.5.md"
+YOUR_ROBOT = ROOT / "docs" / "your-robot.md"
 
 EXTRA_MEANINGS = {
     "device-connect": "the Device Connect networks (Zenoh, NATS), drivers and client",
@@ -79,9 +82,22 @@ def gone_table() -> str:
     return "\n".join(rows)
 
 
+def escaped(cell: str) -> str:
+    return cell.replace("|", "&#124;").replace("*", r"\*").replace("__", r"\_\_")
+
+
+def promises_table() -> str:
+    rows = ["| check | promise | how it is checked | where to look |", "|---|---|---|---|"]
+    for each in promises():
+        cells = (f"`{each.name}`", each.text, inspect.getdoc(each.proof) or "", each.look)
+        rows.append(f"| {' | '.join(map(escaped, cells))} |")
+    return "\n".join(rows)
+
+
 PAGES = {
     REFERENCE: (("settings", settings_table), ("unread", unread_table), ("extras", extras_table)),
     FROM_05: (("moved", moved_table), ("gone", gone_table)),
+    YOUR_ROBOT: (("promises", promises_table),),
 }
 
 

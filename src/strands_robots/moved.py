@@ -96,7 +96,7 @@ NAMES = {
 """Names by their path in 0.5, each with its module and its name here."""
 
 _KEEPS = "strands-robots 0.5 keeps it"
-_NO_DRIVER = f"{_KEEPS}; a package brings a robot by the entry point strands_robots.robots (docs/own-robots.md)"
+_NO_DRIVER = f"{_KEEPS}; a package brings a robot by the entry point strands_robots.robots (docs/your-robot.md)"
 _NO_ROBOT_LIST = (
     "Robot takes the name of a robot, or the path of an MJCF or URDF file; 'strands-robots peers' lists the live ones"
 )

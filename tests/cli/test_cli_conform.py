@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import json
+import re
+from collections import Counter
 from pathlib import Path
+from textwrap import dedent
 
 import pytest
 from tests.cli.conftest import Run
 
 from strands_robots.cli.output import Exit
+from strands_robots.testing import Tier, promises
+
+PAGE = Path(__file__).parents[2] / "docs" / "your-robot.md"
 
 
 @pytest.mark.parametrize(
@@ -62,3 +68,24 @@ def test_new_writes_a_package_with_its_entry_point(run: Run, tmp_path: Path) -> 
     assert {"README.md", "src/left_arm/robot.py", "src/left_arm/bus.py", "tests/test_left_arm.py"} <= files
     for each in (tmp_path / "made").rglob("*.py"):
         compile(each.read_text(), str(each), "exec")
+
+
+def test_page_shows_the_code_that_new_writes(run: Run, tmp_path: Path) -> None:
+    run("new", "my_robot", "--folder", str(tmp_path / "made"), "--json")
+    blocks = re.findall(r"```python\n# (\w+\.py)\n(.*?)```", PAGE.read_text("utf-8"), flags=re.DOTALL)
+    assert {file for file, _ in blocks} == {"robot.py", "bus.py", "conformance.py"}
+    for file, block in blocks:
+        written = (tmp_path / "made" / "src" / "my_robot" / file).read_text()
+        assert dedent(block) in dedent_each(written), block
+
+
+def dedent_each(text: str) -> str:
+    """Return a program with the methods and blocks of its classes at the margin, besides itself."""
+    lines = text.splitlines(keepends=True)
+    return "\n".join("".join(line.removeprefix(" " * margin) for line in lines) for margin in (0, 4, 8))
+
+
+def test_page_states_the_counts_of_the_suite() -> None:
+    counts = Counter(each.tier.label for each in promises(Tier.GOLD))
+    rows = "".join(f"  {tier}: {count} passed\n" for tier, count in counts.items())
+    assert f"```text\nmy_robot: gold\n{rows}```" in PAGE.read_text("utf-8")

@@ -179,4 +179,4 @@ def new(
         written.write_text(Template(source.read_text(encoding="utf-8")).substitute(words), encoding="utf-8")
         screen.say(f"  {written}")
     screen.data({"status": "success", "folder": str(root)})
-    screen.say(f"cd {root}, then pip install -e . and pytest. Serve it: strands-robots serve {name}", "bold")
+    screen.say(f"cd {root} && pip install -e . pytest && pytest    # {root}/README.md has the rest", "bold")

@@ -14,13 +14,19 @@ from strands_robots.testing.report import GOOD, CheckMark, CheckResult, Conforma
 from strands_robots.testing.subject import LongMotion, Subject
 from strands_robots.utils import ValidationError, near
 
+
+def _made(bench: ConformanceBench) -> str:
+    """Make it, and find it on each network."""
+    return type(bench.body).__name__
+
+
 MADE = Promise(
     "bronze.made",
     Tier.BRONZE,
     "It is made, and served on both networks.",
     "Whatever else it promises begins there.",
     "the callable that makes it, and its __init__",
-    lambda bench: type(bench.body).__name__,
+    _made,
 )
 
 

@@ -14,6 +14,9 @@ Proof = Callable[[ConformanceBench], str | None]
 """Checks a promise; returns what it saw, and raises where the promise is not kept."""
 
 
+NO_RECORDER = "the subject has no recorder of its bus (docs/your-robot.md, The bus and its recorder)"
+
+
 @dataclass(frozen=True, slots=True)
 class Promise:
     """One promise: what it says, why it matters, where to look when it is not kept.
@@ -50,7 +53,7 @@ class Promise:
 
     def _judged(self, bench: ConformanceBench) -> tuple[CheckMark, str]:
         if self.needs_recorder and bench.subject.recorder is None:
-            return CheckMark.NOT_PROVEN, "the subject has no recorder of its bus"
+            return CheckMark.NOT_PROVEN, NO_RECORDER
         return judged(lambda: self.proof(bench))
 
 

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import os
+import re
+import signal
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 from fixtures.command_line import WITHIN_S, Machine
+from fixtures.waiting import eventually
 
+PAGE = (Path(__file__).parents[3] / "docs" / "your-robot.md").read_text("utf-8")
 pytestmark = pytest.mark.system
 
 
@@ -39,8 +43,8 @@ def test_its_tests_pass_as_written(machine: Machine, tmp_path: Path) -> None:
 
 
 def test_it_conforms_and_the_report_is_json(machine: Machine) -> None:
-    code, report = machine.last_json("conform", "my_robot.conformance:subject", "--tier", "silver")
-    assert (code, report["tier"], report["failed"]) == (0, "silver", 0)
+    code, report = machine.last_json("conform", "my_robot.conformance:subject", "--tier", "bronze")
+    assert (code, report["tier"], report["failed"]) == (0, "bronze", 0)
 
 
 def test_it_is_served_by_its_name_and_called(machine: Machine) -> None:
@@ -48,3 +52,36 @@ def test_it_is_served_by_its_name_and_called(machine: Machine) -> None:
         code, answer = machine.json("call", "spinner", "spin", "seconds=0.2")
         assert (code, answer["task_status"]) == (0, "completed"), answer
         assert answer["angle_deg"] > 0
+
+
+def test_thirty_lines_of_the_page_are_a_robot_that_is_found_moved_and_stopped(tmp_path: Path) -> None:
+    (program,) = (each for each in re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL) if "class Spinner" in each)
+    assert len(program.splitlines()) <= 30
+    (tmp_path / "spinner.py").write_text(program)
+    machine = Machine(tmp_path / "state", DEVICE_CONNECT_RPC_ALLOW="strands-robots", STRANDS_ROBOT_COMMAND_ALLOW="spin")
+    served = subprocess.Popen([sys.executable, tmp_path / "spinner.py"], env=machine.environment)
+    try:
+        eventually(lambda: machine.run("peers", "spinner").returncode == 0, within=60, what="the robot on the network")
+        code, answer = machine.json("call", "spinner", "spin", "seconds=0.2")
+        assert (code, answer["task_status"]) == (0, "completed"), answer
+        refused = machine.run("call", "spinner", "spin", "seconds=90")
+        assert "seconds must be a finite number from 0.1 to 60, not 90." in refused.stderr
+        spinning = machine.start("call", "spinner", "spin", "seconds=60")
+        eventually(lambda: machine.json("call", "spinner", "getStatus")[1]["task_status"] == "running", within=60)
+        assert "Stopped spin." in machine.run("stop", "spinner").stdout
+        assert "spin stopped: it was stopped." in spinning.communicate(timeout=WITHIN_S)[1]
+        served.send_signal(signal.SIGINT)
+        assert served.wait(WITHIN_S) == 0
+    finally:
+        served.kill()
+        served.wait()
+
+
+def test_thirty_lines_of_the_page_are_bronze_and_the_report_says_what_silver_needs(tmp_path: Path) -> None:
+    (program,) = (each for each in re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL) if "class Spinner" in each)
+    (tmp_path / "spinner.py").write_text(program)
+    machine = Machine(tmp_path / "state", PYTHONPATH=os.pathsep.join([str(tmp_path), *sys.path]))
+    conformed = machine.run("conform", "spinner:Spinner")
+    assert conformed.returncode == 0, conformed.stderr
+    (shown,) = re.findall(r"^Spinner: bronze\n.*?^NOT PROVEN [^\n]*", PAGE, re.DOTALL | re.MULTILINE)
+    assert shown in conformed.stdout
