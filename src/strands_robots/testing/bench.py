@@ -6,9 +6,6 @@ is removed. Nothing leaves the machine.
 
 from __future__ import annotations
 
-import logging
-import socket
-import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -16,9 +13,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from typing import Any, Self, TypeVar
 
-from strands_robots import settings
 from strands_robots.adapted import behind_contract
-from strands_robots.audit import flush_audit
 from strands_robots.contract import holds_robots, robots_in
 from strands_robots.device_connect import init_device_connect_sync, stop_device_connect
 from strands_robots.device_connect.backends.config import loopback_config
@@ -32,9 +27,9 @@ from strands_robots.fleet.reports import runs as says_it_runs
 from strands_robots.mesh import init_mesh
 from strands_robots.safety.estop_listener import estop_listener
 from strands_robots.safety.plane import plane
-from strands_robots.safety.sightings import flush_sightings
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.advertised import RESUMES, AdvertisedParameter, AdvertisedVerb
+from strands_robots.testing.private_network import private_network
 from strands_robots.testing.subject import LongMotion, Subject
 
 T = TypeVar("T")
@@ -48,6 +43,12 @@ _EVERY_S = 0.005
 
 TASKS = ("execute", "start")
 """Verbs that start a task, on Device Connect and on the mesh."""
+
+OPEN_GATES = {
+    **dict.fromkeys(("DEVICE_CONNECT_RPC_ALLOW", "DEVICE_CONNECT_ESTOP_ALLOW"), "*"),
+    **dict.fromkeys(("BYPASS_TOOL_CONSENT", "STRANDS_ALLOW_MOCK"), "true"),
+}
+"""Settings with which any caller may move it."""
 
 TASK = {"instruction": "wave", "policy_provider": "mock", "duration": 30.0}
 
@@ -191,7 +192,7 @@ class ConformanceBench(NetworkBench):
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
-            stack.enter_context(_own_settings(self.subject.deadline_s))
+            stack.enter_context(private_network(self.subject.deadline_s, OPEN_GATES, quiet=True))
             self.body = stack.enter_context(made(self.subject))
             runtime = init_device_connect_sync(self.body, peer_id=PEER, link=loopback_config())
             stack.callback(stop_device_connect, runtime)
@@ -399,36 +400,3 @@ def _found(fleet: Fleet) -> RemoteRobot | None:
         return fleet[PEER]
     except RefusalError:
         return None
-
-
-@contextmanager
-def _own_settings(deadline_s: float) -> Iterator[None]:
-    """Put the user's settings aside for open gates, free ports and own state."""
-    # By its level, so that whoever configured the log keeps it: each refusal and stop of a check would fill it.
-    ours = logging.getLogger("strands_robots")
-    level = ours.level
-    with tempfile.TemporaryDirectory(prefix="conform-", ignore_cleanup_errors=True) as state:
-        values = {
-            "STRANDS_STATE_DIR": state,
-            "STRANDS_DC_PORT": str(_free_port()),
-            "STRANDS_MESH_PORT": str(_free_port()),
-            "STRANDS_HALT_DEADLINE_S": str(deadline_s),
-            **dict.fromkeys(("DEVICE_CONNECT_RPC_ALLOW", "DEVICE_CONNECT_ESTOP_ALLOW"), "*"),
-            **dict.fromkeys(("BYPASS_TOOL_CONSENT", "STRANDS_ALLOW_MOCK"), "true"),
-        }
-        with settings.only(values):
-            ours.setLevel(logging.CRITICAL + 1)
-            try:
-                yield
-            finally:
-                # What is still queued belongs into the directory that is removed.
-                flush_audit()
-                flush_sightings()
-                ours.setLevel(level)
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port

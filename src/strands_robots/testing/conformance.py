@@ -59,7 +59,7 @@ def conform(
     Raises:
         ValidationError: a check or an exemption that does not exist.
     """
-    chosen = _chosen(most, only, subject)
+    chosen = chosen_of(most, only, subject)
     results: list[CheckResult] = []
 
     def tell(result: CheckResult) -> None:
@@ -78,7 +78,7 @@ def conform(
     except Exception as exc:
         if results and not isinstance(exc, AssertionError):
             raise
-        tell(MADE.result(CheckMark.FAILED, f"it could not be served: {type(exc).__name__}: {exc}"))
+        tell(unserved(exc))
     return ConformanceReport(name, tuple(results))
 
 
@@ -106,7 +106,7 @@ def conform_live(
         ValidationError: a check that does not exist.
     """
     subject = Subject(_made_elsewhere, name=robot, motion=motion)
-    chosen = _chosen(most, only, subject)
+    chosen = chosen_of(most, only, subject)
     results: list[CheckResult] = []
 
     def tell(result: CheckResult) -> None:
@@ -122,13 +122,53 @@ def _made_elsewhere() -> object:
     raise NotProvenError("another process makes it")
 
 
-def _chosen(most: Tier, only: Iterable[str], subject: Subject) -> list[Promise]:
+def chosen_of(most: Tier, only: Iterable[str], subject: Subject) -> list[Promise]:
+    """Return the promises up to a tier; those named in ``only``, or all.
+
+    Raises:
+        ValidationError: a check or an exemption of the subject that does not exist.
+    """
     known = [each.name for each in promises()]
     wanted = frozenset(only)
     for name in (*wanted, *subject.exempt):
         if name not in known:
             raise ValidationError(f"there is no check {name}.{near(name, known)}")
     return [each for each in promises(most) if not wanted or each.name in wanted]
+
+
+class PromiseChecks:
+    """Checks of one robot, one after another.
+
+    Args:
+        check: checks a promise.
+        waits: leave out one without whose need it cannot be checked.
+    """
+
+    def __init__(self, check: Callable[[Promise], CheckResult], *, waits: bool = True) -> None:
+        self._check, self._waits = check, waits
+        self._lacking: set[str] = set()
+
+    def blocked(self, promise: Promise) -> bool:
+        """Return True for a promise without whose need it cannot be checked."""
+        return self._waits and promise.needs in self._lacking
+
+    def check(self, promise: Promise) -> CheckResult:
+        """Check a promise, or say which one it waits for."""
+        result = waiting(promise, promise.needs) if self.blocked(promise) else self._check(promise)
+        if result.mark not in GOOD:
+            self._lacking.add(promise.name)
+        return result
+
+
+def waiting(promise: Promise, needed: str) -> CheckResult:
+    """Return the result of a promise that waits for another one."""
+    said = f"{needed} is not proven, without which it cannot be checked"
+    return replace(promise.result(CheckMark.NOT_PROVEN, said), waits_for=needed)
+
+
+def unserved(problem: Exception) -> CheckResult:
+    """Return the result of a robot that could not be served."""
+    return MADE.result(CheckMark.FAILED, f"it could not be served: {type(problem).__name__}: {problem}")
 
 
 def _check_each(
@@ -141,16 +181,11 @@ def _check_each(
     waits: bool = True,
 ) -> None:
     """Check one promise after the other; ``waits`` for those that each needs."""
-    lacking = set()
+    checks = PromiseChecks(check, waits=waits)
     for each in chosen:
-        if waits and each.needs in lacking:
-            said = f"{each.needs} is not proven, without which it cannot be checked"
-            tell(replace(each.result(CheckMark.NOT_PROVEN, said), waits_for=each.needs))
-            lacking.add(each.name)
+        if checks.blocked(each):
+            tell(checks.check(each))
             continue
         checking(each.name)
-        result = check(each)
-        if result.mark not in GOOD:
-            lacking.add(each.name)
-        tell(result)
+        tell(checks.check(each))
         then()

@@ -55,6 +55,16 @@ class CheckResult:
     waits_for: str = ""
     """The check without which this one cannot be made."""
 
+    def words(self, *others: str) -> str:
+        """Return it for a person, with the names of ``others`` of which it says the same.
+
+        One that is not kept comes with its promise, why it matters and where to look.
+        """
+        lines = [f"{self.mark.upper()} {', '.join((self.check, *others))}: {self.said}"]
+        if self.mark in BAD:
+            lines += [f"  promise: {self.promise}", f"  matters: {self.why}", f"  look at: {self.look}"]
+        return "\n".join(lines)
+
 
 @dataclass(frozen=True, slots=True)
 class ConformanceReport:
@@ -88,11 +98,7 @@ class ConformanceReport:
             if marks:
                 counts = ", ".join(f"{marks.count(mark)} {mark}" for mark in CheckMark if mark in marks)
                 lines.append(f"  {each.label}: {counts}")
-        for alike in self._alike():
-            result = alike[0]
-            lines.append(f"{result.mark.upper()} {', '.join(each.check for each in alike)}: {result.said}")
-            if result.mark in BAD:
-                lines += [f"  promise: {result.promise}", f"  matters: {result.why}", f"  look at: {result.look}"]
+        lines += [first.words(*(each.check for each in others)) for first, *others in self._alike()]
         return "\n".join([*lines, *self._way_on(tier)])
 
     def _alike(self) -> list[list[CheckResult]]:

@@ -14,12 +14,12 @@ import device_connect_agent_tools as agent_tools
 import pytest
 from device_connect_agent_tools.adapters import strands as strands_tools
 from fixtures.nats_server import NatsServer
-from fixtures.scripted_model import ScriptedModel
 from fixtures.toy_robots import ToyRobot, ToyWorld
 from fixtures.waiting import eventually, eventually_async, free_port
 from strands import Agent
 
 from strands_robots.device_connect import LinkConfig, init_device_connect_sync, loopback_config, stop_device_connect
+from strands_robots.testing import ScriptedModel
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
 

@@ -12,11 +12,11 @@ from typing import Any
 
 import pytest
 from fixtures.command_line import Machine
-from fixtures.scripted_model import ScriptedModel
 from fixtures.waiting import free_port
 
 from strands_robots import Robot
 from strands_robots.device_connect import init_device_connect_sync, loopback_config, stop_device_connect
+from strands_robots.testing import ScriptedModel
 
 EXAMPLE = Path(__file__).resolve().parents[3] / "examples" / "agent_with_a_model.py"
 pytestmark = [pytest.mark.timeout(300), pytest.mark.filterwarnings("ignore::DeprecationWarning")]

@@ -6,7 +6,8 @@ import sys
 
 import pytest
 from fixtures.mcp_site import McpSite
-from fixtures.scripted_model import ScriptedModel
+
+from strands_robots.testing import ScriptedModel
 
 pytest.importorskip("mcp.server.mcpserver", reason="needs the extra mcp", exc_type=ImportError)
 

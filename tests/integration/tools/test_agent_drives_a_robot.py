@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fixtures.scripted_model import ScriptedModel
 from fixtures.toy_robots import ToyWorld
 from fixtures.waiting import eventually, free_port
 from strands import Agent
 
 from strands_robots.device_connect import init_device_connect_sync, loopback_config, stop_device_connect
+from strands_robots.testing import ScriptedModel
 from strands_robots.tools import robot_mesh
 
 

@@ -1,0 +1,54 @@
+"""Settings of a test alone: free ports and own state."""
+
+from __future__ import annotations
+
+import logging
+import socket
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+
+from strands_robots import settings
+from strands_robots.audit import flush_audit
+from strands_robots.safety.sightings import flush_sightings
+
+
+@contextmanager
+def private_network(deadline_s: float, more: Mapping[str, str], *, quiet: bool = False) -> Iterator[None]:
+    """Put the user's settings aside for free ports and own state.
+
+    It is the environment of the whole process, so one block at a time.
+
+    Args:
+        deadline_s: seconds in which a halt has to answer.
+        more: further settings.
+        quiet: log nothing of this package.
+    """
+    # By its level, so that whoever configured the log keeps it: each refusal and stop of a check would fill it.
+    ours = logging.getLogger("strands_robots")
+    level = ours.level
+    with tempfile.TemporaryDirectory(prefix="strands-robots-", ignore_cleanup_errors=True) as state:
+        values = {
+            "STRANDS_STATE_DIR": state,
+            "STRANDS_DC_PORT": str(_free_port()),
+            "STRANDS_MESH_PORT": str(_free_port()),
+            "STRANDS_HALT_DEADLINE_S": str(deadline_s),
+            **more,
+        }
+        with settings.only(values):
+            if quiet:
+                ours.setLevel(logging.CRITICAL + 1)
+            try:
+                yield
+            finally:
+                # What is still queued belongs into the directory that is removed.
+                flush_audit()
+                flush_sightings()
+                ours.setLevel(level)
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port

@@ -1,0 +1,32 @@
+"""Fixtures for pytest; an installed package has them without a conftest.
+
+pytest imports this file at its start, whatever it tests, so nothing else is imported before a fixture is used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from typing import TYPE_CHECKING
+
+import pytest
+
+if TYPE_CHECKING:
+    from strands_robots.testing.robot_lab import RobotLab
+
+
+@pytest.fixture
+def robots() -> Iterator[Callable[[int], RobotLab]]:
+    """Serve simulated robots on a private network: ``lab = robots(50)``."""
+    from strands_robots.testing import RobotLab  # noqa: PLC0415 - loads the network, which few tests need
+
+    with ExitStack() as stack:
+        served: list[RobotLab] = []
+
+        def serve(count: int = 1) -> RobotLab:
+            if served:
+                pytest.fail("robots() serves one lab in a test; ask for all robots at once.", pytrace=False)
+            served.append(stack.enter_context(RobotLab(count)))
+            return served[0]
+
+        yield serve
