@@ -41,7 +41,7 @@ FLOORS: list[set[str]] = [
         "moved",
     },
     {"safety", "audit", "adapted", "contract", "verb_declaration", "verb_parameters"},
-    {"arm_mixin", "kinematics", "policies", "teleop_mixin", "teleoperators", "recording"},
+    {"arm_mixin", "kinematics", "leader_thread", "policies", "teleop_mixin", "teleoperators", "recording"},
     {
         "hardware",
         "simulation",

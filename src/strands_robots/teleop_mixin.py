@@ -9,11 +9,12 @@ from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 from strands_robots.envelope import Envelope, error, success
+from strands_robots.leader_thread import LeaderThread
 from strands_robots.moved import of_module
 from strands_robots.policies.rollout import STOP_JOIN_S, Body, Rollout
 from strands_robots.policies.task_engine import NewTask, TaskEngine
 from strands_robots.safety.gate import Permit, answered
-from strands_robots.teleoperators import FULL_RANGES_PER_S, InputSink, LeaderPolicy
+from strands_robots.teleoperators import FULL_RANGES_PER_S, GIVE_UP_S, InputSink, LeaderPolicy
 from strands_robots.utils import ValidationError, choice, flag, identifier, number, teleoperator_contract_error
 
 if not TYPE_CHECKING:
@@ -157,7 +158,9 @@ class TeleopMixin:
         def make(body: Body, permit: Permit, _: object) -> Rollout:
             if self._teleop_leaders[name] is not attached:
                 raise ValidationError(f"{name} was attached anew while it waited for {robot}; teleoperate it again.")
-            policy = self._teleop_policies[name] = make_policy(period=1 / rate, sink=sink)
+            # A leader that hangs must hold up no stop, and no base that it has set moving.
+            thread = LeaderThread(name, GIVE_UP_S)
+            policy = self._teleop_policies[name] = make_policy(period=1 / rate, sink=sink, thread=thread)
             return Rollout(
                 body,
                 policy,

@@ -30,10 +30,12 @@ import threading
 import time
 import tty
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any, Protocol, Self, TextIO
+from typing import Any, Protocol, Self, TextIO, cast
 
 from strands_robots.errors import StrandsRobotsError
+from strands_robots.leader_thread import LeaderSilentError, LeaderThread
 from strands_robots.plug_ins import PlugIns
 from strands_robots.policies.base import Action, Ranges, checked_action, limited, numbers, speeds_across
 from strands_robots.policies.decoding import read_json
@@ -90,6 +92,7 @@ class LeaderPolicy:
         max_speed: whole joint ranges a second.
         period: control period, seconds.
         sink: receives every usable frame, as the leader gave it.
+        thread: on which the leader is read; on that of the caller by default, which waits for a read that hangs.
     """
 
     uses_cameras = False
@@ -104,6 +107,7 @@ class LeaderPolicy:
         max_speed: float = FULL_RANGES_PER_S,
         period: float = 0.02,
         sink: InputSink | None = None,
+        thread: LeaderThread | None = None,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
         self.frames = 0
@@ -118,6 +122,7 @@ class LeaderPolicy:
         self._period = period
         self._sink = sink
         self._sink_failed = False
+        self._thread = thread
         self._now = now
         self._ranges: Ranges = {}
         self._speeds: dict[str, float] | None = None
@@ -138,10 +143,13 @@ class LeaderPolicy:
     def act(self, observation: Mapping[str, Any]) -> Action | list[Action] | None:
         now = self._now()
         try:
-            frame = mapping("leader action", self._leader.get_action())
+            frame = mapping("leader action", self._read(self._leader.get_action))
             target = checked_action({self._keys.get(key, key): value for key, value in frame.items()}, self._ranges)
         except LeaderFinished:
             return None
+        except LeaderSilentError as exc:
+            self.last_error = str(exc)
+            raise
         except Exception as exc:
             self.errors += 1
             self.last_error = f"{type(exc).__name__}: {exc}"
@@ -160,10 +168,17 @@ class LeaderPolicy:
         return {key: self._last[key] for key in target}
 
     def interrupt(self) -> None:
-        """Do nothing: a leader's read cannot be interrupted."""
+        """Wait no more for a read on the leader's own thread; no other is interrupted."""
+        if self._thread is not None:
+            self._thread.interrupt()
 
     def close(self) -> None:
-        """Do nothing: the leader stays connected for its owner."""
+        """End the leader's thread; the leader stays connected for its owner."""
+        if self._thread is not None:
+            self._thread.close()
+
+    def _read(self, read: Callable[[], Any]) -> Any:
+        return read() if self._thread is None else self._thread.read(read)
 
     def _publish(self, frame: Mapping[str, Any]) -> None:
         if self._sink is None:
@@ -177,7 +192,7 @@ class LeaderPolicy:
 
     def events(self) -> dict[str, Any] | None:
         """Return the leader's events, or None; raises the leader's exceptions."""
-        return teleop_events(self._leader)
+        return cast("dict[str, Any] | None", self._read(partial(teleop_events, self._leader)))
 
     def _readable_events(self) -> dict[str, Any] | None:
         try:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import pytest
@@ -14,6 +14,7 @@ from fixtures.leaders import ScriptedLeader
 from fixtures.waiting import eventually
 
 from strands_robots.hardware import HardwareRobot
+from strands_robots.safety.stop_executor import stop_executor
 from strands_robots.teleoperators import LeaderPolicy
 
 WAVES = {"pan.pos": (20.0, 50.0, 1.0), "lift.pos": (20.0, 50.0, 1.0)}
@@ -125,7 +126,9 @@ def test_occasional_bad_frame_is_counted_and_not_applied(robot: HardwareRobot) -
     assert robot.teleop_status()["running"] == ["leader"]
 
 
-def test_leader_whose_read_hangs_is_reported_as_not_stopped(robot: HardwareRobot) -> None:
+@pytest.fixture
+def hanging() -> Iterator[tuple[Leader, threading.Event]]:
+    """A leader whose read hangs, and the event of its first read; it returns a target at the end of the test."""
     free, hangs = threading.Event(), threading.Event()
 
     def hang() -> dict[str, float]:
@@ -133,14 +136,43 @@ def test_leader_whose_read_hangs_is_reported_as_not_stopped(robot: HardwareRobot
         free.wait(60)
         return {"pan.pos": 99.0}
 
-    robot.attach_teleop(Leader(hang))
+    yield Leader(hang), hangs
+    free.set()
+
+
+Stop = Callable[[HardwareRobot], bool | None]
+
+
+@pytest.mark.parametrize(
+    "stop",
+    [
+        lambda robot: robot.stop_teleoperate(timeout=20)["stopped"],
+        lambda robot: robot.halt("stop").stopped,
+        lambda robot: stop_executor().submit(robot, "arm", "stop").result(20).stopped,
+    ],
+    ids=["stop_teleoperate", "halt", "executor"],
+)
+def test_stop_waits_for_no_leader_whose_read_hangs(
+    robot: HardwareRobot, hanging: tuple[Leader, threading.Event], stop: Stop
+) -> None:
+    leader, hangs = hanging
+    robot.attach_teleop(leader)
     robot.teleoperate()
     assert hangs.wait(20)
-    answer = robot.stop_teleoperate(timeout=0.05)
-    assert (answer["status"], answer["stopped"]) == ("error", False)
-    free.set()
-    eventually(lambda: not robot.teleop_status()["running"])
+    assert stop(robot) is True
+    assert not robot.teleop_status()["running"]
     assert all(write.action["pan.pos"] != 99.0 for write in robot.device.writes)
+
+
+def test_leader_whose_read_hangs_ends_its_teleoperation_and_the_follower_stops(
+    robot: HardwareRobot, hanging: tuple[Leader, threading.Event]
+) -> None:
+    robot.attach_teleop(hanging[0])
+    robot.teleoperate()
+    eventually(lambda: not robot.teleop_status()["running"])
+    row = robot.teleop_status()["leaders"]["leader"]
+    assert (row["state"], "leader has not answered for 0.5 s" in row["error"]) == ("error", True)
+    assert [write.action for write in robot.device.writes] == [dict.fromkeys(robot.device.positions, 10.0)]
 
 
 def test_frames_go_to_the_network_on_publish(robot: HardwareRobot) -> None:
