@@ -441,3 +441,12 @@ def test_the_first_that_a_stop_asks_of_a_robot_is_its_halt(executor: StopExecuto
     asked.clear()
     assert executor.halt(robot, "watched", "fire").stopped is True
     assert asked[0] == "halt"
+
+
+def test_gate_keeps_the_newest_stop_with_its_reason_and_its_verdict() -> None:
+    robot = Wedged(times=0)
+    halted = stop_executor().submit(robot, "arm-1", "stop by alice")
+    newest = robot.gate.newest_stop
+    assert newest is not None
+    assert newest.reason == "stop by alice"
+    assert newest.verdict.result(20) is halted.result(20)

@@ -40,7 +40,7 @@ from strands_robots.serving.control import ControlChange
 from strands_robots.serving.offered_verbs import Offers, own_verbs
 from strands_robots.serving.pipeline import Command, Pipeline, Result, busy
 from strands_robots.serving.policy_arguments import profile_list
-from strands_robots.serving.stop_arguments import noted
+from strands_robots.serving.stop_arguments import noted, stop_of
 from strands_robots.serving.stops import stop_within
 from strands_robots.serving.verbs import Arguments, Kind, Verb, described, labels_of, text_of
 from strands_robots.serving.workers import ShareFullError, called, loop_future
@@ -185,8 +185,7 @@ class RobotDriver(CollectedOnce):
         own = self.own_verbs.get(function_name)
         verb = own or self.verbs.get(function_name)
         if verb is not None and verb.kind is Kind.STOP and function_name in self.built_verbs:
-            params.pop("source_device", None)
-            return await self._stop(verb, params)
+            return await self._stop(verb, params, params.pop("source_device", None))
         ours = own is not None or (function_name in self.built_verbs and not (observable and observed(self)))
         if verb is None or not ours:
             if verb is not None:
@@ -252,7 +251,7 @@ class RobotDriver(CollectedOnce):
         """Return the answer to ``stop`` for a verdict."""
         return verdict.envelope()
 
-    async def _stop(self, verb: Verb, given: Mapping[str, Any]) -> Envelope:
+    async def _stop(self, verb: Verb, given: Mapping[str, Any], caller: object) -> Envelope:
         arguments, ignored = verb.readable(given)
         name = arguments.get("robot_name", "")
         self.pipeline.pending.void(name)
@@ -260,7 +259,8 @@ class RobotDriver(CollectedOnce):
             target = self.stop_target(name)
         except ValidationError as unknown:
             return enveloped("stop", self.stop_envelope(StopVerdict(not_stopped={name: str(unknown)})))
-        return noted(await self.stop_answer(verb.name, target, name), ignored)
+        reason = stop_of(verb.name, caller_name(caller))
+        return noted(await self.stop_answer(reason, target, name), ignored)
 
     async def stop_answer(self, reason: str, target: Haltable | None = None, name: str = "") -> Envelope:
         """Halt and answer within the halt deadline, for any caller."""

@@ -22,6 +22,7 @@ from strands_robots.safety.statements import with_stop_statement
 from strands_robots.safety.stopping import Outcome, StopVerdict, explain, grade
 from strands_robots.serving.peer_verbs import PEER_VERBS, peer_stop_answer, run_to_end
 from strands_robots.serving.pipeline import Command, Own, Pipeline, Result, busy
+from strands_robots.serving.stop_arguments import stop_of
 from strands_robots.serving.stops import Request as StopRequest
 from strands_robots.serving.stops import StopRequests, robot_stop, stop_within
 from strands_robots.serving.verbs import Arguments, Kind, Verb
@@ -302,7 +303,13 @@ class CommandReceiver:
         if target is None:
             self._answer_stops(StopVerdict(), [asker])
         else:
-            self.stops.add(target, name or self._context.peer_id, HALT, asker, within=stop_within(target))
+            self.stops.add(
+                target,
+                name or self._context.peer_id,
+                stop_of(HALT, request.sender_id),
+                asker,
+                within=stop_within(target),
+            )
 
     def _answer_stops(self, verdict: StopVerdict, requests: list[StopRequest]) -> None:
         self._after_stop()

@@ -16,9 +16,10 @@ import functools
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
-from typing import Literal, ParamSpec, Protocol, TypeVar
+from typing import Any, Literal, NamedTuple, ParamSpec, Protocol, TypeVar
 
 from strands_robots.envelope import Envelope, error
 from strands_robots.errors import StrandsRobotsError
@@ -215,6 +216,18 @@ class Waiting:
                 permit.withdraw()
 
 
+class OrderedStop(NamedTuple):
+    """A stop that the stop executor carries out.
+
+    Attributes:
+        reason: what it was ordered for, such as by whom.
+        verdict: is set to the robot's :class:`~strands_robots.safety.stopping.StopVerdict`, in time.
+    """
+
+    reason: str
+    verdict: Future[Any]
+
+
 class MotionGate:
     """Gate of one robot; thread-safe.
 
@@ -222,6 +235,7 @@ class MotionGate:
         generation: rises with every halt; permits of an older one are void.
         given: rises with every permit that is given. A settling begins only where none was given since its halt.
         under_way: the robot's own verbs that have not returned.
+        newest_stop: the last stop that was ordered, by whomever; None before the first one.
     """
 
     def __init__(self, latch: Latch | None = None, awake: AwakeClock = AWAKE) -> None:
@@ -235,6 +249,7 @@ class MotionGate:
         self._watchers: tuple[Callable[[], None], ...] = ()
         self.given = 0
         self.under_way = VerbsUnderWay()
+        self.newest_stop: OrderedStop | None = None
 
     @property
     def held(self) -> bool:

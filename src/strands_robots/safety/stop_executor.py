@@ -23,6 +23,7 @@ from concurrent.futures import Future
 from typing import cast
 
 from strands_robots import settings
+from strands_robots.safety.gate import OrderedStop
 from strands_robots.safety.stop_targets import (
     Answered,
     Haltable,
@@ -180,7 +181,7 @@ class StopExecutor:
             stop.future.add_done_callback(lambda future: answered(future.result()))
         if not voided:
             note_motion(target)
-        stop.verbs = void_calls(target)
+        stop.verbs = void_calls(target, OrderedStop(reason, stop.future))
         if not voided and (stop.direct or slot.halts.running is not None):
             # The halt of any other target voids permits itself, after it has seen what moves, unless it has to wait.
             revoke_permits(target)

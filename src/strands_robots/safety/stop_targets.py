@@ -12,7 +12,7 @@ from concurrent.futures import Future, InvalidStateError
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Protocol, cast, runtime_checkable
 
-from strands_robots.safety.gate import MotionGate, VerbCall, VerbsUnderWay, kept_gate
+from strands_robots.safety.gate import MotionGate, OrderedStop, VerbCall, VerbsUnderWay, kept_gate
 from strands_robots.safety.stopping import ForeignAnswer, PendingVerdict, StopVerdict, graded, read_verdict
 from strands_robots.stop_log import stop_logger
 
@@ -190,8 +190,8 @@ class StopOfRobot:
         raise NotImplementedError
 
 
-def under_way_of(target: object) -> VerbsUnderWay | None:
-    """Return the own verbs of what is stopped; None where it has no gate of ours.
+def known_gate(target: object) -> MotionGate | None:
+    """Return the gate of what is stopped; None where it has none of ours.
 
     No code of the robot's own is run: it may hang, and a stop follows.
     """
@@ -201,14 +201,25 @@ def under_way_of(target: object) -> VerbsUnderWay | None:
         gate = object.__getattribute__(robot, "__dict__").get("gate")
     except AttributeError:
         gate = None
-    known = cast(MotionGate, gate) if issubclass(type(gate), MotionGate) else kept_gate(robot)
+    return cast(MotionGate, gate) if issubclass(type(gate), MotionGate) else kept_gate(robot)
+
+
+def under_way_of(target: object) -> VerbsUnderWay | None:
+    """Return the own verbs of what is stopped; None where it has no gate of ours."""
+    known = known_gate(target)
     return None if known is None else known.under_way
 
 
-def void_calls(target: object) -> tuple[VerbCall, ...]:
-    """Void the permits of the own verbs that run on ``target``; return their calls."""
-    under_way = under_way_of(target)
-    calls = () if under_way is None else under_way.calls
+def void_calls(target: object, stop: OrderedStop | None = None) -> tuple[VerbCall, ...]:
+    """Void the permits of the own verbs that run on ``target``; return their calls.
+
+    Args:
+        stop: which the gate keeps as its newest; None for one that is noted already.
+    """
+    known = known_gate(target)
+    if known is not None and stop is not None:
+        known.newest_stop = stop
+    calls = () if known is None else known.under_way.calls
     for each in calls:
         each.void()
     return calls

@@ -30,6 +30,11 @@ def stop_reason(value: object) -> tuple[str, str]:
     return said, "" if value.isprintable() else "characters of reason that cannot be printed"
 
 
+def stop_of(verb: str, caller: str | None) -> str:
+    """Return the reason of a stop: the verb, and the name that the caller states."""
+    return f"{verb} by {caller}" if caller else verb
+
+
 def stop_robot(name: str, value: object) -> tuple[str, str]:
     """Return the id of the robot that a stop means, empty for all, and a note.
 
