@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
 from fixtures.leaders import write_csv
 from tests.cli.conftest import Run
 
@@ -22,13 +23,13 @@ def test_recording_leads_a_simulated_arm_to_its_end(run: Run, tmp_path: Path) ->
 
 def test_unusable_leader_is_refused_by_name(run: Run, tmp_path: Path) -> None:
     for leader, reason in (("no-such-leader", "recording"), (str(tmp_path / "none.csv"), "cannot be read")):
-        result = run("teleop", leader, "so100", "--json")
+        result = run("teleop", leader, "so100", "--no-network", "--json")
         assert result.exit_code == 2
         assert reason in json.loads(result.stdout)["reason"]
 
 
 def test_keyboard_is_refused_without_a_terminal(run: Run) -> None:
-    result = run("teleop", "keyboard", "so100", "--json")
+    result = run("teleop", "keyboard", "so100", "--no-network", "--json")
     assert result.exit_code != 0
 
 
@@ -53,3 +54,24 @@ def test_refused_option_is_not_reported_as_unknown_follower(run: Run, tmp_path: 
     reason = json.loads(result.stdout)["reason"]
     assert "safety" in reason
     assert "Device Connect" not in reason
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (("so100", "--no-network", "--peer-id", "arm-1"), "--no-network goes without --peer-id"),
+        (("so100", "--no-network", "--mesh"), "--no-network goes without"),
+        (("so100", "--peer-id", "arm-1", "--publish", "lead-1"), "arm-1 and lead-1 are two"),
+        (("so100", "--peer-id", "arm.1"), "arm.1"),
+        (("mesh:arm-1", "--peer-id", "arm-2"), "not for mesh:arm-1"),
+        (("mesh:arm-1", "--no-network"), "not for mesh:arm-1"),
+    ],
+    ids=" ".join,
+)
+def test_flags_of_the_network_that_exclude_one_another_are_refused(
+    run: Run, tmp_path: Path, arguments: tuple[str, ...], reason: str
+) -> None:
+    write_csv(tmp_path / "run.csv", [(0.0, {"shoulder_pan": 0.0})])
+    result = run("teleop", str(tmp_path / "run.csv"), *arguments, "--json")
+    assert result.exit_code == 2
+    assert reason in json.loads(result.stdout)["reason"]

@@ -23,9 +23,10 @@ import typer
 from strands_robots import settings
 from strands_robots.adapted import adapt
 from strands_robots.cli.app import assignments, parse_ports
-from strands_robots.cli.network import Network, mesh_peer
+from strands_robots.cli.network import Network
 from strands_robots.cli.output import CliError, Screen
-from strands_robots.cli.readiness import mesh_port_problem, mesh_problems, shortcomings
+from strands_robots.cli.own_robot import device_of, peer_of
+from strands_robots.cli.readiness import mesh_problems, shortcomings
 from strands_robots.cli.record import record_robot
 from strands_robots.contract import put_away
 from strands_robots.envelope import text_of
@@ -35,7 +36,6 @@ from strands_robots.policies import warm_profiles
 from strands_robots.policies.base import SPEED_MAX
 from strands_robots.policies.profiles import load_profiles
 from strands_robots.safety.authorization import listed, motion_refusal
-from strands_robots.safety.sightings import DuplicateDeviceError
 from strands_robots.tags import own_tags
 from strands_robots.utils import (
     ValidationError,
@@ -426,13 +426,7 @@ def _serve(screen: Screen, body: Any, served: AbstractContextManager[str], *, pi
 
 @contextmanager
 def _on_mesh(screen: Screen, network: Network, body: Any, peer_id: str | None, peer_type: str) -> Iterator[str]:
-    with ExitStack() as joined:
-        try:
-            mesh = joined.enter_context(mesh_peer(body, peer_id, peer_type))
-        except DuplicateDeviceError as exc:
-            raise CliError(f"The robot is not on the network: {exc}") from exc
-        except CliError as exc:
-            raise CliError(f"{exc} {mesh_port_problem(answers=False)}".strip(), exc.code) from exc
+    with peer_of(body, peer_id, peer_type) as mesh:
         lacking = mesh_problems()
         facts = {"peer_id": mesh.peer_id, "network": "mesh", "pid": os.getpid(), "not_ready": lacking}
         screen.data({"event": "serving", **facts})
@@ -448,24 +442,9 @@ def _on_mesh(screen: Screen, network: Network, body: Any, peer_id: str | None, p
 def _on_device_connect(
     screen: Screen, network: Network, link: LinkConfig, body: Any, peer_id: str | None
 ) -> Iterator[str]:
-    from strands_robots import device_connect  # noqa: PLC0415 - loaded when it is used
-    from strands_robots.device_connect.bringup import default_id, driver_for  # noqa: PLC0415 - as above
-
-    driver = driver_for(body, "robot")
-    try:
-        runtime = device_connect.init_device_connect_sync(
-            driver,
-            peer_id=peer_id or default_id(body),
-            link=link,
-            allow_insecure=True if network.stated.opted_in else None,
-        )
-    except (device_connect.DuplicateDeviceError, TimeoutError, OSError) as exc:
-        raise CliError(f"The robot is not on the network: {exc}") from exc
-    try:
-        _announce(screen, str(runtime.device_id), link, driver)
-        yield str(runtime.device_id)
-    finally:
-        device_connect.stop_device_connect(runtime)
+    with device_of(network, link, body, peer_id) as (own_id, driver):
+        _announce(screen, own_id, link, driver)
+        yield own_id
 
 
 def _announce(screen: Screen, peer_id: str, link: LinkConfig, driver: DeviceDriver) -> None:

@@ -15,7 +15,8 @@ import typer
 from rich.control import Control
 
 from strands_robots.cli.app import Seconds
-from strands_robots.cli.network import mesh_peer
+from strands_robots.cli.led_robot import LedRobot, Serving, halted_first, served
+from strands_robots.cli.network import Network, mesh_peer
 from strands_robots.cli.output import POLL_S, CliError, Exit, Screen, table, wait_until
 from strands_robots.cli.record import record_robot
 from strands_robots.envelope import is_error, text_of
@@ -38,6 +39,8 @@ _NAME = "leader"
 _MANUAL = ("keyboard", "gamepad")
 FollowerId = Annotated[str | None, typer.Option("--id", help="Calibration id of the follower.")]
 Calibration = Annotated[Path | None, typer.Option("--calibration", help="Calibration file of the follower.")]
+PeerId = Annotated[str | None, typer.Option("--peer-id", help="Id of the follower on the network.")]
+NoNetwork = Annotated[bool, typer.Option("--no-network", help="Lead it on no network: only Ctrl-C stops it.")]
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +82,7 @@ class NoFollower:
 
 def teleop(
     screen: Screen,
+    network: Network,
     *,
     leader: Annotated[
         str,
@@ -104,25 +108,30 @@ def teleop(
         str | None, typer.Option("--publish", help="Also let others follow, on the mesh as this PEER.", metavar="PEER")
     ] = None,
     record: Annotated[Path | None, typer.Option("--record", help="Also record the follower: a new .mcap.")] = None,
+    peer_id: PeerId = None,
+    no_network: NoNetwork = False,
 ) -> None:
-    """Let a leader drive a follower until it ends or Ctrl-C, which stops the follower first."""
+    """Let a leader drive a follower, served meanwhile, until it ends or Ctrl-C."""
     arm = _arm_options("", follower_id, calibration)
+    remote = "" if leader.startswith(MESH_PREFIX) else publish
+    how = _how_served(network, follower, peer_id, remote, alone=no_network)
     options = TeleopOptions(leader if leader in _MANUAL else "arm", seconds, hz, max_speed)
     if leader.startswith(MESH_PREFIX):
         if follower.startswith(MESH_PREFIX) or publish is not None:
             raise ValidationError("a leader of the mesh leads a follower of this machine, and publishes itself.")
         peer = identifier("leader", leader.removeprefix(MESH_PREFIX))
-        _follow(screen, peer, follower, arm, options=options, record=record)
+        _follow(screen, peer, follower, arm, how=how, options=options, record=record)
         return
 
     def connected(robot: Any) -> AbstractContextManager[Any]:
         return _connected_leader(leader, robot, _arm_options("", leader_id, leader_calibration))
 
-    _drive(screen, leader, follower, connected, arm, options=options, publish=publish, record=record)
+    _drive(screen, leader, follower, connected, arm, how=how, options=options, publish=publish, record=record)
 
 
 def replay(
     screen: Screen,
+    network: Network,
     *,
     file: Annotated[Path, typer.Argument(help="A recording: .mcap, .csv or .parquet.")],
     to: Annotated[str, typer.Option("--to", help="TYPE@PORT of a real arm, a model, or mesh:PEER.")],
@@ -130,11 +139,14 @@ def replay(
     follower_id: FollowerId = None,
     calibration: Calibration = None,
     speed: Annotated[float, typer.Option("--speed", help="Times as fast, at most 10.")] = 1.0,
+    peer_id: PeerId = None,
+    no_network: NoNetwork = False,
 ) -> None:
     """Play the recorded actions of a device to a follower, here or on the mesh, and stop it at the end."""
     leader = _recorded_leader(file, device, speed)
     arm = _arm_options("", follower_id, calibration)
-    _drive(screen, file.name, to, lambda _: nullcontext(leader), arm, options=TeleopOptions())
+    how = _how_served(network, to, peer_id, None, alone=no_network)
+    _drive(screen, file.name, to, lambda _: nullcontext(leader), arm, how=how, options=TeleopOptions())
 
 
 def calibrate(
@@ -178,6 +190,7 @@ def _drive(
     connected: Callable[[Any], AbstractContextManager[Any]],
     arm: dict[str, Any],
     *,
+    how: Serving,
     options: TeleopOptions,
     publish: str | None = None,
     record: Path | None = None,
@@ -201,59 +214,90 @@ def _drive(
         with connected(NoFollower()) as source:
             _publish(screen, leader, peer, source, options)
         return
-    on_mesh = {} if publish is None else {"peer_id": identifier("--publish", publish), "mesh": True}
-    with _made_follower(screen, follower, arm, record, publish, **on_mesh) as robot, connected(robot) as source:
+    with (
+        _made_follower(screen, follower, arm, record, how) as led,
+        connected(led.robot) as source,
+        halted_first(led.robot),
+    ):
+        robot = led.robot
         _check_keys(follower, source, robot.body().bounds)
-        for answer in (
-            robot.attach_teleop(source, _NAME, method=options.method, max_speed=options.max_speed),
-            robot.teleoperate(_NAME, duration=options.seconds, hz=options.hz, publish=publish is not None),
-        ):
-            if is_error(answer):
-                raise CliError(text_of(answer))
+        _begin(screen, led, leader, source, options, publish=publish is not None)
+        session = robot.tasks.by_leader[_NAME]
         _announce(screen, leader, follower, source)
         if publish is not None:
             screen.say(f"Others may follow {publish}/{_NAME} on the mesh.")
         wait_until(
             screen,
-            lambda: "" if _NAME in robot.teleoperating() else "It has ended.",
+            lambda: "" if session.running and not session.voided else "It has ended.",
             getattr(source, "duration", None) or 0.0,
         )
-        verdict = _stop(screen, robot)
+        verdict, why = _ended(screen, led, stopped=led.stopped)
         row: dict[str, Any] = robot.teleop_status()["leaders"][_NAME]
-    screen.data({"event": "ended", **row, "stopped": verdict.stopped})
+    screen.data({"event": "ended", **row, "stopped": verdict.stopped, **({"stopped_by": why} if why else {})})
     if row["state"] == "error":
         raise CliError(f"The teleoperation failed: {row['error']}", **row)
     screen.say(f"{row['state'].capitalize()} after {row['step']} frames, {row['errors']} of them unusable.", "green")
-    _check_stopped(verdict)
+    _check_stopped(verdict, why)
+
+
+def _begin(screen: Screen, led: LedRobot, leader: str, source: Any, options: TeleopOptions, *, publish: bool) -> None:
+    """Let the leader lead from the robot's present position.
+
+    Raises:
+        CliError: it was refused. A locked robot stays on the network before, so that its resume reaches it.
+    """
+    robot = led.robot
+    with led.held_by(leader if "@" in leader else Path(leader).name, lambda: _NAME in robot.teleoperating()):
+        for answer in (
+            robot.attach_teleop(source, _NAME, method=options.method, max_speed=options.max_speed),
+            robot.teleoperate(_NAME, duration=options.seconds, hz=options.hz, publish=publish),
+        ):
+            if is_error(answer):
+                if led.peer_id and led.locked:
+                    led.hold(screen)
+                raise CliError(text_of(answer))
+
+
+def _ended(screen: Screen, led: LedRobot, *, stopped: bool) -> tuple[StopVerdict, str]:
+    """Halt the robot at the end; return the verdict, and who stopped it before.
+
+    Args:
+        stopped: by a caller of the network; then it is halted already, and stays there until Ctrl-C.
+    """
+    if not stopped:
+        return _stop(screen, led.robot), ""
+    why = led.stopped_by
+    verdict = led.hold(screen)
+    return verdict or _stop(screen, led.robot), why
 
 
 def _follow(
-    screen: Screen, peer: str, follower: str, arm: dict[str, Any], *, options: TeleopOptions, record: Path | None
+    screen: Screen,
+    peer: str,
+    follower: str,
+    arm: dict[str, Any],
+    *,
+    how: Serving,
+    options: TeleopOptions,
+    record: Path | None,
 ) -> None:
     """Let a leader published on the mesh drive a follower of this machine."""
-    from strands_robots.fleet.mesh.leading import DEVICE, followed  # noqa: PLC0415 - loaded when the network is used
+    from strands_robots.fleet.mesh.leading import DEVICE, FollowedPeer, followed  # noqa: PLC0415 - loaded when the network is used
 
-    with _made_follower(screen, follower, arm, record, mesh=True, peer_id=_temporary_mesh_id("follow")) as robot:
-        with _refused(), followed(robot, peer, options.max_speed) as leading:
+    with _made_follower(screen, follower, arm, record, how) as led, halted_first(led.robot):
+        robot, leaders = led.robot, list[FollowedPeer]()
+        with _refused(), ExitStack() as stack:
+            with led.held_by(peer, lambda: bool(leaders)):
+                leaders.append(stack.enter_context(followed(robot, peer, options.max_speed)))
+            leading = leaders[0]
             _announce(screen, f"{peer}/{DEVICE}", robot.tool_name_str, leading)
             why, stats = wait_until(screen, options.timed(leading.over)), leading.stats
-        verdict = _stop(screen, robot)
+        verdict, by = _ended(screen, led, stopped=led.stopped)
     row = {key: stats[key] for key in ("frames_received", "errors", "rejected", "slew_rejected", "rate_dropped")}
-    screen.data({"event": "ended", **row, "why": why, "stopped": verdict.stopped})
-    _check_stopped(verdict)
+    screen.data({"event": "ended", **row, "why": why, "stopped": verdict.stopped, **({"stopped_by": by} if by else {})})
+    _check_stopped(verdict, by)
     left_out = row["errors"] + row["rejected"] + row["slew_rejected"] + row["rate_dropped"]
     screen.say(f"{why} {row['frames_received']} frames arrived, {left_out} of them were not applied.", "green")
-
-
-def _temporary_mesh_id(name: str) -> str:
-    """Return a fresh mesh id for one command, covered by its certificate, if any."""
-    from strands_robots.mesh.transport import TransportError  # noqa: PLC0415 - loaded when a network is used
-    from strands_robots.mesh.wire_identity import IdentityError, visitor_id  # noqa: PLC0415 - as above
-
-    try:
-        return visitor_id(name)
-    except (TransportError, IdentityError) as exc:
-        raise CliError(str(exc), Exit.USAGE) from exc
 
 
 def _lead_peer(
@@ -346,32 +390,49 @@ def _refused() -> Iterator[None]:
         raise CliError(str(refusal), Exit.SILENT if silent else Exit.REFUSED) from refusal
 
 
+def _how_served(network: Network, follower: str, peer_id: str | None, on_mesh: str | None, *, alone: bool) -> Serving:
+    """Return how a follower of this machine is served."""
+    if not follower.startswith(MESH_PREFIX) and follower != NO_FOLLOWER:
+        return Serving.of(network, peer_id, on_mesh, alone=alone)
+    if alone or peer_id is not None:
+        raise ValidationError(f"--peer-id and --no-network are for a follower of this machine, not for {follower}.")
+    if network.flags:
+        network.use_mesh()
+    return Serving(network)
+
+
 @contextmanager
 def _made_follower(
-    screen: Screen, follower: str, arm: dict[str, Any], record: Path | None, name: str | None = None, **more: Any
-) -> Iterator[Any]:
-    """Make and record the follower, ``TYPE@PORT`` or a model; halt it at the end."""
-    from strands_robots.robot import NO_SUCH_MODEL, Robot  # noqa: PLC0415 - heavy, and needed by these commands alone
+    screen: Screen, follower: str, arm: dict[str, Any], record: Path | None, how: Serving
+) -> Iterator[LedRobot]:
+    """Make, serve and record ``TYPE@PORT`` or a model; halt it at the end."""
+    from strands_robots.robot import NO_SUCH_MODEL, Robot, counts_as_hardware  # noqa: PLC0415 - heavy, and needed by these commands alone
 
     kind, at, port = follower.partition("@")
+    how.check()
     try:
-        robot: Any = Robot(kind, mode="real" if at else "sim", **more, **({**arm, "port": port} if at else {}))
+        robot: Any = Robot(kind, mode="real" if at else "sim", mesh=False, **({**arm, "port": port} if at else {}))
     except ValidationError as exc:
         if exc.code != NO_SUCH_MODEL or "/" in kind or "." in kind:
             raise
         hint = "A device of Device Connect takes no frames; serve its robot on the mesh too, and name it mesh:PEER."
         raise ValidationError(f"{exc} {hint}") from exc
     try:
-        with record_robot(screen, robot, name or robot.tool_name_str, record):
-            yield robot
+        with served(screen, robot, how, "real" if at or counts_as_hardware(kind) else "sim") as led:
+            try:
+                with record_robot(screen, robot, how.peer_id or robot.tool_name_str, record):
+                    yield led
+            finally:
+                # On the network still: a stop reaches it until it stands.
+                robot.halt("teleop ended")
     finally:
-        robot.halt("teleop ended")
         robot.cleanup()
 
 
 def _stop(screen: Screen, robot: Any) -> StopVerdict:
-    screen.say("Stopping the follower...")
+    # A terminal that takes no more output must not delay it.
     verdict: StopVerdict = robot.halt("teleop ended")
+    screen.say("Stopping the follower...")
     if verdict.stopped:
         screen.say("The follower stands still.", "green")
     if verdict.settling:
@@ -379,9 +440,11 @@ def _stop(screen: Screen, robot: Any) -> StopVerdict:
     return verdict
 
 
-def _check_stopped(verdict: StopVerdict) -> None:
+def _check_stopped(verdict: StopVerdict, stopped_by: str) -> None:
     if not verdict.stopped:
         raise CliError(f"The follower did not confirm its stop: {text_of(verdict.envelope())}")
+    if stopped_by:
+        raise CliError(f"Stopped from the network: {stopped_by}")
 
 
 @contextmanager

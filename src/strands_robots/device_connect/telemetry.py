@@ -417,7 +417,8 @@ class StateReports:
         device, self._looking = self._device, self._looking + 1
         try:
             activity = await called(device.pipeline.shares.read, glance, READ_DEADLINE_S)
-            return replace(activity, busy=True) if device.robot.gate.under_way else activity
+            # A verb of its own and a leader are no task, and move it all the same.
+            return replace(activity, busy=True) if device.robot.gate.under_way or self._rolling else activity
         except Exception as exc:  # noqa: BLE001 - whatever a robot's read raises is its state to tell
             fault = f"{type(exc).__name__}: {exc}"
             if fault != self.activity.fault:

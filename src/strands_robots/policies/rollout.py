@@ -213,6 +213,11 @@ class Rollout:
         return self.state == "running" or self._thread.is_alive()
 
     @property
+    def voided(self) -> bool:
+        """True once it was stopped or halted: it moves nothing more; its loop may run."""
+        return not self._permit.valid
+
+    @property
     def elapsed_s(self) -> float:
         """Seconds since the start, or the time it took."""
         if self._started_at is None:

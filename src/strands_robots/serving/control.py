@@ -355,14 +355,14 @@ class ControlLease:
         self._give_way(holder)
         self._settle()
         leader = self._led_by()
-        if leader:
-            # Whoever sits at the robot must not be halted by a lease that ends.
-            text = f"acquireControl is refused: {leader} ({HUMAN}) leads it at its own machine."
-            raise NotHolderError(text, "not_holder", holder=leader, kind=HUMAN)
         with self._changing:
             lease = self._lease
             if lease is not None and not _owns(lease, holder, lease_id):
                 raise self._not_holder("acquireControl", lease)
+            if leader:
+                # Whoever sits at the robot must not be halted by a lease that ends.
+                text = f"acquireControl is refused: {leader} ({HUMAN}) leads it at its own machine."
+                raise NotHolderError(text, "not_holder", holder=leader, kind=HUMAN)
             given = self._give(holder, kind, ttl_s)
             answer = self._answer(given, self.epoch)
         self._tell("acquired", given)

@@ -166,7 +166,10 @@ class ControlLeases:
         if any(each.leading() for each in self._streams_of(name)):
             return True
         robot = self._robot()
-        return False if robot is None else task_runs(robot, name)
+        if robot is None:
+            return False
+        # A leader at this machine is no task.
+        return bool(self._led_by(name)) or task_runs(robot, name)
 
     def _halt(self, name: str, shown_as: str, reason: str) -> Future[StopVerdict] | None:
         """Order the halt of the robot, or of the named robot of the world."""

@@ -6,6 +6,7 @@ import itertools
 import json
 import math
 import os
+import signal
 import sys
 import threading
 import time
@@ -14,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fixtures.command_line import on_a_terminal
+from fixtures.command_line import Machine, on_a_terminal
 from fixtures.feetech_bus import MOTORS, FeetechBus, arm_calibration, arm_servos
 from fixtures.waiting import eventually
 from typer.testing import CliRunner
@@ -204,3 +205,36 @@ def test_an_arm_is_calibrated_at_a_terminal(fresh: FeetechBus, machine: bool) ->
 
 def test_the_calibration_of_the_fixture_is_lerobots_own_shape() -> None:
     assert set(arm_calibration()) == set(MOTORS)
+
+
+def test_led_arm_is_stopped_from_the_network(bus: FeetechBus, calibration: Path, tmp_path: Path) -> None:
+    machine = Machine(tmp_path / "state")
+    with FeetechBus(arm_servos(), link=tmp_path / "leader") as leader:
+        files = ["--calibration", str(calibration), "--leader-calibration", str(calibration)]
+        words = ["teleop", f"so101@{leader.port}", f"so101@{bus.port}", *files, "--peer-id", "arm-1", "--json"]
+        patient = [sys.executable, "-m", "fixtures.feetech_bus.patient", "strands_robots.cli", *words]
+        with on_a_terminal(patient, machine.environment) as terminal:
+            pan, ended = leader.servos[1], threading.Event()
+
+            def wave() -> None:
+                start = pan.shaft
+                while not ended.wait(0.02):
+                    pan.shaft = start + 400 * math.sin(time.monotonic())
+
+            by_hand = threading.Thread(target=wave)
+            by_hand.start()
+            try:
+                eventually(lambda: len(bus.written_after(0.0, "goal_position")) > 100, within=60, what="a led arm")
+                code, said = machine.json("stop", "arm-1")
+                assert code == 0, said
+                stopped_at = time.monotonic()
+                # The leader goes on waving while this command runs.
+                machine.run("peers")
+                assert not bus.written_after(stopped_at, "goal_position")
+                assert all(servo.torque for servo in bus.servos.values()), "it keeps its position"
+                assert '"event": "held"' in terminal.drawn
+                terminal.process.send_signal(signal.SIGINT)
+                assert terminal.process.wait(60) == 1
+            finally:
+                ended.set()
+                by_hand.join()

@@ -15,6 +15,7 @@ from strands_robots.envelope import Envelope, is_error, text_of
 from strands_robots.errors import NoAnswerError, NoSuchRobotError, RefusalError, RobotError, UnreachableError
 from strands_robots.fleet.mesh.network import MeshNetwork
 from strands_robots.policies.base import Ranges, checked_action, limited, numbers, speeds_across
+from strands_robots.serving.control_leases import leases_of
 from strands_robots.teleoperators import UNBOUNDED_PER_S, BoundedLeader, LeaderFinished, LeaderPolicy
 from strands_robots.utils import ValidationError, mapping, number, plain_text, shown, text
 
@@ -203,6 +204,17 @@ class FollowedPeer:
         stats = self.stats
         return "" if stats["running"] else f"The robot stopped following {self._peer}: {_stream_end(stats)}."
 
+    def leading(self) -> bool:
+        """Return True while the leader may move the robot, also in a pause."""
+        return self._receiver.leading
+
+    def void(self) -> None:
+        """Let no frame move the robot from now on; wait for nothing."""
+        self._receiver.void()
+
+    def end_pauses(self) -> None:
+        """Do nothing: this command is its leader's follower, and nobody else's."""
+
 
 @contextmanager
 def dialled(source: str, peer: str) -> Iterator[Mesh]:
@@ -252,8 +264,10 @@ def followed(robot: Any, peer: str, max_speed: float) -> Iterator[FollowedPeer]:
     receiver.start()
     if receiver.start_refusal is not None:
         raise RobotError(f"{peer} cannot lead: {receiver.start_refusal}")
+    followed_peer = FollowedPeer(peer, receiver)
+    leases_of(robot, hardware=False).attach(followed_peer)
     try:
-        yield FollowedPeer(peer, receiver)
+        yield followed_peer
     finally:
         receiver.stop()
 
