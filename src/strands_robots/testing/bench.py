@@ -189,11 +189,17 @@ class ConformanceBench(NetworkBench):
         self._stack = ExitStack()
         self.body: Any = None
         self._fleets: list[Fleet] = []
+        self.halted_unlinked: StopVerdict | Exception = StopVerdict()
+        """Verdict of a halt before it was on a network, or what that raised."""
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
             stack.enter_context(private_network(self.subject.deadline_s, OPEN_GATES, quiet=True))
             self.body = stack.enter_context(made(self.subject))
+            try:
+                self.halted_unlinked = self.halt()
+            except Exception as exc:  # noqa: BLE001 - the check of it says so
+                self.halted_unlinked = exc
             runtime = init_device_connect_sync(self.body, peer_id=PEER, link=loopback_config())
             stack.callback(stop_device_connect, runtime)
             peer = init_mesh(self.body, PEER)

@@ -6,8 +6,8 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from itertools import pairwise
 
-from strands_robots.adapted import behind_contract
 from strands_robots.envelope import text_of
 from strands_robots.errors import RefusalError
 from strands_robots.safety.stopping import StopVerdict
@@ -15,7 +15,6 @@ from strands_robots.testing.bench import (
     ConformanceBench,
     NotKeptError,
     NotProvenError,
-    made,
     runs,
     wait_for,
     within,
@@ -36,10 +35,39 @@ PARALLEL = 3
 )
 def halts(bench: ConformanceBench) -> str:
     """Halt a motion once."""
-    with bench.moving():
+    with bench.moving() as run:
+        _check_seen_moving(bench, run.motion.verb)
         verdict = bench.halt()
         bench.check_still(verdict, bench.writes, "halt")
     return f"{verdict.elapsed_ms:.1f} ms"
+
+
+BEGUN_S = 0.05
+"""What is written once when a motion begins is written by then."""
+
+SEEN_S = 1.0
+
+
+def _check_seen_moving(bench: ConformanceBench, verb: str) -> None:
+    """Check that the recorder sees it move: else no write proves nothing.
+
+    Raises:
+        NotProvenError: it runs without a write.
+    """
+    recorder = bench.subject.recorder
+    if recorder is None or bench.subject.moving is not None:
+        return
+    time.sleep(BEGUN_S)
+    count, ends = recorder.count, time.monotonic() + SEEN_S
+    while time.monotonic() < ends:
+        writes = recorder.since(count)
+        if any(second.at - first.at <= bench.subject.watch_s for first, second in pairwise(writes)):
+            return
+        time.sleep(bench.poll_s)
+    raise NotProvenError(
+        f"{verb} had no two writes within {bench.subject.watch_s:g} s. Give Subject(motion=...) where it ended, and "
+        "Subject(moving=...) where the motor goes on by itself (docs/your-robot.md, The bus and its recorder)"
+    )
 
 
 @promise(
@@ -172,12 +200,12 @@ def own_verbs(bench: ConformanceBench) -> str:
     look="what halt() reads of a connection, a runtime or a peer",
 )
 def unlinked(bench: ConformanceBench) -> str:
-    """Halt another robot of the subject, which is on no network."""
-    with made(bench.subject) as body:
-        robot = behind_contract(body)
-        verdict = within(bench.subject.deadline_s + 1.0, lambda: robot.halt("conformance"), "halt")
-        if verdict.stopped is not True:
-            raise NotKeptError(f"halt of a robot on no network: {text_of(verdict.envelope())}")
+    """Halt it before it is on a network."""
+    verdict = bench.halted_unlinked
+    if isinstance(verdict, Exception):
+        raise verdict
+    if verdict.stopped is not True:
+        raise NotKeptError(f"halt of a robot on no network: {text_of(verdict.envelope())}")
     return ""
 
 

@@ -122,8 +122,8 @@ class Subject:
     """A robot whose promises are checked.
 
     Args:
-        make: makes the robot on its emulated bus, connected and standing still. It is called several times; at most
-            one robot lives at a time.
+        make: makes the robot on its emulated bus, connected and standing still. It may be called again, once the
+            last robot was let go of by its ``cleanup()``.
         recorder: of that bus; without one it is not proven that a stop is followed by no write.
         moving: returns True while the emulated motor moves. A motor that is told a speed or a torque goes on without a
             write, so for those it is needed: it must be False after every verdict that says stopped.

@@ -114,7 +114,7 @@ class SaysIdleAndGoesOn(faulty_robots.IgnoresHalt):
     told = False
 
     def stop_task(self) -> Any:
-        self.told = True
+        self.told = self.told or not self.still.is_set()
         return super().stop_task()
 
     def get_task_status(self) -> Any:

@@ -55,6 +55,30 @@ def test_without_a_recorder_silver_is_not_proven() -> None:
     assert report.tier is Tier.BRONZE
 
 
+def test_motor_that_goes_on_without_a_write_is_not_proven_to_stand_by_its_writes() -> None:
+    recorder = BusRecorder()
+    unseen = Subject(lambda: faulty_robots.KeepsItsSpeed(recorder), recorder)
+    (halts,) = conform(unseen, only=["silver.halts"]).results
+    assert (halts.mark, "Subject(moving=...)" in halts.said) == (CheckMark.NOT_PROVEN, True)
+
+
+def test_one_robot_of_a_subject_lives_at_a_time() -> None:
+    alive: list[int] = []
+
+    class Lone(Rig):
+        def cleanup(self) -> None:
+            alive.pop()
+
+    def make() -> Rig:
+        alive.append(len(alive))
+        assert len(alive) == 1
+        return Lone(BusRecorder())
+
+    report = conform(Subject(make), only=["silver.unlinked"])
+    assert [each.mark for each in report.results] == [CheckMark.PASSED]
+    assert alive == []
+
+
 def test_robot_that_cannot_be_made_is_named_with_its_error() -> None:
     def make() -> Any:
         raise OSError("no such port")
