@@ -11,8 +11,10 @@ from textwrap import dedent
 import pytest
 from tests.cli.conftest import Run
 
+from strands_robots.cli.conform import subject_of
 from strands_robots.cli.output import Exit
 from strands_robots.testing import Tier, promises
+from strands_robots.utils import ValidationError
 
 PAGE = Path(__file__).parents[2] / "docs" / "your-robot.md"
 
@@ -20,21 +22,15 @@ PAGE = Path(__file__).parents[2] / "docs" / "your-robot.md"
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("reachy_mini",), "reachy_mini is real hardware; give module:NAME"),
-        (("lerobot:so100",), "lerobot:so100 is real hardware; give module:NAME"),
-        (("so100", "--set", "mode=real"), "so100 is real hardware"),
-        (("no_such_module:subject",), "ModuleNotFoundError: No module named 'no_such_module'"),
-        (("json:no_such_name",), "AttributeError"),
-        (("math:pi",), "must be a Subject, or make one or a robot, not 3.14"),
+        (("math:tau", "--motion", "wave"), "--motion is for real hardware and for --live"),
+        (("so100", "--limit", "0"), "--limit must"),
         (("so100", "--tier", "iron"), "--tier must be one of bronze, silver, gold, not 'iron'"),
         (("arm-1", "--live", "--motion", "1up"), "--motion must be VERB KEY=VALUE"),
         (("arm-1", "--live", "--motion", "wave 'to me"), "--motion must be VERB KEY=VALUE"),
         (("arm-1", "--live", "--motion", "wave speed=NaN"), "speed must be finite"),
         (("arm-1", "--live", "--motion", "wave", "--approve-motions", "00"), "which names this list, not '00'"),
         (("arm 1", "--live"), "TARGET must"),
-        (("so100", "--motion", "wave"), "--motion is for --live"),
         (("so100", "--port", "4711"), "give --live with it"),
-        (("math:tau", "--only", "silver.halt"), "must be a Subject"),
     ],
     ids=str,
 )
@@ -42,6 +38,48 @@ def test_conform_refuses_by_name(run: Run, arguments: tuple[str, ...], said: str
     refused = run("conform", *arguments, "--json")
     assert refused.exit_code == Exit.USAGE
     assert said in json.loads(refused.stdout.splitlines()[-1])["reason"]
+
+
+@pytest.mark.parametrize(
+    "arguments", [("reachy_mini",), ("lerobot:so100",), ("so100", "--set", "mode=real", "--set", "port=/dev/ttyACM0")]
+)
+def test_conform_moves_no_hardware_before_its_list_is_approved(run: Run, arguments: tuple[str, ...]) -> None:
+    refused = run(
+        "conform", *arguments, "--motion", "execute instruction=wave duration=2", "--tier", "silver", "--json"
+    )
+    listed, failed = map(json.loads, refused.stdout.splitlines())
+    made, moved, wrong, let_go = listed["motions"]
+    assert refused.exit_code == Exit.REFUSED
+    assert made.startswith("It is made")
+    assert ("/dev/ttyACM0" in made) is ("--set" in arguments)
+    assert moved.startswith("execute(instruction='wave', duration=2), up to 5 times")
+    assert "wrong" in wrong
+    assert "sinks" in let_go
+    assert failed["reason"].startswith("Nothing was moved.")
+    assert failed["reason"].endswith(f"--approve-motions {listed['digest']}")
+
+
+def test_list_of_another_arm_or_motion_has_another_digest(run: Run) -> None:
+    ports = [("--set", f"port=/dev/ttyACM{number}") for number in (0, 1)]
+    lines = [*ports, (*ports[0], "--motion", "execute duration=2"), (*ports[0], "--motion", "execute duration=3")]
+    digests = [
+        json.loads(run("conform", "so100", "--set", "mode=real", *line, "--json").stdout.splitlines()[0])["digest"]
+        for line in lines
+    ]
+    assert len(set(digests)) == len(lines)
+
+
+@pytest.mark.parametrize(
+    ("target", "said"),
+    [
+        ("no_such_module:subject", "ModuleNotFoundError: No module named 'no_such_module'"),
+        ("json:no_such_name", "AttributeError"),
+        ("math:pi", "must be a Subject, or make one or a robot, not 3.14"),
+    ],
+)
+def test_target_that_makes_no_robot_is_refused_by_name(target: str, said: str) -> None:
+    with pytest.raises(ValidationError, match=re.escape(said)):
+        subject_of(target, {})
 
 
 @pytest.mark.parametrize("name", ["", "My_Robot", "my-robot", "1robot", "a" * 51, "../x", "class", "json", "numpy"])

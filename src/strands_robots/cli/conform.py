@@ -6,7 +6,7 @@ import keyword
 import re
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -15,14 +15,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from strands_robots import settings
 from strands_robots.cli.app import assignments
-from strands_robots.cli.motion_approval import FLAG, MotionList, lines_of, parse_motion
+from strands_robots.cli.conform_process import ConformRequest, conform_apart
+from strands_robots.cli.motion_approval import FLAG, LET_GO, MotionList, connected, lines_of, parse_motion
 from strands_robots.cli.network import Network, answering
 from strands_robots.cli.output import CliError, Screen
-from strands_robots.utils import ValidationError, choice, identifier, shown
+from strands_robots.cli.serve import options_of_file
+from strands_robots.utils import ValidationError, choice, identifier, number, shown
 
 if TYPE_CHECKING:
-    from strands_robots.testing import CheckResult, ConformanceReport, LongMotion, Subject, Tier
+    from strands_robots.testing import CheckResult, ConformanceReport, LongMotion, Subject
 
 TIERS = ("bronze", "silver", "gold")
 
@@ -42,6 +45,12 @@ def conform(
         list[str] | None,
         typer.Option("--set", help="An option of a robot that was named.", metavar="KEY=VALUE"),
     ] = None,
+    config: Annotated[
+        Path | None, typer.Option("--config", help="File of the robot's options: .json, .toml or LeRobot's .yaml.")
+    ] = None,
+    limit: Annotated[
+        float, typer.Option("--limit", help="Seconds for one check; a process that takes longer is ended.")
+    ] = 120.0,
     live: Annotated[
         bool, typer.Option("--live", help="TARGET is the id of a robot in reach; without --motion it is not moved.")
     ] = False,
@@ -54,10 +63,8 @@ def conform(
     ] = None,
 ) -> None:
     """Check a robot on its emulated bus, where it moves. Exits 1 on a failure."""
-    from strands_robots.testing import Tier  # noqa: PLC0415 - loads both networks
-    from strands_robots.testing import conform as check  # noqa: PLC0415 - as above
-
-    most = Tier[choice("--tier", tier, TIERS).upper()]
+    most = choice("--tier", tier, TIERS).upper()
+    limit_s = number("--limit", limit, low=1, high=3600)
     chosen = _Chosen(most, tuple(only or ()), None if motion is None else parse_motion(motion), approve_motions)
 
     def tell(result: CheckResult) -> None:
@@ -70,9 +77,9 @@ def conform(
     else:
         if network != Network():
             raise ValidationError("a network is stated for a robot in reach; give --live with it.")
-        if motion is not None:
-            raise ValidationError("--motion is for --live; a Subject has its motion.")
-        report = check(_subject(target, assignments(options or [])), most, only=chosen.only, report=tell)
+        stated = {} if config is None else options_of_file(config, target)
+        request = ConformRequest(target, stated | assignments(options or []), most, chosen.only, limit_s=limit_s)
+        report = conform_apart(_approved(screen, request, chosen), tell)
     screen.data({"event": "report", **report.facts()})
     for line in report.words().splitlines():
         screen.say(line)
@@ -85,7 +92,7 @@ def conform(
 class _Chosen:
     """Checks that were chosen, and the motion for them."""
 
-    most: Tier
+    most: str
     only: tuple[str, ...]
     motion: LongMotion | None
     approval: str | None
@@ -100,43 +107,53 @@ class _Chosen:
         return lines_of(self.motion, starts, wrong=any(map(self._checks, WRONG_ARGUMENTS)))
 
     def _checks(self, name: str) -> bool:
-        from strands_robots.testing import promises  # noqa: PLC0415 - as above
+        from strands_robots.testing import Tier, promises  # noqa: PLC0415 - as above
 
-        return any(name == each.name for each in promises(self.most)) and (not self.only or name in self.only)
+        return any(name == each.name for each in promises(Tier[self.most])) and (not self.only or name in self.only)
+
+
+def _approved(screen: Screen, request: ConformRequest, chosen: _Chosen) -> ConformRequest:
+    """Return the request, for real hardware once its motions are approved."""
+    from strands_robots.robot import counts_as_hardware  # noqa: PLC0415 - heavy, and needed by this command alone
+
+    if not (counts_as_hardware(request.target) or request.options.get("mode") == "real"):
+        if chosen.motion is not None:
+            raise ValidationError("--motion is for real hardware and for --live; a Subject has its motion.")
+        return request
+    if request.target == "reachy_mini" and (host := settings.raw("REACHY_HOST")):
+        # The check puts the settings aside, and the list has to name the robot that moves.
+        request = replace(request, options={"host": host, **request.options})
+    MotionList(request.target, [connected(request.options), *chosen.motions(), LET_GO]).approve(screen, chosen.approval)
+    motion = None if chosen.motion is None else asdict(chosen.motion)
+    return replace(request, hardware=True, motion=motion)
 
 
 def _live(
     screen: Screen, network: Network, robot: str, chosen: _Chosen, tell: Callable[[CheckResult], None]
 ) -> ConformanceReport:
-    from strands_robots.testing import conform_live  # noqa: PLC0415 - loads both networks
+    from strands_robots.testing import Tier, conform_live  # noqa: PLC0415 - loads both networks
 
     robot = identifier("TARGET", robot)
     if moved := chosen.motions():
         MotionList(robot, moved).approve(screen, chosen.approval)
     with network.joined() as there, answering(there, robot, ""):
-        return conform_live(there, robot, chosen.most, motion=chosen.motion, only=chosen.only, report=tell)
+        return conform_live(there, robot, Tier[chosen.most], motion=chosen.motion, only=chosen.only, report=tell)
 
 
-def _subject(target: str, options: dict[str, Any]) -> Subject:
+def subject_of(target: str, options: dict[str, Any]) -> Subject:
     """Return the subject that a target names.
 
     Raises:
-        ValidationError: it cannot be loaded, or it is real hardware.
+        ValidationError: it cannot be loaded.
     """
     from strands_robots.robot import LEROBOT, Robot  # noqa: PLC0415 - heavy, and needed by this command alone
     from strands_robots.testing import Subject  # noqa: PLC0415 - as above
 
     module, colon, attribute = target.partition(":")
-    if not colon:
-        if target == "reachy_mini" or options.get("mode") == "real":
-            raise ValidationError(
-                f"{target} is real hardware; give module:NAME of a Subject whose robot is on an emulated bus."
-            )
+    if target == "reachy_mini" or target.startswith(LEROBOT):
+        options = {**options, "mode": "real"}
+    if not colon or target.startswith(LEROBOT):
         return Subject(lambda: Robot(target, **options), name=target)
-    if target.startswith(LEROBOT):
-        raise ValidationError(
-            f"{target} is real hardware; give module:NAME of a Subject whose robot is on an emulated bus."
-        )
     # As a module that is run: the package that is being written need not be installed.
     sys.path.insert(0, str(Path.cwd()))
     try:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from strands_robots.cli.app import assignments
 from strands_robots.cli.output import CliError, Screen
@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from strands_robots.testing import LongMotion
 
 FLAG = "--approve-motions"
+
+LET_GO = "It is let go at the end: without power an arm sinks."
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +50,7 @@ class MotionList:
         screen.data({"event": "motions", "robot": self.robot, "motions": list(self.lines), "digest": self.digest})
         screen.say(f"These checks move {self.robot}:", "bold")
         for line in self.lines:
-            screen.say(f"  {line}")
+            screen.copyable(f"  {line}")
         if given is not None:
             if given != self.digest:
                 raise ValidationError(f"{FLAG} must be {self.digest}, which names this list, not {shown(given)}.")
@@ -84,18 +86,24 @@ def lines_of(motion: LongMotion, starts: int, wrong: bool) -> list[str]:
         starts: how often it is started, at most.
         wrong: it is called with wrong arguments as well.
     """
-    called = f"{motion.verb}({', '.join(f'{name}={value!r}' for name, value in motion.arguments.items())})"
+    called = f"{motion.verb}({_named(motion.arguments)})"
     lines = []
     if starts:
         often = "once" if starts == 1 else f"up to {starts} times"
-        lines.append(
-            f"{called}, {often}: each is stopped when it runs, 10 s later at most. If a stop fails, it goes on."
-        )
+        lines.append(f"{called}, {often}: each is stopped when it runs, or after 10 s. If a stop fails, it goes on.")
     if wrong:
-        lines.append(
-            f"{motion.verb} with one argument wrong or unknown, which it has to refuse. If it takes it, it moves."
-        )
+        lines.append(f"{motion.verb} with one argument wrong, which it has to refuse. A robot that takes it moves.")
     return lines
+
+
+def connected(options: Mapping[str, Any]) -> str:
+    """Return the sentence of a robot that is made with these options."""
+    made = f" with {_named(options)}" if options else ""
+    return f"It is made{made} and connected, which powers its motors and may move it."
+
+
+def _named(arguments: Mapping[str, Any]) -> str:
+    return ", ".join(f"{name}={value!r}" for name, value in arguments.items())
 
 
 def _yes(question: str) -> bool:
