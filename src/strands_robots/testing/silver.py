@@ -306,7 +306,8 @@ def lockout(bench: ConformanceBench) -> str:
     "silver.honest",
     "While its bus raises or hangs, a halt answers in time, and says stopped only where no write follows.",
     why="A verdict that is wrong is worse than none: people walk up to the robot.",
-    look="halt(): an exception of the bus that is swallowed, a lock that a hung write holds",
+    look="halt(): an exception of the bus that is swallowed, a lock that a hung write holds; a motor that goes on by "
+    "itself, and no halt() that asks it",
     needs_recorder=True,
     needs="silver.halts",
 )
