@@ -33,7 +33,7 @@ def answers(*calls: dict[str, Any]) -> list[dict[str, Any]]:
     return [block["toolResult"] for message in agent.messages for block in message["content"] if "toolResult" in block]
 
 
-def test_agent_finds_moves_and_stops_fifty_robots(robots: Callable[[int], RobotLab]) -> None:
+def test_agent_finds_moves_and_stops_fifty_robots(robots: Callable[..., RobotLab]) -> None:
     lab = robots(50)
     # A busy machine may answer late, so the agent looks more than once.
     found = [str(each["content"]) for each in answers(*3 * [{"action": "peers"}])]
@@ -48,7 +48,7 @@ def test_agent_finds_moves_and_stops_fifty_robots(robots: Callable[[int], RobotL
     assert lab.moving == []
 
 
-def test_agent_is_told_which_robots_an_emergency_stop_did_not_stop(robots: Callable[[int], RobotLab]) -> None:
+def test_agent_is_told_which_robots_an_emergency_stop_did_not_stop(robots: Callable[..., RobotLab]) -> None:
     lab = robots(50)
     answers(*({"action": "tell", "target": each, **WAVE} for each in lab.ids))
     lab["robot-7"].silence()

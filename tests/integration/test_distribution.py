@@ -79,13 +79,16 @@ def test_the_source_archive_holds_what_a_test_run_needs(built: Path) -> None:
     assert not {name for name in tracked() if not name.startswith(NOT_SHIPPED)} - names
 
 
-def test_the_metadata_names_the_distribution_its_license_and_its_command(wheel: Path, about: Message) -> None:
+def test_the_metadata_names_the_distribution_its_license_its_command_and_its_pytest_plug_in(
+    wheel: Path, about: Message
+) -> None:
     assert (about["Name"], about["Version"]) == ("strands-robots-edge", __version__)
     assert about["Requires-Python"] == ">=3.11"
     assert about["License-Expression"] == "Apache-2.0"
     with zipfile.ZipFile(wheel) as archive:
         commands = archive.read(f"strands_robots_edge-{__version__}.dist-info/entry_points.txt").decode()
     assert "strands-robots = strands_robots.cli:main" in commands
+    assert "[pytest11]\nstrands_robots = strands_robots.testing.pytest_plugin" in commands
 
 
 def test_the_metadata_has_every_extra_that_a_page_or_a_refusal_names(about: Message) -> None:

@@ -5,7 +5,7 @@ pytest imports this file at its start, whatever it tests, so nothing else is imp
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
@@ -16,17 +16,20 @@ if TYPE_CHECKING:
 
 
 @pytest.fixture
-def robots() -> Iterator[Callable[[int], RobotLab]]:
-    """Serve simulated robots on a private network: ``lab = robots(50)``."""
+def robots() -> Iterator[Callable[..., RobotLab]]:
+    """Serve simulated robots on a private network: ``lab = robots(50)``.
+
+    The arguments are those of ``RobotLab``.
+    """
     from strands_robots.testing import RobotLab  # noqa: PLC0415 - loads the network, which few tests need
 
     with ExitStack() as stack:
         served: list[RobotLab] = []
 
-        def serve(count: int = 1) -> RobotLab:
+        def serve(count: int = 1, more: Mapping[str, str] | None = None) -> RobotLab:
             if served:
                 pytest.fail("robots() serves one lab in a test; ask for all robots at once.", pytrace=False)
-            served.append(stack.enter_context(RobotLab(count)))
+            served.append(stack.enter_context(RobotLab(count, more)))
             return served[0]
 
         yield serve

@@ -21,7 +21,7 @@ from strands_robots.safety.plane import plane
 from strands_robots.testing.private_network import private_network
 from strands_robots.testing.simulated_arm import SimulatedArm
 from strands_robots.threads import LoopThread
-from strands_robots.utils import ValidationError, near, number, shown, whole
+from strands_robots.utils import ValidationError, mapping, near, number, shown, text, whole
 
 T = TypeVar("T")
 
@@ -39,6 +39,8 @@ SETTINGS = {
     "STRANDS_ALLOW_MOCK": "true",
     "STRANDS_MESH": "false",
 }
+
+KNOWN = frozenset(each.name for each in settings.declared())
 
 STANDS = success("It stands.", stopped=True)
 UNREACHED = error("No order reaches it.", stopped=False)
@@ -210,21 +212,27 @@ class RobotLab:
 
     Args:
         count: robots, 1 to 200; their ids are ``robot-1``, ``robot-2``, ...
+        more: settings by name; by default any caller may move the robots.
 
     Raises:
-        ValidationError: ``count`` outside its domain.
+        ValidationError: ``count`` outside its domain, or a setting that does not exist.
         TimeoutError: they were not served within 60 s.
     """
 
-    def __init__(self, count: int) -> None:
+    def __init__(self, count: int, more: Mapping[str, str] | None = None) -> None:
         number_of = whole("count", count, low=1, high=ROBOTS_MAX)
+        self._settings = dict(SETTINGS)
+        for name, value in mapping("more", more or {}).items():
+            if name not in KNOWN:
+                raise ValidationError(f"more must have settings, not {shown(name)}.{near(name, KNOWN)}")
+            self._settings[name] = text(f"more[{name!r}]", value, empty=True)
         self._robots = {name: LabRobot(self, name) for name in (f"robot-{each + 1}" for each in range(number_of))}
         self._loop: LoopThread | None = None
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
-            stack.enter_context(private_network(HALT_DEADLINE_S, SETTINGS))
+            stack.enter_context(private_network(HALT_DEADLINE_S, self._settings))
             settings.put("ZENOH_CONNECT", str(loopback_config().meeting_point))
             self._loop = LoopThread("robot-lab")
             stack.callback(self._loop.close)

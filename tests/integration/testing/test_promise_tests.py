@@ -33,9 +33,9 @@ TestPortless = conformance_tests(Subject(portless), Tier.BRONZE)
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> ChildRun:
-    file = tmp_path_factory.mktemp("promises") / "test_promises.py"
-    file.write_text(FILE, encoding="utf-8")
-    return child_pytest(file, "-rxs", "-k", "made or verbs or silver.halts or silver.again")
+    folder = tmp_path_factory.mktemp("promises")
+    (folder / "test_promises.py").write_text(FILE, encoding="utf-8")
+    return child_pytest(folder, "-rxs", "-k", "made or verbs or silver.halts or silver.again")
 
 
 def test_each_check_is_a_test_of_its_own(run: ChildRun) -> None:

@@ -29,6 +29,13 @@ def lab() -> Iterator[RobotLab]:
 
 
 @pytest.fixture
+def lab_for_desk() -> Iterator[RobotLab]:
+    """A robot that one caller may move."""
+    with RobotLab(1, {"DEVICE_CONNECT_RPC_ALLOW": "desk"}) as lab:
+        yield lab
+
+
+@pytest.fixture
 def fleet(lab: RobotLab) -> Iterator[Fleet]:
     """A caller that knows them, and had them move."""
     with connect(name="tester") as fleet:
@@ -134,6 +141,22 @@ def test_tools_of_agents_reach_them_and_are_disconnected_with_them(monkeypatch: 
         assert lab.moving == []
         assert not disconnected.is_set()
     assert disconnected.is_set()
+
+
+def test_lab_takes_settings_and_refuses_a_caller_by_them(lab_for_desk: RobotLab) -> None:
+    with connect(name="somebody") as fleet, pytest.raises(RefusalError, match="DEVICE_CONNECT_RPC_ALLOW"):
+        fleet["robot-1"].call("execute", instruction="wave")
+    with connect(name="desk") as fleet:
+        assert fleet["robot-1"].call("execute", instruction="wave")["status"] == "success"
+
+
+@pytest.mark.parametrize(
+    ("more", "named"),
+    [({"NO_SUCH_SETTING": "1"}, "more must have"), ({"TENANT": 1}, r"more\['TENANT'\]"), (["TENANT"], "more must be")],
+)
+def test_wrong_setting_is_refused_by_name(more: Any, named: str) -> None:
+    with pytest.raises(ValidationError, match=rf"^{named}"):
+        RobotLab(1, more)
 
 
 @pytest.mark.parametrize("count", [0, -1, 201, True, 2.0, "3", float("nan")])
