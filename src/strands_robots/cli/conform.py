@@ -20,7 +20,7 @@ from strands_robots.cli.app import assignments
 from strands_robots.cli.conform_process import ConformRequest, conform_apart
 from strands_robots.cli.motion_approval import FLAG, LET_GO, MotionList, connected, lines_of, parse_motion
 from strands_robots.cli.network import Network, answering
-from strands_robots.cli.output import CliError, Screen
+from strands_robots.cli.output import CliError, Exit, Screen
 from strands_robots.cli.serve import options_of_file
 from strands_robots.utils import ValidationError, choice, identifier, number, shown
 
@@ -136,8 +136,14 @@ def _live(
     robot = identifier("TARGET", robot)
     if moved := chosen.motions():
         MotionList(robot, moved).approve(screen, chosen.approval)
-    with network.joined() as there, answering(there, robot, ""):
-        return conform_live(there, robot, Tier[chosen.most], motion=chosen.motion, only=chosen.only, report=tell)
+    try:
+        with network.joined() as there, answering(there, robot, ""):
+            return conform_live(there, robot, Tier[chosen.most], motion=chosen.motion, only=chosen.only, report=tell)
+    except KeyboardInterrupt:
+        if not moved:
+            raise
+        stop = f"strands-robots stop {robot}{network.flags}"
+        raise CliError(f"Interrupted. To be sure that {robot} stands: {stop}", Exit.INTERRUPTED, stop=stop) from None
 
 
 def subject_of(target: str, options: dict[str, Any]) -> Subject:

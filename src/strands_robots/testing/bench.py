@@ -141,6 +141,9 @@ class NetworkBench:
         """Halt it over its networks."""
         return self.remote.halt(reason)
 
+    def settle(self) -> None:
+        """Do what a motion needs once it was halted and its call is over."""
+
     def rest(self) -> None:
         """Have it stand still, for the next check."""
         self.halt("the check is over")
@@ -175,6 +178,8 @@ class NetworkBench:
                 with suppress(NotKeptError):
                     self.halt("the motion of a check is over")
             run.join()
+            if not run.refused:
+                self.settle()
 
 
 class ConformanceBench(NetworkBench):

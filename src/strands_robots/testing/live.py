@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from typing import cast
 
 from strands_robots.contract import RUNNING
@@ -63,6 +64,12 @@ class LiveBench(NetworkBench):
     def remote(self) -> RemoteRobot:
         """The robot on the network that its motions go to."""
         return self._moved
+
+    def settle(self) -> None:
+        """Halt a motion that was on its way to the robot while the halt overtook it."""
+        with suppress(RefusalError):
+            if self.runs():
+                self.halt("a motion began after its halt")
 
 
 def check_live(promise: Promise, bench: NetworkBench) -> CheckResult:
