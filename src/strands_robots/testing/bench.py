@@ -6,11 +6,13 @@ is removed. Nothing leaves the machine.
 
 from __future__ import annotations
 
+import math
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from functools import partial
+from dataclasses import dataclass
+from functools import partial, wraps
 from typing import Any, Self, TypeVar
 
 from strands_robots.adapted import behind_contract
@@ -49,6 +51,9 @@ OPEN_GATES = {
     **dict.fromkeys(("BYPASS_TOOL_CONSENT", "STRANDS_ALLOW_MOCK"), "true"),
 }
 """Settings with which any caller may move it."""
+
+OF_A_MOTION = frozenset({"wait"})
+"""Reads that are refused while no motion runs."""
 
 TASK = {"instruction": "wave", "policy_provider": "mock", "duration": 30.0}
 
@@ -119,8 +124,8 @@ class NetworkBench:
         return [each for each in robot.verbs.values() if each.kind == "motion" and each.name not in RESUMES]
 
     def plain_reads(self, network: str) -> list[AdvertisedVerb]:
-        """Return its reads on a network that need no argument."""
-        verbs = self.on[network].verbs.values()
+        """Return its reads on a network that need neither an argument nor a motion."""
+        verbs = [each for each in self.on[network].verbs.values() if each.name not in OF_A_MOTION]
         return [each for each in verbs if each.reads and not any(named.required for named in each.parameters)]
 
     def arguments(self, verb: AdvertisedVerb) -> dict[str, Any]:
@@ -255,8 +260,24 @@ class ConformanceBench(NetworkBench):
             raise NotKeptError(f"{how}: {text_of(verdict.envelope())}")
         self.check_no_write(count, how)
 
-    def check_no_write(self, count: int, how: str) -> None:
+    @contextmanager
+    def halts_noted(self) -> Iterator[list[HaltCall]]:
+        """Note the calls of the robot's halts, from every transport, for the block."""
+        calls: list[HaltCall] = []
+        with ExitStack() as stack:
+            own = [name for name in HALTS if callable(getattr(self.body, name, None))]
+            # One that halts on the stop executor's thread writes there, whoever waits for it.
+            for name in own[:1] if own[:1] == ["halt_here"] else own:
+                stack.enter_context(put(self.body, name, _noted(getattr(self.body, name), calls)))
+            yield calls
+
+    def check_no_write(self, count: int, how: str, halts: Sequence[HaltCall] = ()) -> None:
         """Check that nothing is written after ``count`` for the subject's ``watch_s``.
+
+        Args:
+            count: writes until the verdict.
+            how: it was stopped, for the error.
+            halts: calls of halts, in which a robot on a bus is frozen, which is a write.
 
         Raises:
             NotKeptError: a write followed.
@@ -266,13 +287,56 @@ class ConformanceBench(NetworkBench):
             return
         verdict_at = time.monotonic()
         while time.monotonic() - verdict_at < self.subject.watch_s:
-            if late := recorder.since(count):
+            if late := [each for each in recorder.since(count) if not any(call.had(each.at) for call in halts)]:
                 after_ms = max(0.0, (late[0].at - verdict_at) * 1000)
                 raise NotKeptError(f"{how}: {late[0].what or 'a write'} {after_ms:.0f} ms after the verdict")
             time.sleep(_EVERY_S)
         if self.subject.moving is not None and self.subject.moving():
             after_ms = (time.monotonic() - verdict_at) * 1000
             raise NotKeptError(f"{how}: its motor moves {after_ms:.0f} ms after the verdict")
+
+
+HALTS = ("halt_here", "halt", "stop_task")
+"""Methods by which a stop halts a robot."""
+
+
+@dataclass(slots=True)
+class HaltCall:
+    """One call of a robot's halt, in monotonic s; without an end while it runs."""
+
+    began: float
+    ended: float = math.inf
+
+    def had(self, moment: float) -> bool:
+        """Return True for a moment in it."""
+        return self.began <= moment <= self.ended
+
+
+def _noted(method: Callable[..., T], calls: list[HaltCall]) -> Callable[..., T]:
+    @wraps(method)
+    def noted(*values: Any, **named: Any) -> T:
+        call = HaltCall(time.monotonic())
+        calls.append(call)
+        try:
+            return method(*values, **named)
+        finally:
+            call.ended = time.monotonic()
+
+    return noted
+
+
+@contextmanager
+def put(body: object, name: str, method: Callable[..., Any]) -> Iterator[None]:
+    """Have an object another method for the block."""
+    own = vars(body).get(name)
+    setattr(body, name, method)
+    try:
+        yield
+    finally:
+        if own is None:
+            delattr(body, name)
+        else:
+            setattr(body, name, own)
 
 
 class MotionRun:
@@ -292,7 +356,10 @@ class MotionRun:
             if isinstance(self.answer, RefusalError):
                 raise NotProvenError(f"{self.motion.verb} was refused: {self.answer}")
             over = self.over and self._returns_at_its_end
-            if self._bench.writes > before if self._bench.subject.recorder else self._bench.runs():
+            # A task that is refused while it begins may have held the robot, which is a write, too.
+            begun = self.motion.verb not in TASKS or self.over
+            moved = self._bench.writes > before if self._bench.subject.recorder else self._bench.runs()
+            if begun and moved and not isinstance(self.answer, RefusalError):
                 return
             if over:
                 raise NotProvenError(f"{self.motion.verb} ended before it moved the robot: {self._said}")
