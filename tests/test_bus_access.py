@@ -15,6 +15,7 @@ from fixtures.devices import RANGES, BlindDevice, RecordingDevice
 from strands_robots.bus_access import (
     action_ranges,
     bus_lock,
+    declared_numbers,
     joint_read_source,
     read_currents,
     read_joints,
@@ -109,6 +110,20 @@ def test_lerobots_motor_modes_are_ranges() -> None:
 def test_unknown_ranges_are_infinite_and_declared_ones_count() -> None:
     assert action_ranges(SimpleNamespace(action_features={"a": float})) == {"a": (-math.inf, math.inf)}
     assert action_ranges(RecordingDevice()) == dict(RANGES)
+
+
+def test_motors_of_an_arm_have_their_ranges_beside_the_wheels_of_a_base() -> None:
+    motors = {"arm_pan": SimpleNamespace(norm_mode=Mode.RANGE_M100_100), "left_wheel": SimpleNamespace(norm_mode=None)}
+    bus = SimpleNamespace(motors=motors, calibration={}, sync_read=lambda register: {})
+    actions = {"arm_pan.pos": float, "x.vel": float, "mode": str}
+    device = SimpleNamespace(bus=bus, action_features=actions, observation_features=actions)
+    assert action_ranges(device) == {"arm_pan.pos": (-100.0, 100.0), "x.vel": (-math.inf, math.inf)}
+
+
+def test_numbers_that_a_device_does_not_declare_are_no_joints() -> None:
+    observation = {"pan.pos": 1.0, "pan.target": 90.0, "note": "ok"}
+    assert declared_numbers(SimpleNamespace(observation_features={"pan.pos": float}), observation) == {"pan.pos": 1.0}
+    assert declared_numbers(SimpleNamespace(), observation) == {"pan.pos": 1.0, "pan.target": 90.0}
 
 
 class Pair:

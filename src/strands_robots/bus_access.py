@@ -35,6 +35,9 @@ _READERS = ("get_joints", "get_observation")
 NORMALISED = {"RANGE_M100_100": (-100.0, 100.0), "RANGE_0_100": (0.0, 100.0)}
 """LeRobot's normalised motor ranges (``MotorNormMode``)."""
 
+TEXTS = (str, "str", "string")
+"""Features that are words, such as a mode, which no policy and no caller sets."""
+
 _locks: dict[int, tuple[object, threading.RLock]] = {}
 _guard = threading.Lock()
 
@@ -95,7 +98,7 @@ def joint_reader(device: Any) -> Callable[[], dict[str, float]]:
             if answer is not None and "status" not in answer:
                 return numbers(answer)
             if not buses:
-                return numbers(source.get_observation())
+                return declared_numbers(source, source.get_observation())
             joints: dict[str, float] = {}
             for prefix, bus in buses:
                 positions = bus.sync_read("Present_Position")
@@ -103,6 +106,18 @@ def joint_reader(device: Any) -> Callable[[], dict[str, float]]:
             return joints
 
     return read
+
+
+def declared_numbers(device: Any, observation: Mapping[str, Any]) -> dict[str, float]:
+    """Return the declared numbers of an observation; all where none is declared.
+
+    A driver may answer with more, such as what a joint was told last, which is no position.
+    """
+    features = getattr(device, "observation_features", None)
+    found = numbers(observation)
+    return (
+        {key: found[key] for key in found if key in features} if isinstance(features, Mapping) and features else found
+    )
 
 
 def read_currents(device: Any) -> dict[str, float]:
@@ -155,30 +170,39 @@ def write_joints(device: Any, targets: Mapping[str, float]) -> None:
 
 
 def action_ranges(device: Any) -> dict[str, tuple[float, float]]:
-    """Return the range of every action key; infinite where none is known.
+    """Return the range of every number of an action; infinite where none is known.
 
     A LeRobot motor in degrees has the range of its calibration, which LeRobot centres on 0:
     ``(range_max - range_min) / 2`` encoder counts each way, of 4096 a turn minus one.
     """
     declared = getattr(device, "joint_ranges", None)
     known: Mapping[str, Any] = declared if isinstance(declared, Mapping) else {}
-    motors = _motors(device) or {}
+    motors = _described(device)
     ranges: dict[str, tuple[float, float]] = {}
-    for key in device.action_features:
+    for key, feature in dict(device.action_features).items():
+        if feature in TEXTS:
+            continue
         if key in known:
             low, high = known[key]
             ranges[key] = (float(low), float(high))
         else:
-            ranges[key] = _motor_range(device, key.removesuffix(".pos"), motors)
+            ranges[key] = _motor_range(*motors[key]) if key in motors else (-math.inf, math.inf)
     return ranges
 
 
-def _motor_range(device: Any, motor: str, motors: Mapping[str, Any]) -> tuple[float, float]:
-    described = motors.get(motor)
-    mode = str(getattr(getattr(described, "norm_mode", None), "name", ""))
+def _described(device: Any) -> dict[str, tuple[Any, str]]:
+    """Return bus and name of the motor of each key, beside the wheels of a base."""
+    bus = getattr(device, "bus", None)
+    own = [("", bus)] if _is_bus(bus) else []
+    buses = (*own, *motor_buses(device))
+    return {f"{prefix}{motor}.pos": (each, motor) for prefix, each in buses for motor in each.motors}
+
+
+def _motor_range(bus: Any, motor: str) -> tuple[float, float]:
+    mode = str(getattr(getattr(bus.motors[motor], "norm_mode", None), "name", ""))
     if mode in NORMALISED:
         return NORMALISED[mode]
-    calibration = getattr(device.bus, "calibration", None) if described is not None else None
+    calibration = getattr(bus, "calibration", None)
     entry = calibration.get(motor) if isinstance(calibration, Mapping) else None
     if mode == "DEGREES" and entry is not None:
         half = (entry.range_max - entry.range_min) / 2 * 360 / 4095

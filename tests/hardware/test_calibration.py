@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -110,3 +111,12 @@ def test_a_lost_answer_does_not_keep_an_arm_from_connecting(problem: Exception) 
     bus = LosingBus(2, problem)
     DeviceBody.bring_up(SimpleNamespace(connect=bus.connect))
     assert bus.connections == 3
+
+
+def test_driver_that_brings_the_calibration_of_its_motors_needs_no_file() -> None:
+    bus = SimpleNamespace(motors={"joint1": None}, calibration={"joint1": object()}, port="can0")
+    device = SimpleNamespace(bus=bus, calibration={}, calibration_fpath=Path("none.json"), id="piper")
+    calibrate_from(device, None, name="piper", role="follower")
+    bus.calibration = {}
+    with pytest.raises(ValidationError, match="has no calibration"):
+        calibrate_from(device, None, name="piper", role="follower")

@@ -87,3 +87,22 @@ def test_lerobot_repeats_no_read_by_itself(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(lerobot_device, "lerobot_module", lambda name: devices)
     assert make_device("arm", {}, calibrated=False).config.num_read_retries == 0
     assert make_device("arm", {"num_read_retries": 1}, calibrated=False).config.num_read_retries == 1
+
+
+def test_robot_is_found_by_the_name_of_its_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    @dataclass
+    class Config:
+        id: str | None = None
+
+    registry = SimpleNamespace(get_known_choices=lambda: {"lerobot_robot_viola": Config})
+    devices = SimpleNamespace(__path__=[], __name__="robots", RobotConfig=registry)
+    devices.make_robot_from_config = lambda config: SimpleNamespace(config=config)
+    monkeypatch.setattr(lerobot_device, "lerobot_module", lambda name: devices)
+    assert make_device("viola", {}, calibrated=False).config.id == "viola"
+
+
+def test_driver_may_keep_something_else_where_lerobot_keeps_its_port() -> None:
+    handler = SimpleNamespace(ser=SimpleNamespace(ConnectPort=None), is_open=False)
+    device = SimpleNamespace(bus=SimpleNamespace(port_handler=handler))
+    _compat.forget_input(device)
+    assert not _compat.unplugged(device)

@@ -96,8 +96,10 @@ def unplugged(device: Any) -> bool:
 def forget_input(device: Any) -> None:
     """Discard unread bytes of the serial port of a LeRobot device."""
     serial = getattr(getattr(getattr(device, "bus", None), "port_handler", None), "ser", None)
-    if serial is not None and serial.is_open and not unplugged(device):
-        serial.reset_input_buffer()
+    # A driver on another bus may keep anything under that name.
+    reset = getattr(serial, "reset_input_buffer", None)
+    if callable(reset) and getattr(serial, "is_open", False) and not unplugged(device):
+        reset()
 
 
 def stop_base(device: Any, still: Mapping[str, float]) -> None:

@@ -12,9 +12,18 @@ from functools import partial
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
-from strands_robots.bus_access import action_ranges, bus_lock, joint_reader, motor_buses, read_currents, write_joints
+from strands_robots.bus_access import (
+    action_ranges,
+    bus_lock,
+    declared_numbers,
+    joint_reader,
+    motor_buses,
+    read_currents,
+    write_joints,
+)
 from strands_robots.hardware._compat import drop, forget_input, stop_base, unplugged
 from strands_robots.hardware.device_facts import default_speeds, require_port
+from strands_robots.hardware.hold_check import HoldCheck
 from strands_robots.hardware.lerobot_device import answer_lost, write_to_servos
 from strands_robots.policies.base import Action, checked_speeds, is_velocity, numbers
 from strands_robots.safety.gate import MotionsHeldError, Permit, PermitVoidError
@@ -94,6 +103,7 @@ class DeviceBody:
         self._latest: tuple[float, dict[str, float]] | None = None
         self.targets: dict[str, float] = {}
         """What it was told last by an action, by key; empty once it was frozen or let go."""
+        self._holdable = HoldCheck(name)
         self._lost = False
         self._was_connected = self.is_connected
         self._holds_unconnected = bool(getattr(device, "holds_unconnected", False))
@@ -160,7 +170,7 @@ class DeviceBody:
         """Read joints and pictures; repeat as :meth:`get_joints` does."""
         with self.lock:
             began, observation = self._exchange(lambda: (time.monotonic(), dict(self.device.get_observation())))
-            self._latest = (began, numbers(observation))
+            self._latest = (began, declared_numbers(self.device, observation))
             return observation
 
     def get_joints(self, tries: int = READ_TRIES, *, urgent: bool = False) -> dict[str, float]:
@@ -254,7 +264,9 @@ class DeviceBody:
         def exchange() -> Mapping[str, Any]:
             sent = self._exchange(send, self._send_tries)
             taken = sent if isinstance(sent, Mapping) else dict(action)
-            self.targets |= numbers(taken)
+            _, present = self._latest or (0.0, {})
+            self._holdable.note(action, numbers(taken), present)
+            self.targets |= {key: value for key, value in numbers(taken).items() if key not in self._holdable.turned}
             return taken
 
         return permit.write(self.lock, exchange)
@@ -392,9 +404,15 @@ class DeviceBody:
         if targets:
             # LeRobot cannot send an action to an arm of which no motor is in it.
             write = partial(write_joints, self.device) if self._limp else self.device.send_action
-            self._exchange(lambda: write(targets), urgent=urgent)
+            sent = self._exchange(lambda: write(targets), urgent=urgent)
+            if isinstance(sent, Mapping):
+                self._holdable.note(targets, numbers(sent), present)
         # A bus does not confirm targets; what it answers after them shows that it took them.
         self.get_joints(READ_TRIES, urgent=urgent)
+        moving = [key for key in self.bounds if not is_velocity(key) and self._stiff(key)]
+        if problem := self._holdable.problem(present, moving=moving):
+            raise ConnectionError(problem)
+        self._holdable.held()
 
     def _stop_base(self, still: Mapping[str, float]) -> None:
         """Stop the wheels before the arm is read, which one silent motor fails."""
@@ -409,8 +427,12 @@ class DeviceBody:
         return {
             key: present[key]
             for key in self.bounds
-            if key in present and not is_velocity(key) and self._limp.isdisjoint({"", key.removesuffix(".pos")})
+            if key in present and not is_velocity(key) and self._stiff(key) and key not in self._holdable.turned
         }
+
+    def _stiff(self, key: str) -> bool:
+        """Return True unless the torque of that joint was switched off here."""
+        return self._limp.isdisjoint({"", key.removesuffix(".pos")})
 
     def _release(self, motors: Collection[str] = ()) -> None:
         """Switch torque off motor by motor, so that a silent one delays no other."""

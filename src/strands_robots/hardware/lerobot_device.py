@@ -54,7 +54,8 @@ def calibrate_from(device: Any, given: object, *, name: str, role: str) -> None:
         checked = checked_calibration(_content(given), {motor: each.id for motor, each in bus.motors.items()})
         device.calibration = {motor: made(**entry) for motor, entry in checked.items()}
         bus.calibration = device.calibration
-    if not device.calibration:
+    # A driver may bring the calibration of its motors, which have no other.
+    if not device.calibration and not getattr(bus, "calibration", None):
         command = f"strands-robots calibrate {name} --port {bus.port} --id {device.id}"
         raise ValidationError(
             f"{name} {device.id!r} has no calibration, for {device.calibration_fpath} is not there; "
@@ -262,6 +263,9 @@ _ROLES = {
     "follower": ("lerobot.robots", "RobotConfig", "make_robot_from_config"),
     "leader": ("lerobot.teleoperators", "TeleoperatorConfig", "make_teleoperator_from_config"),
 }
+_PREFIXES: Mapping[Role, str] = {"follower": "lerobot_robot_", "leader": "lerobot_teleoperator_"}
+"""Beginning of the import names of LeRobot's plug-ins."""
+
 _WITHOUT_TORCH = ("so_follower", "so_leader")
 """Modules that need no torch to be imported; the others are left alone where there is none."""
 
@@ -291,14 +295,14 @@ def make_device(name: str, options: Mapping[str, Any], role: Role = "follower", 
         raise missing_extra(f"The real robot {shown(name)}", "lerobot") from exc
     _register_all(devices)
     known: dict[str, Any] = getattr(devices, registry).get_known_choices()
-    kind = name if name in known else f"{name}_{role}"
-    if kind not in known:
+    kind = _kind(name, role, known)
+    if not kind:
         broken = _register_plug_in(str(name), role, lambda: getattr(devices, registry).get_known_choices())
         known = getattr(devices, registry).get_known_choices()
-        kind = name if name in known else kind
-        if kind not in known and broken:
+        kind = _kind(name, role, known)
+        if not kind and broken:
             raise ValidationError(f"LeRobot's plug-in for {shown(name)} cannot be loaded: {broken}.")
-    if kind not in known:
+    if not kind:
         similar = alike(str(name), known)
         hint = f"near it: {', '.join(similar)}" if similar else f"known: {', '.join(sorted(known))}"
         raise ValidationError(f"name must be a LeRobot {role} type, not {shown(name)}; {hint}.")
@@ -343,6 +347,13 @@ def _register_all(devices: Any) -> None:
             logger.debug("%s is not available: %s", module.name, exc)
 
 
+def _kind(name: str, role: Role, known: Mapping[str, Any]) -> str:
+    """Return the registered type that a name means; empty for none."""
+    # Some packages register their type under the name of the package.
+    meant = (name, f"{name}_{role}", f"{_PREFIXES[role]}{name}")
+    return next((each for each in meant if each in known), "")
+
+
 def _register_plug_in(name: str, role: Role, known: Callable[[], Mapping[str, Any]]) -> str:
     """Import LeRobot's plug-ins until one registers ``name``.
 
@@ -352,7 +363,7 @@ def _register_plug_in(name: str, role: Role, known: Callable[[], Mapping[str, An
     Returns:
         Errors of the packages that could not be imported; empty once the name is registered.
     """
-    prefix = {"follower": "lerobot_robot_", "leader": "lerobot_teleoperator_"}[role]
+    prefix = _PREFIXES[role]
     likely = prefix + name.removesuffix(f"_{role}").replace("-", "_")
     broken = []
     for package in sorted(lerobot_plug_ins(prefix), key=lambda each: (not each.startswith(likely), each)):
@@ -360,7 +371,7 @@ def _register_plug_in(name: str, role: Role, known: Callable[[], Mapping[str, An
             lerobot_module(package)
         except Exception as exc:  # noqa: BLE001 - a package of a stranger raises what it likes
             broken.append(f"{package}: {type(exc).__name__}: {' '.join(str(exc).split())}".rstrip("."))
-        if name in known():
+        if _kind(name, role, known()):
             return ""
     return "; ".join(broken)
 
