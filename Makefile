@@ -1,4 +1,4 @@
-.PHONY: help demo dashboard soak test test-all lint bench serve api system venv clean mcp bridge real-arm real-arm-test real-arm-next lerobot lerobot-next dds-security models
+.PHONY: help demo dashboard soak test test-all lint bench serve api system venv clean mcp bridge real-arm real-arm-test real-arm-next foreign lerobot lerobot-next dds-security models
 .DEFAULT_GOAL := help
 VENV := .venv
 BIN := $(VENV)/bin
@@ -92,6 +92,9 @@ lerobot-next:  ## The same on LeRobot 0.6.1, which needs Python 3.12 (PYTHON=pyt
 real-arm-next:  ## The arm driver of LeRobot 0.6.1, which needs Python 3.12 (PYTHON=python3.12), in .venv-lerobot-0.6.1
 	@./scripts/real-arm.sh 0.6.1
 	@./scripts/tests.sh .venv-lerobot-0.6.1/bin/python tests/integration/hardware $(ARGS)
+
+foreign:  ## Robots of other people's packages from the index, graded on emulated buses (ARGS=PACKAGE)
+	@./scripts/foreign.sh $(ARGS)
 
 soak: venv  ## A hundred robots at 10 Hz on the page for ten minutes (SECONDS=600)
 	@$(BIN)/python -m benchmarks.soak $(or $(SECONDS),600)
