@@ -19,7 +19,7 @@ from strands_robots.errors import ArgumentsError, NoAnswerError, RefusalError, U
 from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.remote_robot import RemoteRobot
 from strands_robots.safety.stopping import StopVerdict
-from strands_robots.serving.advertised import AdvertisedVerb
+from strands_robots.serving.advertised import WAITING, AdvertisedVerb
 from strands_robots.testing import bronze, gold
 from strands_robots.testing.bench import MotionRun, NetworkBench, NotKeptError, NotProvenError, wait_for
 from strands_robots.testing.promise import Promise, judged
@@ -64,6 +64,10 @@ class LiveBench(NetworkBench):
     def remote(self) -> RemoteRobot:
         """The robot on the network that its motions go to."""
         return self._moved
+
+    def plain_reads(self, network: str) -> list[AdvertisedVerb]:
+        """Return its reads that need no argument and wait for no motion."""
+        return [each for each in super().plain_reads(network) if each.name not in WAITING]
 
     def settle(self) -> None:
         """Halt a motion that was on its way to the robot while the halt overtook it."""
@@ -132,6 +136,8 @@ def _features(bench: NetworkBench) -> str:
     seen = set()
     for robot in bench.on.values():
         try:
+            if isinstance(robot.features().get("robots"), Mapping):
+                return "a world"
             seen.add(bronze.check_features(robot.features, robot.state))
         except UnknownVerbError as exc:
             raise NotProvenError(f"it has no features or no state on {robot.network}") from exc

@@ -110,6 +110,15 @@ def test_robot_that_nobody_serves_is_not_in_reach(machine: Machine) -> None:
     assert "barista" in answer["reason"]
 
 
+def test_world_of_another_process_is_read_as_one(tmp_path: Path) -> None:
+    machine = Machine(tmp_path / "state")
+    with machine.serving("arm-1", "--mode", "sim"):
+        code, report = machine.last_json("conform", "arm-1", "--live", "--tier", "bronze")
+    checks = {each["check"]: (each["mark"], each["said"]) for each in report["checks"]}
+    assert code == 0, checks
+    assert checks["bronze.status"] == checks["bronze.features"] == ("passed", "a world")
+
+
 class SaysIdleAndGoesOn(faulty_robots.IgnoresHalt):
     told = False
 
