@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 from pathlib import Path
 from typing import Any
@@ -37,10 +38,10 @@ def stands(arm: LedArm) -> None:
 
 def test_it_is_found_and_moves_for_its_leader_alone_until_it_is_stopped(arm: LedArm) -> None:
     with arm.led() as leading:
-        assert "arm-1" in arm.machine.run("peers").stdout
-        twin = arm.machine.run("teleop", "sweep", "led_arm", "--peer-id", "arm-1")
+        eventually(lambda: re.search(r"arm-1 .* busy ", arm.machine.run("peers").stdout), within=60)
+        twin = arm.start("teleop", "sweep", "led_arm", "--peer-id", "arm-1")
+        assert "--no-network leads it without one" in twin.communicate(timeout=60)[1]
         assert twin.returncode == 1
-        assert "--no-network leads it without one" in twin.stderr
         code, refused = arm.machine.json(*MOVE)
         assert code == 1
         assert "sweep (human) holds control" in refused["reason"]
@@ -70,7 +71,7 @@ def test_emergency_stop_locks_it_by_name_and_the_next_lead_begins_where_it_stand
     stood = arm.actions[-1]
 
     line = ("teleop", "sweep", "led_arm", "--peer-id", "arm-1", "--json")
-    locked = arm.machine.start(*line)
+    locked = arm.start(*line)
     try:
         held = event(locked, "held")
         assert "arm-1 is locked by the emergency stop of" in held["stopped_by"]
@@ -104,6 +105,22 @@ def test_it_is_on_both_networks_where_the_mesh_is_on(arm: LedArm) -> None:
         event(leading, "held")
 
 
+def test_follower_of_a_leader_on_the_mesh_is_held_by_it_and_stopped_on_device_connect(arm: LedArm) -> None:
+    publishing = arm.start("teleop", "sweep", "none", "--publish", "lead-1")
+    try:
+        eventually(lambda: "lead-1" in arm.machine.run("peers", "--mesh").stdout, within=60, what="the leader")
+        with arm.led(leader="mesh:lead-1") as leading:
+            code, refused = arm.machine.json(*MOVE)
+            assert code == 1
+            assert "lead-1 (human) holds control" in refused["reason"]
+            assert arm.machine.json("estop")[0] == 0
+            assert "arm-1 is locked by the emergency stop of" in event(leading, "held")["stopped_by"]
+            stands(arm)
+    finally:
+        publishing.send_signal(signal.SIGINT)
+        publishing.communicate(timeout=60)
+
+
 def test_leader_that_hangs_ends_the_teleoperation(arm: LedArm) -> None:
     with arm.led(leader="stuck") as leading:
         arm.hang("stuck")
@@ -128,7 +145,7 @@ def test_arm_whose_read_hangs_is_reported_as_such_and_moves_no_more(arm: LedArm)
 
 
 def test_without_a_network_it_is_found_by_nobody(arm: LedArm) -> None:
-    process = arm.machine.start("teleop", "sweep", "led_arm", "--no-network", "--json")
+    process = arm.start("teleop", "sweep", "led_arm", "--no-network", "--json")
     try:
         arm.moves()
         assert json.loads(arm.machine.run("peers", "--json").stdout or "{}").get("peers") in (None, [])
