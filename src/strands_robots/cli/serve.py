@@ -471,13 +471,14 @@ def _announce(screen: Screen, peer_id: str, link: LinkConfig, driver: DeviceDriv
 
 def _halt(screen: Screen, body: Any) -> bool:
     """Stop the robot and report it; True when it is known to stand still."""
-    screen.say("Stopping the robot...")
     # The robot is still on the network: a motion that started after this halt would outlive the process.
     put_away(getattr(body, "robot", body))
     halt = getattr(body, "halt", None)
     if not callable(halt):
         halt = adapt(body).halt
     verdict = halt("the operator ended serve")
+    # A terminal that takes no more output must not delay it.
+    screen.say("Stopping the robot...")
     answer = verdict.envelope()
     screen.data({"event": "stopped", **{key: answer[key] for key in ("status", "stopped", "halted") if key in answer}})
     screen.say(text_of(answer), "green" if answer["status"] == "success" else "bold red")
