@@ -12,7 +12,9 @@ from fixtures.driver_bench import DriverBench, drive
 from fixtures.toy_robots import ToyRobot
 from fixtures.waiting import eventually
 
+from strands_robots.audit import read_audit_log
 from strands_robots.device_connect import base_driver
+from strands_robots.device_connect.command_records import EACH_PER_S
 from strands_robots.mesh.resume_authority import keygen
 from strands_robots.safety.ed25519 import load_signing_key
 from strands_robots.safety.plane import plane
@@ -38,6 +40,20 @@ async def test_a_stop_that_did_not_happen_is_an_error_that_says_so(robot: ToyRob
         assert answer["status"] == "error"
         assert answer["stopped"] is False
         assert "toy" in answer["not_stopped"]
+
+
+async def test_stops_and_refused_motions_are_recorded_and_a_flood_of_them_is_counted(robot: ToyRobot) -> None:
+    async with DriverBench(drive(robot)) as bench:
+        for _ in range(20):
+            await bench.call("execute", "stranger", instruction="wave")
+        await bench.call("stop", "stranger")
+        await bench.call("getState", "stranger")
+    found = [each for each in read_audit_log() if each["peer_id"] == "bench-1"]
+    refused = [each["payload"] for each in found if each["event"] == "command_refused"]
+    assert (len(refused), refused[0]["action"], refused[0]["about"]) == (EACH_PER_S, "execute", "stranger")
+    assert "DEVICE_CONNECT_RPC_ALLOW" in refused[0]["reason"]
+    stops = [each["payload"] for each in found if each["event"] == "command_executed"]
+    assert stops == [{"about": "stranger", "action": "stop"}]
 
 
 async def test_nothing_to_stop_is_a_success(robot: ToyRobot) -> None:

@@ -21,6 +21,7 @@ from strands_robots import settings
 from strands_robots.adapted import is_value, warn_endless
 from strands_robots.contract import Haltable, Robot, RolloutEvent, Unsubscribe, observe
 from strands_robots.device_connect._compat import CollectedOnce, Runtime, describe_anew, emit, observed, on, rpc
+from strands_robots.device_connect.command_records import CommandRecords
 from strands_robots.device_connect.device_stops import DeviceStops, SafetyRegistration, stops_of
 from strands_robots.device_connect.presence import lock_stated
 from strands_robots.device_connect.telemetry import (
@@ -30,7 +31,7 @@ from strands_robots.device_connect.telemetry import (
     StateReports,
     sweep,
 )
-from strands_robots.envelope import Envelope, RefusalReason, Refused, error, jsonable, success
+from strands_robots.envelope import Envelope, RefusalReason, Refused, error, is_error, jsonable, success
 from strands_robots.safety.authorization import ANONYMOUS, Approval, Authorization, caller_name
 from strands_robots.safety.gate import MotionRequest
 from strands_robots.safety.stop_executor import stop_executor
@@ -166,6 +167,7 @@ class RobotDriver(CollectedOnce):
         self.runtime: Any = None
         self.policy_provider = ""
         """Of the last motion that was asked for, for a robot that tells no events."""
+        self._records = CommandRecords()
         self._watchers: list[asyncio.Task[None]] = []
         self._unsubscribe: Unsubscribe | None = None
         self._end_control: Callable[[], None] = lambda: None
@@ -185,7 +187,10 @@ class RobotDriver(CollectedOnce):
         own = self.own_verbs.get(function_name)
         verb = own or self.verbs.get(function_name)
         if verb is not None and verb.kind is Kind.STOP and function_name in self.built_verbs:
-            return await self._stop(verb, params, params.pop("source_device", None))
+            caller = params.pop("source_device", None)
+            answer = await self._stop(verb, params, caller)
+            self._records.stopped(self.peer_id, caller, answer)
+            return answer
         ours = own is not None or (function_name in self.built_verbs and not (observable and observed(self)))
         if verb is None or not ours:
             if verb is not None:
@@ -211,10 +216,13 @@ class RobotDriver(CollectedOnce):
             if request is not None:
                 request.give_up()
             return error(f"The robot did not answer {verb.name} in time; what it may still start is void.")
+        answer = enveloped(verb.name, result.result)
+        if moves and is_error(answer):
+            self._records.refused(self.peer_id, command, result.refusal, answer)
         if moves and result.refusal is None:
             logger.info("%s: %s by caller %s (self-declared).", self.peer_id, verb.name, shown(caller))
             self.reports.wake()
-        return enveloped(verb.name, result.result)
+        return answer
 
     def authorize(self, command: Command, arguments: Arguments) -> tuple[str, ...]:
         """Refuse a caller or a policy that is not allowed; return the caller's name."""
