@@ -24,13 +24,14 @@ PAGE = Path(__file__).parents[2] / "docs" / "your-robot.md"
     [
         (("math:tau", "--motion", "wave"), "--motion is for real hardware and for --live"),
         (("so100", "--limit", "0"), "--limit must"),
-        (("so100", "--tier", "iron"), "--tier must be one of bronze, silver, gold, not 'iron'"),
+        (("so100", "--tier", "iron"), "--tier must be one of bronze, silver, gold, platinum, not 'iron'"),
         (("arm-1", "--live", "--motion", "1up"), "--motion must be VERB KEY=VALUE"),
         (("arm-1", "--live", "--motion", "wave 'to me"), "--motion must be VERB KEY=VALUE"),
         (("arm-1", "--live", "--motion", "wave speed=NaN"), "speed must be finite"),
         (("arm-1", "--live", "--motion", "wave", "--approve-motions", "00"), "which names this list, not '00'"),
         (("arm 1", "--live"), "TARGET must"),
         (("so100", "--port", "4711"), "give --live with it"),
+        ((), "TARGET must say which robot is checked"),
     ],
     ids=str,
 )
@@ -38,6 +39,16 @@ def test_conform_refuses_by_name(run: Run, arguments: tuple[str, ...], said: str
     refused = run("conform", *arguments, "--json")
     assert refused.exit_code == Exit.USAGE
     assert said in json.loads(refused.stdout.splitlines()[-1])["reason"]
+
+
+def test_list_has_each_check_with_its_promise_and_why_it_matters(run: Run) -> None:
+    (line,) = run("conform", "--list", "--json").stdout.splitlines()
+    listed = json.loads(line)["checks"]
+    assert [each["check"] for each in listed] == [each.name for each in promises()]
+    assert {each["tier"] for each in listed} == {"bronze", "silver", "gold", "platinum"}
+    assert all(each["promise"] and each["matters"] and each["look"] for each in listed)
+    words = " ".join(run("conform", "--list").stdout.split())
+    assert all(f"{each['check']}: {each['promise']}" in words for each in listed)
 
 
 @pytest.mark.parametrize(

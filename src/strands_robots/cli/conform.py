@@ -27,7 +27,7 @@ from strands_robots.utils import ValidationError, choice, identifier, number, sh
 if TYPE_CHECKING:
     from strands_robots.testing import CheckResult, ConformanceReport, LongMotion, Subject
 
-TIERS = ("bronze", "silver", "gold")
+TIERS = ("bronze", "silver", "gold", "platinum")
 
 _STYLES = {"passed": "green", "exempt": "cyan", "not proven": "yellow"}
 
@@ -37,9 +37,13 @@ def conform(
     network: Network,
     *,
     target: Annotated[
-        str, typer.Argument(help="module:NAME of a Subject, or of what makes the robot; a robot's name; or an id.")
-    ],
-    tier: Annotated[str, typer.Option("--tier", help="The highest that is checked: bronze, silver or gold.")] = "gold",
+        str | None,
+        typer.Argument(help="module:NAME of a Subject, or of what makes the robot; a robot's name; or an id."),
+    ] = None,
+    tier: Annotated[
+        str, typer.Option("--tier", help="The highest that is checked: bronze, silver, gold or platinum.")
+    ] = "gold",
+    list_them: Annotated[bool, typer.Option("--list", help="List the checks with their promises, and end.")] = False,
     only: Annotated[list[str] | None, typer.Option("--only", help="A check, such as silver.halts (repeat).")] = None,
     options: Annotated[
         list[str] | None,
@@ -63,6 +67,11 @@ def conform(
     ] = None,
 ) -> None:
     """Check a robot on its emulated bus, where it moves. Exits 1 on a failure."""
+    if list_them:
+        _list(screen)
+        return
+    if target is None:
+        raise ValidationError("TARGET must say which robot is checked; --list lists the checks.")
     most = choice("--tier", tier, TIERS).upper()
     limit_s = number("--limit", limit, low=1, high=3600)
     chosen = _Chosen(most, tuple(only or ()), None if motion is None else parse_motion(motion), approve_motions)
@@ -86,6 +95,19 @@ def conform(
     if report.failed:
         names = ", ".join(each.check for each in report.failed)
         raise CliError(f"{report.name} does not keep {len(report.failed)} of its promises: {names}.")
+
+
+def _list(screen: Screen) -> None:
+    """Print each check with its promise, by tier."""
+    from strands_robots.testing import promises  # noqa: PLC0415 - loads both networks
+
+    screen.data({"event": "checks", "checks": [each.facts() for each in promises()]})
+    tier = ""
+    for each in promises():
+        if each.tier.label != tier:
+            tier = each.tier.label
+            screen.say(tier, "bold")
+        screen.say(f"  {each.name}: {each.text}")
 
 
 @dataclass(frozen=True, slots=True)

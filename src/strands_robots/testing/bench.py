@@ -21,11 +21,14 @@ from strands_robots.device_connect import init_device_connect_sync, stop_device_
 from strands_robots.device_connect.backends.config import loopback_config
 from strands_robots.envelope import text_of
 from strands_robots.errors import NoAnswerError, RefusalError, RobotError, StrandsRobotsError, UnreachableError
+from strands_robots.fleet.adapter import NetworkAdapter
 from strands_robots.fleet.device_connect.network import DeviceConnectNetwork
 from strands_robots.fleet.fleet import Fleet
 from strands_robots.fleet.mesh.network import MeshNetwork
+from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.remote_robot import RemoteRobot
 from strands_robots.fleet.reports import runs as says_it_runs
+from strands_robots.fleet.verdicts import FleetVerdict
 from strands_robots.mesh import init_mesh
 from strands_robots.safety.estop_listener import estop_listener
 from strands_robots.safety.plane import plane
@@ -198,7 +201,12 @@ class ConformanceBench(NetworkBench):
         super().__init__(subject)
         self._stack = ExitStack()
         self.body: Any = None
-        self._fleets: list[Fleet] = []
+        self.fleets: dict[str, Fleet] = {}
+        """A caller by network."""
+
+        self.estops: list[str] = []
+        """Ids of the emergency stops of the run."""
+
         self.halted_unlinked: StopVerdict | Exception = StopVerdict()
         """Verdict of a halt before it was on a network, or what that raised."""
 
@@ -210,15 +218,17 @@ class ConformanceBench(NetworkBench):
                 self.halted_unlinked = self.halt()
             except Exception as exc:  # noqa: BLE001 - the check of it says so
                 self.halted_unlinked = exc
-            runtime = init_device_connect_sync(self.body, peer_id=PEER, link=loopback_config())
-            stack.callback(stop_device_connect, runtime)
             peer = init_mesh(self.body, PEER)
             if peer is not None:
                 stack.callback(peer.close)
+            runtime = init_device_connect_sync(self.body, peer_id=PEER, link=loopback_config())
+            stack.callback(stop_device_connect, runtime)
             for network in (DeviceConnectNetwork(loopback_config(), CALLER), MeshNetwork(f"{CALLER}-mesh")):
-                fleet = stack.enter_context(Fleet([network]))
-                self._fleets.append(fleet)
-                self.on[network.name] = wait_for(partial(_found, fleet), ANSWER_S, "the robot on its network")
+                networks = Networks([network])
+                self.fleets[network.name] = stack.enter_context(Fleet(networks))
+                # Its id is known: there is no need to wait for others that may join.
+                wait_for(partial(_described, network), ANSWER_S, "the robot on its network")
+                self.on[network.name] = RemoteRobot(network.known(PEER), network, networks)
             wait_for(_estops_arrive, ANSWER_S, "its e-stop link")
             self._stack = stack.pop_all()
         return self
@@ -226,9 +236,15 @@ class ConformanceBench(NetworkBench):
     def __exit__(self, *exception: object) -> None:
         self._stack.__exit__(None, None, None)
 
-    def estop(self) -> None:
-        """Send an emergency stop to it, as a safety controller does."""
-        self._fleets[0].estop("emergency stop of a check")
+    def estop(self, network: str = "") -> FleetVerdict:
+        """Send an emergency stop to it, as a safety controller does.
+
+        Args:
+            network: over which; Device Connect by default.
+        """
+        verdict = self.fleets[network or next(iter(self.fleets))].estop("emergency stop of a check")
+        self.estops.append(verdict.estop_id)
+        return verdict
 
     def clear(self) -> None:
         """Free it, as an operator at this machine does."""
@@ -256,8 +272,7 @@ class ConformanceBench(NetworkBench):
         Raises:
             NotKeptError: it did not stop, or wrote after the verdict.
         """
-        if verdict.stopped is not True:
-            raise NotKeptError(f"{how}: {text_of(verdict.envelope())}")
+        check_stopped(verdict, how)
         self.check_no_write(count, how)
 
     @contextmanager
@@ -414,6 +429,16 @@ def made(subject: Subject) -> Iterator[Any]:
                 within(ANSWER_S, cleanup, "cleanup")
 
 
+def check_stopped(verdict: StopVerdict, how: str) -> None:
+    """Check that a verdict says stopped.
+
+    Raises:
+        NotKeptError: it says anything else.
+    """
+    if verdict.stopped is not True:
+        raise NotKeptError(f"{how}: {text_of(verdict.envelope())}")
+
+
 def usual_motion(bench: NetworkBench) -> LongMotion:
     """Return a task of the policy mock, or the first declared motion.
 
@@ -469,12 +494,12 @@ def wait_for(condition: Callable[[], T | None], seconds: float, what: str) -> T:
     return value
 
 
+def _described(network: NetworkAdapter) -> bool:
+    try:
+        return network.describe(PEER, anew=True) is not None and network.bears(PEER)
+    except RefusalError:
+        return False
+
+
 def _estops_arrive() -> bool:
     return all(each.link.up for each in estop_listener().registrations)
-
-
-def _found(fleet: Fleet) -> RemoteRobot | None:
-    try:
-        return fleet[PEER]
-    except RefusalError:
-        return None

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 from strands_robots.fleet.networks import Networks
-from strands_robots.testing import bronze, gold, silver
+from strands_robots.testing import bronze, gold, platinum, silver
 from strands_robots.testing.bench import ConformanceBench, NotProvenError
 from strands_robots.testing.live import LiveBench, check_live
 from strands_robots.testing.promise import Promise
@@ -32,14 +32,13 @@ MADE = Promise(
 
 def promises(most: Tier = Tier.PLATINUM) -> tuple[Promise, ...]:
     """Return the promises of each tier up to ``most``, in their order."""
-    return tuple(
-        each for each in (MADE, *bronze.PROMISES, *silver.PROMISES, *gold.PROMISES) if each.tier.value <= most.value
-    )
+    every = (MADE, *bronze.PROMISES, *silver.PROMISES, *gold.PROMISES, *platinum.PROMISES)
+    return tuple(each for each in every if each.tier.value <= most.value)
 
 
 def conform(
     subject: Subject,
-    most: Tier = Tier.PLATINUM,
+    most: Tier = Tier.GOLD,
     *,
     only: Iterable[str] = (),
     report: Callable[[CheckResult], None] = lambda result: None,
@@ -50,7 +49,7 @@ def conform(
 
     Args:
         subject: makes the robot.
-        most: the highest tier that is checked.
+        most: the highest tier that is checked. That of platinum is a load of some seconds, for a robot that is gold.
         only: names of checks; all by default.
         report: called with each result.
         checking: called with the name of each check before it begins.
@@ -85,7 +84,7 @@ def conform(
 def conform_live(
     networks: Networks,
     robot: str,
-    most: Tier = Tier.PLATINUM,
+    most: Tier = Tier.GOLD,
     *,
     motion: LongMotion | None = None,
     only: Iterable[str] = (),
@@ -146,17 +145,23 @@ class PromiseChecks:
 
     def __init__(self, check: Callable[[Promise], CheckResult], *, waits: bool = True) -> None:
         self._check, self._waits = check, waits
-        self._lacking: set[str] = set()
+        self._lacking: dict[str, Tier] = {}
 
-    def blocked(self, promise: Promise) -> bool:
-        """Return True for a promise without whose need it cannot be checked."""
-        return self._waits and promise.needs in self._lacking
+    def blocked(self, promise: Promise) -> str:
+        """Return the promise without which this one cannot be checked, or ""."""
+        if not self._waits:
+            return ""
+        if promise.tier is Tier.PLATINUM:
+            # A load on a robot that is not gold says nothing of the load.
+            return next((name for name, tier in self._lacking.items() if tier is not promise.tier), "")
+        return promise.needs if promise.needs in self._lacking else ""
 
     def check(self, promise: Promise) -> CheckResult:
         """Check a promise, or say which one it waits for."""
-        result = waiting(promise, promise.needs) if self.blocked(promise) else self._check(promise)
+        needed = self.blocked(promise)
+        result = waiting(promise, needed) if needed else self._check(promise)
         if result.mark not in GOOD:
-            self._lacking.add(promise.name)
+            self._lacking[promise.name] = promise.tier
         return result
 
 

@@ -51,6 +51,13 @@ class Promise:
         """Return a result of this promise."""
         return CheckResult(self.name, self.tier, mark, said, self.text, self.why, self.look, round(seconds, 3))
 
+    def facts(self) -> dict[str, str]:
+        """Return what it says, as JSON can carry it."""
+        return {
+            **{"check": self.name, "tier": self.tier.label, "promise": self.text},
+            **{"matters": self.why, "look": self.look, "needs": self.needs},
+        }
+
     def _judged(self, bench: ConformanceBench) -> tuple[CheckMark, str]:
         if self.needs_recorder and bench.subject.recorder is None:
             return CheckMark.NOT_PROVEN, NO_RECORDER

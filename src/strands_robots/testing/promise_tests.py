@@ -16,7 +16,7 @@ from strands_robots.utils import ValidationError, shown
 
 
 def conformance_tests(
-    subject: Subject | Callable[[], Subject], most: Tier = Tier.PLATINUM, *, proven: Tier | None = None
+    subject: Subject | Callable[[], Subject], most: Tier = Tier.GOLD, *, proven: Tier | None = None
 ) -> type:
     """Return a class of tests, one for each promise of a robot.
 

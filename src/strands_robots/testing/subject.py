@@ -12,13 +12,20 @@ from typing import Any
 
 from strands_robots.utils import ValidationError, number, shown, text
 
+Values = Mapping[str, float]
+"""Positions by joint, in the unit in which the robot states its limits."""
+
 
 @dataclass(frozen=True, slots=True)
 class BusWrite:
-    """One write to a robot's bus: its moment in monotonic s, and what was written."""
+    """One write to a robot's bus: its moment in monotonic s, and what was written.
+
+    ``values`` are the joints' positions that it commands; empty where the recorder was not given any.
+    """
 
     at: float
     what: str
+    values: Values = field(default_factory=dict)
 
 
 class BusRecorder:
@@ -30,22 +37,36 @@ class BusRecorder:
         recorder = BusRecorder()
         recorder.watch(robot.bus, "write", "sync_write")     # these methods of it
 
-    or call :meth:`wrote` from the emulated bus itself, before each write.
+    or call :meth:`wrote` from the emulated bus itself, before each write. With the positions that each write commands
+    the limits and speeds of the robot are proven as well::
+
+        recorder.wrote("goal", {"pan": 12.5})
+        recorder.watch(device, "send_action", values=lambda action: action)
     """
 
     def __init__(self) -> None:
         self._writes: list[BusWrite] = []
         self._fault: Callable[[], None] | None = None
 
-    def wrote(self, what: object = "") -> None:
-        """Record a write that is made now; raise what a check has the bus raise."""
+    def wrote(self, what: object = "", values: Values | None = None) -> None:
+        """Record a write that is made now; raise what a check has the bus raise.
+
+        Args:
+            what: in a few words.
+            values: the positions that it commands, by joint, in the unit of the robot's limits.
+        """
         fault = self._fault
         if fault is not None:
             fault()
-        self._writes.append(BusWrite(time.monotonic(), str(what)[:200]))
+        self._writes.append(BusWrite(time.monotonic(), str(what)[:200], dict(values or {})))
 
-    def watch(self, bus: Any, *methods: str) -> None:
+    def watch(self, bus: Any, *methods: str, values: Callable[..., Values] | None = None) -> None:
         """Record each call of these methods of ``bus``.
+
+        Args:
+            bus: the object that writes.
+            methods: names of its methods.
+            values: called with a call's arguments; returns the positions that it commands, by joint.
 
         Raises:
             ValidationError: it has no such method.
@@ -54,12 +75,14 @@ class BusRecorder:
             method = getattr(bus, name, None)
             if not callable(method):
                 raise ValidationError(f"methods must be methods of {shown(bus)}, not {shown(name)}.")
-            setattr(bus, name, self._recorded(name, method))
+            setattr(bus, name, self._recorded(name, method, values))
 
-    def _recorded(self, name: str, method: Callable[..., Any]) -> Callable[..., Any]:
+    def _recorded(
+        self, name: str, method: Callable[..., Any], values_of: Callable[..., Values] | None
+    ) -> Callable[..., Any]:
         @wraps(method)
         def call(*values: Any, **named: Any) -> Any:
-            self.wrote(name)
+            self.wrote(name, None if values_of is None else values_of(*values, **named))
             return method(*values, **named)
 
         return call
@@ -152,6 +175,12 @@ class Subject:
     watch_s: float = 0.25
     """Seconds after a verdict in which no write may follow; several periods of its control loop."""
 
+    limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    """Lowest and highest position by joint, for what its features do not state."""
+
+    speeds: Mapping[str, float] = field(default_factory=dict)
+    """Greatest speed by joint, in its unit a second."""
+
     def __post_init__(self) -> None:
         if not callable(self.make):
             raise ValidationError(f"make must be a callable that makes the robot, not {shown(self.make)}.")
@@ -161,5 +190,12 @@ class Subject:
         number("deadline_s", self.deadline_s, low=0.1, high=60)
         number("answer_s", self.answer_s, low=0.1, high=60)
         number("watch_s", self.watch_s, low=0.01, high=60)
+        for joint, limits in self.limits.items():
+            named = f"limits[{joint!r}]"
+            if not isinstance(limits, tuple | list) or len(limits) != 2:
+                raise ValidationError(f"{named} must be the lowest and the highest position, not {shown(limits)}.")
+            number(named, limits[1], above=number(named, limits[0]))
+        for joint, speed in self.speeds.items():
+            number(f"speeds[{joint!r}]", speed, above=0)
         for check, reason in self.exempt.items():
             text(f"exempt[{check!r}]", reason, longest=500)

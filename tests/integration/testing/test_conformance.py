@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -29,9 +30,11 @@ def example(name: str) -> Any:
     return module
 
 
-def test_robot_that_keeps_its_promises_is_gold() -> None:
-    report = conform(subject(Rig))
-    assert report.tier is Tier.GOLD, report.words()
+def test_robot_that_keeps_its_promises_is_platinum() -> None:
+    report = conform(subject(Rig), Tier.PLATINUM)
+    # The one thing that another program of this machine can keep from being proven; a failure it cannot.
+    busy = [each.check for each in report.results if "this machine" in each.said] == ["platinum.estop"]
+    assert report.tier is (Tier.GOLD if busy else Tier.PLATINUM), report.words()
     assert report.name == "Rig"
     assert not report.failed
 
@@ -122,6 +125,20 @@ def test_examples_are_gold() -> None:
         assert report.tier is Tier.GOLD, report.words()
 
 
+def test_limits_without_positions_or_speeds_are_not_proven_and_say_what_to_give() -> None:
+    checked = ["platinum.limits"]
+    (result,) = conform(replace(subject(Rig), speeds={}), Tier.PLATINUM, only=checked).results
+    assert (result.mark, "Subject(speeds={'pan': 45.0})" in result.said) == (CheckMark.NOT_PROVEN, True)
+
+    class WithoutPositions(Rig):
+        def write(self, angle: float) -> None:
+            self.recorder.wrote("angle")
+            self.angle = angle
+
+    (result,) = conform(subject(WithoutPositions), Tier.PLATINUM, only=checked).results
+    assert (result.mark, "recorder.wrote(" in result.said) == (CheckMark.NOT_PROVEN, True)
+
+
 FAULTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "IgnoresHalt": (("silver.halts",), ()),
     "KeepsItsSpeed": (("silver.halts",), ()),
@@ -150,13 +167,19 @@ FAULTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "ReadsNaN": (("bronze.features",), ()),
     "RaisesInARead": (("bronze.reads",), ("gold.reads", "gold.own_verbs")),
     "AnswersWhatJsonCannotCarry": (("bronze.reads",), ("gold.reads", "gold.own_verbs")),
+    "StopsSlowly": (("platinum.estop",), ()),
+    "MovesBeyondItsLimit": (("platinum.limits",), ()),
+    "MovesFasterThanItSays": (("platinum.limits",), ()),
+    "WritesNaN": (("platinum.limits",), ()),
+    "KeepsItsKeyOpen": (("platinum.signed",), ()),
+    "WritesIntoTheAudit": (("platinum.audit",), ()),
 }
 """Checks that find each fault, and those that it may also fail."""
 
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_fault_is_found_by_its_check_and_by_no_wrong_one(fault: str) -> None:
-    report = conform(subject(getattr(faulty_robots, fault)))
+    report = conform(subject(getattr(faulty_robots, fault)), Tier.PLATINUM)
     found, also = FAULTS[fault]
     failed = {each.check for each in report.failed}
     assert set(found) <= failed, report.words()
