@@ -17,19 +17,15 @@ if TYPE_CHECKING:
 
 @pytest.fixture
 def robots() -> Iterator[Callable[..., RobotLab]]:
-    """Serve simulated robots on a private network: ``lab = robots(50)``.
+    """Serve simulated robots, once in a test: ``lab = robots(50)``.
 
     The arguments are those of ``RobotLab``.
     """
     from strands_robots.testing import RobotLab  # noqa: PLC0415 - loads the network, which few tests need
 
     with ExitStack() as stack:
-        served: list[RobotLab] = []
 
         def serve(count: int = 1, more: Mapping[str, str] | None = None) -> RobotLab:
-            if served:
-                pytest.fail("robots() serves one lab in a test; ask for all robots at once.", pytrace=False)
-            served.append(stack.enter_context(RobotLab(count, more)))
-            return served[0]
+            return stack.enter_context(RobotLab(count, more))
 
         yield serve

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import sys
+import threading
 import time
 from collections.abc import Awaitable, Callable, Coroutine, Iterable, Iterator, Mapping
 from contextlib import ExitStack
@@ -41,6 +42,8 @@ SETTINGS = {
 }
 
 KNOWN = frozenset(each.name for each in settings.declared())
+
+_ONLY_ONE = threading.Lock()
 
 STANDS = success("It stands.", stopped=True)
 UNREACHED = error("No order reaches it.", stopped=False)
@@ -216,7 +219,6 @@ class RobotLab:
 
     Raises:
         ValidationError: ``count`` outside its domain, or a setting that does not exist.
-        TimeoutError: they were not served within 60 s.
     """
 
     def __init__(self, count: int, more: Mapping[str, str] | None = None) -> None:
@@ -231,7 +233,16 @@ class RobotLab:
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
+        """Serve the robots; return once all of them can be found, called and stopped.
+
+        Raises:
+            RuntimeError: this process has another lab.
+            TimeoutError: they were not served within 60 s.
+        """
+        if not _ONLY_ONE.acquire(blocking=False):
+            raise RuntimeError("a process has one lab at a time; leave the other one first")
         with ExitStack() as stack:
+            stack.callback(_ONLY_ONE.release)
             stack.enter_context(private_network(HALT_DEADLINE_S, self._settings))
             settings.put("ZENOH_CONNECT", str(loopback_config().meeting_point))
             self._loop = LoopThread("robot-lab")

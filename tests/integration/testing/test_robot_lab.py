@@ -176,6 +176,13 @@ def test_unknown_robot_is_refused_with_the_names_that_there_are() -> None:
         RobotLab(1)["robot-7"]
 
 
+def test_second_lab_is_refused_and_the_first_one_goes_on(lab: RobotLab) -> None:
+    with pytest.raises(RuntimeError, match="one lab at a time"), RobotLab(1):
+        pytest.fail("two labs share one environment")
+    with connect() as fleet:
+        assert fleet["robot-1"].call("getState")["status"] == "success"
+
+
 def test_lab_that_is_not_entered_says_how() -> None:
     with pytest.raises(RuntimeError, match="with RobotLab"):
         RobotLab(1)["robot-1"].cut()
