@@ -20,7 +20,7 @@ import strands_robots
 from strands_robots import HardwareRobot, Robot, Simulation
 from strands_robots.contract import TaskRobot, WorldRobot
 from strands_robots.moved import METHODS
-from strands_robots.utils import MissingExtraError, ValidationError
+from strands_robots.utils import MissingExtraError, ValidationError, missing_extra
 
 
 @dataclass
@@ -110,6 +110,23 @@ def test_bad_argument_is_refused_by_name(arguments: dict[str, Any], reason: str)
 def test_missing_lerobot_is_reported_with_the_extra() -> None:
     with pytest.raises(MissingExtraError, match=r"\[lerobot\] extra"):
         Robot("so100", mode="real")
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [("so100", "^Simulation needs"), ("my_robot", "^There is no robot 'my_robot' of an installed package")],
+)
+def test_missing_simulation_is_reported_beside_a_robot_that_no_package_has(
+    name: str, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class WithoutMujoco(ModuleType):
+        @property
+        def Simulation(self) -> Any:
+            raise missing_extra("Simulation", "sim")
+
+    monkeypatch.setitem(sys.modules, "strands_robots.simulation", WithoutMujoco("strands_robots.simulation"))
+    with pytest.raises(MissingExtraError, match=said):
+        Robot(name)
 
 
 def test_real_robot_is_configured_and_connected_without_calibration(stand_in: list[_Config]) -> None:

@@ -22,7 +22,7 @@ from strands_robots.plug_ins import PlugIn, PlugIns, takes
 from strands_robots.safety.scope import own_cell
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.tags import own_tags
-from strands_robots.utils import ValidationError, choice, own_device_id, shown
+from strands_robots.utils import MissingExtraError, ValidationError, choice, own_device_id, shown
 from strands_robots.utils import peer_id as valid_peer_id
 
 logger = logging.getLogger(__name__)
@@ -245,7 +245,12 @@ def run(
 
 
 def _simulated(name: str, tool_name: str | None, options: dict[str, Any]) -> Any:
-    from strands_robots.simulation import Simulation, furnish  # noqa: PLC0415 - loads MuJoCo
+    try:
+        from strands_robots.simulation import Simulation, furnish  # noqa: PLC0415 - loads MuJoCo
+    except MissingExtraError as exc:
+        if name in PLUG_INS.built_in:
+            raise
+        raise MissingExtraError(f"There is no robot {shown(name)} of an installed package. {exc}") from exc
 
     label, scene, tip = _label(name), options.pop("scene", None), options.pop("tip", "")
     simulation = _construct(_networked(Simulation), tool_name=tool_name or label, **options)
