@@ -74,6 +74,27 @@ def test_hold_of_its_own_stops_any_device(monkeypatch: pytest.MonkeyPatch) -> No
     assert device.told == {}
 
 
+class ArmOnBase(RecordingDevice):
+    """It needs the speed of its base in every action, as LeRobot's LeKiwi does."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.positions["x.vel"] = 0.0
+
+    def send_action(self, action: dict[str, float]) -> dict[str, float]:
+        return super().send_action({**action, "x.vel": action["x.vel"]})
+
+
+def test_base_that_an_action_does_not_name_is_told_to_stand() -> None:
+    device = ArmOnBase()
+    robot = connected(device)
+    assert robot.send_action({"pan.pos": 11.0})["status"] == "success"
+    assert device.writes[-1].action == {"pan.pos": 11.0, "x.vel": 0.0}
+    assert robot.send_action({"x.vel": 0.2})["status"] == "success"
+    assert device.writes[-1].action == {"x.vel": 0.2}
+    assert robot.halt("test").stopped is True
+
+
 def test_driver_that_bounds_a_step_or_a_range_may_take_something_else() -> None:
     check = HoldCheck("arm")
     check.note(

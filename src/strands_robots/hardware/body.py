@@ -96,6 +96,8 @@ class DeviceBody:
         self.lock = bus_lock(device)
         self.bounds = {**action_ranges(device), **_checked(joint_ranges or {}, device)}
         positions = [key for key in self.bounds if not is_velocity(key)]
+        # LeRobot's driver of an arm on a base takes no action without the speeds of the base.
+        self._still = {key: 0.0 for key in self.bounds if is_velocity(key)} if positions else {}
         self._speeds = {} if speed_limit is None else checked_speeds(speed_limit, positions)
         self._read_joints = joint_reader(device)
         self.speeds = default_speeds(device) | self._speeds
@@ -259,7 +261,7 @@ class DeviceBody:
                 self._stiffen()
             self.driven = True
             # A driver that bounds the step reads the joints first, whose answer may be lost.
-            return self.device.send_action(dict(action))
+            return self.device.send_action(self._still | dict(action))
 
         def exchange() -> Mapping[str, Any]:
             sent = self._exchange(send, self._send_tries)
@@ -457,7 +459,7 @@ class DeviceBody:
         try:
             targets = self._targets(present)
             if targets:
-                self._exchange(lambda: self.device.send_action(targets))
+                self._exchange(lambda: self.device.send_action(self._still | targets))
             for motor in limp:
                 bus, own = self._torque[motor]
                 enable = getattr(bus, "enable_torque", None)
