@@ -35,7 +35,7 @@ EXTRA_MEANINGS = {
     "rosbridge": "ROS 1 and ROS 2 robots behind a rosbridge server",
     "ros2": "ROS 2 robots over bare DDS, without a ROS 2 installation",
     "record": "recordings of robots as MCAP files",
-    "dataset": "episodes of LeRobot's datasets as leaders (not in `all`)",
+    "dataset": "LeRobot's datasets: episodes written, checked, and as leaders (not in `all`)",
     "lerobot": "real arms through LeRobot, and its checkpoints (brings torch; not in `all`)",
     "all": "everything but `bridge`, `dataset`, `lerobot` and `lerobot-async`",
 }

@@ -41,7 +41,16 @@ FLOORS: list[set[str]] = [
         "moved",
     },
     {"safety", "audit", "adapted", "contract", "verb_declaration", "verb_parameters"},
-    {"arm_mixin", "kinematics", "leader_thread", "policies", "teleop_mixin", "teleoperators", "recording"},
+    {
+        "arm_mixin",
+        "datasets",
+        "kinematics",
+        "leader_thread",
+        "policies",
+        "recording",
+        "teleop_mixin",
+        "teleoperators",
+    },
     {
         "hardware",
         "simulation",

@@ -261,6 +261,7 @@ COMMANDS = {
     "dashboard": ("dashboard", "demo"),
     "teleop": ("teleop", "calibrate", "replay"),
     "record": ("record",),
+    "dataset": ("dataset",),
     "policy": ("policy", "eval"),
     "audit": ("audit",),
     "keys": ("keys", "mesh"),
@@ -272,6 +273,7 @@ COMMANDS = {
 
 GROUPS: Mapping[str, tuple[str, tuple[str, ...]]] = {
     "policy": ("Look at trained policies before a robot moves by them.", ("check", "bench")),
+    "dataset": ("Episodes to train by, in LeRobot's format.", ("from-mcap", "check")),
     "audit": ("The safety record of this machine.", ("tail", "show", "verify")),
     "keys": ("Keys that free robots and sign their stops.", ("resume", "estop", "console", "mcp")),
     "mesh": ("The native mesh: certificates and access rules.", ("keys",)),
@@ -279,7 +281,7 @@ GROUPS: Mapping[str, tuple[str, tuple[str, ...]]] = {
 }
 """Words that stand before other ones: what they are about, and those."""
 
-FUNCTIONS = {"eval": "evaluate"}
+FUNCTIONS = {"eval": "evaluate", "from-mcap": "from_mcap"}
 """Functions whose name is not that of their command."""
 
 HELP = """Robots on Device Connect and the native mesh: serve one, find them, drive them, and stop them.

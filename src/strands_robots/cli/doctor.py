@@ -47,7 +47,7 @@ _EXTRAS: dict[str, tuple[str, ...]] = {
     "groot": ("msgpack",),
     "lerobot-async": ("grpcio",),
     "record": ("mcap", "pillow"),
-    "dataset": ("pyarrow",),
+    "dataset": ("av", "mcap", "numpy", "pillow", "pyarrow"),
     "lerobot": ("lerobot",),
     "rosbridge": ("websockets",),
     "ros2": ("cyclonedds",),

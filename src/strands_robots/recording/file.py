@@ -229,13 +229,13 @@ class Recorder:
         """Record the joints of this moment; returns at once."""
         self._put(RecordedJoints(time.time(), device, joints))
 
-    def take_picture(self, device: str, camera: str, jpeg: bytes) -> None:
-        """Record a picture; returns at once."""
+    def take_picture(self, device: str, camera: str, jpeg: bytes, at: float | None = None) -> None:
+        """Record a picture, of now or of ``at`` (s since the epoch); returns at once."""
         if self._picture_bytes > PENDING_PICTURE_BYTES:
             self.lost += 1
             return
         self._picture_bytes += len(jpeg)
-        self._put(RecordedPicture(time.time(), device, camera, jpeg))
+        self._put(RecordedPicture(time.time() if at is None else at, device, camera, jpeg))
 
     def _put(self, item: RecordedItem) -> None:
         try:

@@ -1,0 +1,244 @@
+"""Episodes of a dataset from recordings of robots (MCAP).
+
+Each task that a robot carried out is an episode; a recording without tasks is one. Its steps, joints and pictures are
+put on the grid of the dataset: a frame has what was newest at its moment, and how old that was.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from strands_robots.datasets.episodes import FRAMES_MAX, Dataset, DatasetEpisode
+from strands_robots.datasets.layout import DatasetError, DatasetInfo, Feature
+from strands_robots.datasets.video import Video, VideoWriter
+from strands_robots.policies.base import numbers
+from strands_robots.recording.file import STEP, RecordedEvent, RecordedItem, RecordedPicture, read_items
+from strands_robots.utils import ValidationError, shown
+
+STATE, ACTION, SUCCESS, STOP, INTERVENTION = "observation.state", "action", "next.success", "stop", "intervention"
+AGE, SAME, IMAGES = "observation.age_ms.", "observation.same.", "observation.images."
+
+STOPPED, EMERGENCY = 1, 2
+"""Values of the feature ``stop``; 0 is none."""
+
+_STOPS = {"halted": STOPPED, "locked": EMERGENCY, "emergencyStop": EMERGENCY}
+_ENDS = ("taskComplete", "policyComplete")
+_STARTS = ("taskStarted", "policyStarted")
+
+
+@dataclass
+class Attempt:
+    """One task of a robot as it was recorded.
+
+    ``steps`` are moments in seconds, observations and actions by name; ``pictures`` moments and JPEG by camera.
+    """
+
+    instruction: str = ""
+    steps: list[tuple[float, dict[str, float], dict[str, float]]] = field(default_factory=list)
+    pictures: dict[str, list[tuple[float, bytes]]] = field(default_factory=dict)
+    stops: list[tuple[float, int]] = field(default_factory=list)
+
+
+def attempts_of(path: Path, robot: str | None = None) -> list[Attempt]:
+    """Return the attempts in a recording; of a cut file, those that it has.
+
+    Args:
+        path: an ``.mcap`` file of one robot's tasks.
+        robot: whose, where several were recorded; ``WORLD/ROBOT`` of a simulated world.
+
+    Raises:
+        ValidationError: no recording, no steps in it, or those of several robots and none named.
+        MissingExtraError: the [dataset] extra is not installed.
+    """
+    items = list(read_items(path))
+    known = sorted({each.robot for each in items if isinstance(each, RecordedEvent) and each.event == STEP})
+    if not known:
+        raise ValidationError(f"{path.name} has no steps of a task: nothing in it is an episode.")
+    if robot not in known and (robot is not None or len(known) > 1):
+        raise ValidationError(
+            f"robot must be one of those that were recorded ({', '.join(known)}), not {shown(robot)}."
+        )
+    chosen = robot or known[0]
+    attempts = list(_attempts(items, chosen))
+    for each in items:
+        if isinstance(each, RecordedPicture) and chosen.partition("/")[0] == each.device.partition("/")[0]:
+            for attempt in attempts:
+                attempt.pictures.setdefault(each.camera, []).append((each.at, each.jpeg))
+    return attempts
+
+
+def _attempts(items: Sequence[RecordedItem], robot: str) -> Iterator[Attempt]:
+    attempt = Attempt()
+    for each in items:
+        if not isinstance(each, RecordedEvent) or each.robot not in (robot, robot.partition("/")[0]):
+            continue
+        if each.event in _STARTS or each.event in _ENDS:
+            if attempt.steps and each.event in _STARTS:
+                yield attempt
+                attempt = Attempt()
+            if each.event in _ENDS and each.payload.get("state") == "stopped":
+                attempt.stops.append((each.at, STOPPED))
+            attempt.instruction = str(each.payload.get("instruction") or attempt.instruction)
+            if each.event in _ENDS and attempt.steps:
+                yield attempt
+                attempt = Attempt()
+        elif each.event == STEP and each.robot == robot:
+            observation, action = (_numbers(each.payload.get(name)) for name in ("observation", "action"))
+            attempt.steps.append((each.at, observation, action))
+        elif (code := _STOPS.get(each.event)) is not None:
+            attempt.stops.append((each.at, code))
+    if attempt.steps:
+        yield attempt
+
+
+def info_of(attempts: Sequence[Attempt], fps: int, robot_type: str) -> DatasetInfo:
+    """Return the kind of episodes that attempts are.
+
+    Raises:
+        ValidationError: they differ in their names or cameras, or have none.
+    """
+    first = attempts[0]
+    states = {tuple(observation) for each in attempts for _, observation, _ in each.steps}
+    if len(states) > 1:
+        raise ValidationError("the steps do not all state the same joints; they are episodes of different robots.")
+    state = states.pop()
+    told = {name: None for each in attempts for _, _, action in each.steps for name in action}
+    if not state or not told:
+        raise ValidationError("the steps state no joints or no actions.")
+    features: dict[str, Feature] = {
+        STATE: Feature("float32", (len(state),), state),
+        ACTION: Feature("float32", (len(told),), tuple(told)),
+        f"{AGE}state": Feature("float32"),
+        SUCCESS: Feature("bool"),
+        STOP: Feature("int64"),
+        INTERVENTION: Feature("bool"),
+    }
+    for camera in sorted(first.pictures):
+        if any(not each.pictures.get(camera) for each in attempts):
+            raise ValidationError(f"camera {camera} has no picture of one of the attempts.")
+        features[f"{IMAGES}{camera}"] = Feature("video", decoded(first.pictures[camera][0][1]).shape)
+        features[f"{AGE}{camera}"] = Feature("float32")
+        features[f"{SAME}{camera}"] = Feature("bool")
+    return DatasetInfo(fps, features, robot_type)
+
+
+def save_attempt(dataset: Dataset, attempt: Attempt, task: str, *, success: bool) -> int:
+    """Put an attempt on the grid of a dataset and save it.
+
+    Args:
+        dataset: made for attempts of its kind.
+        attempt: with steps.
+        task: in words; that of the attempt where it is empty.
+        success: of the whole attempt.
+
+    Returns:
+        The index of the episode.
+
+    Raises:
+        ValidationError: it does not fit the dataset.
+        DatasetError: it cannot be written.
+    """
+    steps, fps = attempt.steps, dataset.info.fps
+    began = steps[0][0]
+    count = int((steps[-1][0] - began) * fps) + 1
+    if count > FRAMES_MAX:
+        raise ValidationError(f"an episode must have 1 to {FRAMES_MAX:,} frames, not {count:,}.")
+    moments = began + np.arange(count) / fps
+    newest = _newest(moments, [at for at, _, _ in steps])
+    state, action = (dataset.info.features[name].names for name in (STATE, ACTION))
+    told = _told(steps)
+    columns: dict[str, NDArray[Any]] = {
+        STATE: _rows(state, [observation for _, observation, _ in steps])[newest],
+        ACTION: _rows(action, told)[newest],
+        f"{AGE}state": (moments - np.array([steps[index][0] for index in newest])) * 1000,
+        SUCCESS: np.arange(count) == (count - 1 if success else -1),
+        STOP: _stops(moments, attempt.stops),
+        INTERVENTION: np.zeros(count, dtype=bool),
+    }
+    videos: dict[str, Video] = {}
+    for name in dataset.info.videos:
+        camera = name.removeprefix(IMAGES)
+        videos[name] = _encoded(dataset, attempt.pictures.get(camera, []), camera, moments, columns)
+    return dataset.save(DatasetEpisode(task or attempt.instruction or "unnamed", columns, videos))
+
+
+def decoded(jpeg: bytes) -> NDArray[np.uint8]:
+    """Return the pixels of a JPEG, RGB in ``(height, width, 3)``.
+
+    Raises:
+        DatasetError: it is none, or larger than a camera's.
+    """
+    from PIL import Image, UnidentifiedImageError  # noqa: PLC0415 - an extra
+
+    try:
+        with Image.open(io.BytesIO(jpeg), formats=["JPEG"]) as image:
+            return np.asarray(image.convert("RGB"))
+    except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as exc:
+        raise DatasetError(f"a picture cannot be decoded: {exc}") from exc
+
+
+def _encoded(
+    dataset: Dataset,
+    pictures: Sequence[tuple[float, bytes]],
+    camera: str,
+    moments: NDArray[np.float64],
+    columns: dict[str, NDArray[Any]],
+) -> Video:
+    """Encode the newest picture of each frame, and state its age in ``columns``."""
+    newest = _newest(moments, [at for at, _ in pictures])
+    columns[f"{AGE}{camera}"] = np.maximum(moments - np.array([pictures[index][0] for index in newest]), 0) * 1000
+    same = [False, *(pictures[now][1] == pictures[before][1] for before, now in pairwise(newest))]
+    columns[f"{SAME}{camera}"] = np.array(same)
+    height, width, _ = dataset.info.features[f"{IMAGES}{camera}"].shape
+    pixels, last = None, -1
+    with VideoWriter(dataset.running / f"{camera}.mp4", dataset.info.fps, width, height) as video:
+        for index in newest:
+            if pixels is None or index != last:
+                pixels, last = decoded(pictures[index][1]), index
+            video.write(pixels)
+        return video.finish()
+
+
+def _newest(moments: NDArray[np.float64], times: Sequence[float]) -> list[int]:
+    """Return the index of the newest time at each moment, else of the first."""
+    if not times:
+        raise ValidationError("a camera has no picture.")
+    # A step at its own moment counts although its time was rounded to nanoseconds.
+    return list(np.maximum(np.searchsorted(np.array(times), moments + 1e-6, side="right") - 1, 0))
+
+
+def _told(steps: Sequence[tuple[float, Mapping[str, float], Mapping[str, float]]]) -> list[dict[str, float]]:
+    """Return the whole action of each step: a joint keeps what it was told."""
+    told: dict[str, float] = {}
+    whole = []
+    for _, observation, action in steps:
+        told = {**told, **action}
+        whole.append({**observation, **told})
+    return whole
+
+
+def _rows(names: Sequence[str], rows: Sequence[Mapping[str, float]]) -> NDArray[np.float32]:
+    lacking = sorted({name for row in rows for name in names if name not in row})
+    if lacking:
+        raise ValidationError(f"{', '.join(lacking)} is missing in a step.")
+    return np.array([[row[name] for name in names] for row in rows], dtype=np.float32)
+
+
+def _stops(moments: NDArray[np.float64], stops: Sequence[tuple[float, int]]) -> NDArray[np.int64]:
+    column = np.zeros(len(moments), dtype=np.int64)
+    for at, code in stops:
+        index = min(int(np.searchsorted(moments, at)), len(moments) - 1)
+        column[index] = max(column[index], code)
+    return column
+
+
+def _numbers(value: object) -> dict[str, float]:
+    return numbers(value) if isinstance(value, Mapping) else {}

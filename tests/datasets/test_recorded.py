@@ -1,0 +1,105 @@
+"""Recordings as episodes: on the grid, with the age of each reading, and with the stops."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import Result
+from PIL import Image
+from typer.testing import CliRunner
+
+from strands_robots.cli.app import build
+from strands_robots.datasets import tables
+from strands_robots.datasets.layout import data_file, read_info
+from strands_robots.datasets.recorded import attempts_of
+from strands_robots.recording.file import Recorder
+from strands_robots.utils import ValidationError
+
+BEGAN = 1_000.0
+HZ = 20.0
+
+
+def picture(shade: int) -> bytes:
+    file = io.BytesIO()
+    Image.fromarray(np.full((48, 64, 3), shade, dtype=np.uint8)).save(file, "JPEG")
+    return file.getvalue()
+
+
+def recorded(path: Path, *, tasks: int = 2, state: str = "completed", cameras: bool = True) -> Path:
+    """Write tasks of 20 steps at 20 Hz, a picture each tenth step."""
+    with Recorder(path) as recorder:
+        for task in range(tasks):
+            at = BEGAN + 10 * task
+            recorder.take("arm-1", "taskStarted", {"instruction": "wave"}, at - 0.01)
+            for step in range(20):
+                moment = at + step / HZ
+                observation = {"pan": float(step), "lift": 1.0}
+                action = {"pan": step + 1.0} if step else {"pan": 1.0, "lift": 2.0}
+                recorder.take("arm-1", "streamStep", {"observation": observation, "action": action}, moment)
+                if cameras and step % 10 == 0:
+                    recorder.take_picture("arm-1", "top", picture(step), moment)
+            end = {"instruction": "wave", "state": state}
+            recorder.take("arm-1", "taskComplete", end, at + 1.0)
+    return path
+
+
+def run(*arguments: str) -> Result:
+    return CliRunner().invoke(build("dataset"), ["dataset", *arguments])
+
+
+def frames_of(folder: Path, episode: int = 0) -> dict[str, np.ndarray]:
+    return tables.read_frames(folder / data_file(episode))
+
+
+def test_each_task_is_an_episode_on_the_grid_with_its_ages(tmp_path: Path) -> None:
+    file, out = recorded(tmp_path / "a.mcap"), tmp_path / "set"
+    made = run("from-mcap", str(file), "--out", str(out), "--fps", "40", "--success")
+    assert made.exit_code == 0, made.output
+    info, frames = read_info(out), frames_of(out)
+    assert (info.episodes, info.fps, info.features["observation.state"].names) == (2, 40, ("pan", "lift"))
+    assert len(frames["index"]) == 39
+    assert frames["observation.state"][:6, 0].tolist() == [0, 0, 1, 1, 2, 2]
+    assert frames["observation.age_ms.state"][:4] == pytest.approx([0, 25, 0, 25], abs=0.1)
+    assert frames["action"][4].tolist() == [3.0, 2.0], "lift keeps what it was told"
+    assert frames["observation.age_ms.top"][19] == pytest.approx(475, abs=0.1)
+    assert frames["observation.same.top"].tolist() == [number not in (0, 20) for number in range(39)]
+    assert frames["next.success"].tolist() == [False] * 38 + [True]
+    assert tables.read_tasks(out / "meta/tasks.parquet") == ["wave"]
+    assert run("check", str(out)).exit_code == 0
+
+
+def test_stop_is_marked_in_its_frame(tmp_path: Path) -> None:
+    file, out = recorded(tmp_path / "a.mcap", tasks=1, state="stopped", cameras=False), tmp_path / "set"
+    run("from-mcap", str(file), "--out", str(out), "--fps", "20")
+    assert frames_of(out)["stop"].tolist() == [0] * 19 + [1]
+
+
+def test_cut_recording_gives_what_it_still_has(tmp_path: Path) -> None:
+    file = recorded(tmp_path / "a.mcap", tasks=1, cameras=False)
+    whole = len(attempts_of(file)[0].steps)
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    (attempt,) = attempts_of(file) or [None]
+    assert attempt is None or len(attempt.steps) <= whole
+
+
+def test_recording_of_others_is_refused_by_name(tmp_path: Path) -> None:
+    with pytest.raises(ValidationError, match=r"robot must be one of those that were recorded \(arm-1\), not 'arm-2'"):
+        attempts_of(recorded(tmp_path / "a.mcap"), "arm-2")
+    with Recorder(tmp_path / "b.mcap") as recorder:
+        recorder.take("arm-1", "taskStarted", {"instruction": "wave"})
+    refused = run("from-mcap", str(tmp_path / "b.mcap"), "--out", str(tmp_path / "set"))
+    assert refused.exit_code != 0
+    assert "has no steps of a task" in refused.output
+    assert not (tmp_path / "set").exists()
+
+
+def test_index_of_the_dataset_is_what_lerobot_states(tmp_path: Path) -> None:
+    file, out = recorded(tmp_path / "a.mcap", tasks=1), tmp_path / "set"
+    run("from-mcap", str(file), "--out", str(out), "--robot-type", "so101")
+    stated = json.loads((out / "meta/info.json").read_text())
+    assert (stated["codebase_version"], stated["robot_type"], stated["splits"]) == ("v3.0", "so101", {"train": "0:1"})
+    assert stated["features"]["observation.images.top"]["shape"] == [48, 64, 3]
