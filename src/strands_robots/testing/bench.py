@@ -44,6 +44,9 @@ CALLER = "conform"
 ANSWER_S = 10.0
 """Seconds in which a read, a refusal or a start has to be answered."""
 
+LASTS_MAX_S = 60.0
+"""Seconds that a check waits for a read that declares more."""
+
 _EVERY_S = 0.005
 
 TASKS = ("execute", "start")
@@ -130,6 +133,10 @@ class NetworkBench:
         """Return its reads on a network that need neither an argument nor a motion."""
         verbs = [each for each in self.on[network].verbs.values() if each.name not in OF_A_MOTION]
         return [each for each in verbs if each.reads and not any(named.required for named in each.parameters)]
+
+    def answer_s(self, verb: AdvertisedVerb) -> float:
+        """Return the seconds in which a read has to be answered, its ``lasts`` included."""
+        return self.subject.answer_s + min(verb.lasts_s, LASTS_MAX_S)
 
     def arguments(self, verb: AdvertisedVerb) -> dict[str, Any]:
         """Return valid arguments of a motion, the subject's where it gives some."""

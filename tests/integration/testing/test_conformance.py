@@ -14,6 +14,7 @@ import pytest
 from fixtures import faulty_robots
 from fixtures.faulty_robots import Rig, subject
 
+from strands_robots import verb
 from strands_robots.hardware import HardwareRobot
 from strands_robots.testing import BusRecorder, CheckMark, Subject, Tier, conform
 
@@ -137,6 +138,26 @@ def test_limits_without_positions_or_speeds_are_not_proven_and_say_what_to_give(
 
     (result,) = conform(subject(WithoutPositions), Tier.PLATINUM, only=checked).results
     assert (result.mark, "recorder.wrote(" in result.said) == (CheckMark.NOT_PROVEN, True)
+
+
+def test_read_has_the_time_that_it_declares_and_no_more() -> None:
+    class Scans(Rig):
+        @verb(motion=False, lasts=5.0)
+        def scan(self) -> int:
+            """Scan the room."""
+            time.sleep(0.6)
+            return 1
+
+    class ScansWithoutSayingSo(Rig):
+        @verb(motion=False)
+        def scan(self) -> int:
+            """Scan the room."""
+            time.sleep(0.6)
+            return 1
+
+    for kind, mark in {Scans: CheckMark.PASSED, ScansWithoutSayingSo: CheckMark.FAILED}.items():
+        (result,) = conform(replace(subject(kind), answer_s=0.3), only=["bronze.reads"]).results
+        assert result.mark is mark, result.said
 
 
 FAULTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
