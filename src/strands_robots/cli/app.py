@@ -66,7 +66,8 @@ def command(app: typer.Typer, name: str) -> Callable[[Body], Body]:
         if network and "source" in own and own["source"].default == SOURCE:
             own["source"] = _profiles_name(own["source"])
         # A command may define a network flag of its own meaning, as serve does with --port.
-        shared = {name: each for name, each in _parameters(Network).items() if network and name not in own}
+        # Comprehensions here do not call anything `name`: Python 3.12.1 loses one that is a closure's as well.
+        shared = {flag: each for flag, each in _parameters(Network).items() if network and flag not in own}
         if name in WITHOUT_MESH:
             shared.pop("mesh")
         parameters = [*own.values(), *shared.values(), _JSON]
@@ -74,7 +75,7 @@ def command(app: typer.Typer, name: str) -> Callable[[Body], Body]:
         def run(**arguments: Any) -> None:
             screen = Screen(arguments.pop("machine"))
             if network:
-                arguments["network"] = Network(**{name: arguments.pop(name) for name in shared})
+                arguments["network"] = Network(**{flag: arguments.pop(flag) for flag in shared})
 
             def work() -> None:
                 if network:
