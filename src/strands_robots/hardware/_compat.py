@@ -93,6 +93,28 @@ def unplugged(device: Any) -> bool:
         return True
 
 
+def reopened(device: Any) -> bool:
+    """Open the serial port of a LeRobot device that was gone, and write nothing.
+
+    Returns:
+        False where the port is still gone, or the device has none.
+    """
+    bus: Any = getattr(device, "bus", None)
+    handler = getattr(bus, "port_handler", None)
+    if handler is None:
+        return False
+    if handler.is_open and not unplugged(device):
+        return True
+    handler.is_using = False
+    if handler.is_open:
+        handler.closePort()
+    try:
+        bus.connect(handshake=False)
+    except (OSError, TypeError):  # pySerial's of a closed port is a TypeError
+        return False
+    return True
+
+
 def forget_input(device: Any) -> None:
     """Discard unread bytes of the serial port of a LeRobot device."""
     serial = getattr(getattr(getattr(device, "bus", None), "port_handler", None), "ser", None)

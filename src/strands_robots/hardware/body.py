@@ -21,7 +21,7 @@ from strands_robots.bus_access import (
     read_currents,
     write_joints,
 )
-from strands_robots.hardware._compat import drop, forget_input, stop_base, unplugged
+from strands_robots.hardware._compat import drop, forget_input, reopened, stop_base, unplugged
 from strands_robots.hardware.device_facts import default_speeds, require_port
 from strands_robots.hardware.hold_check import HoldCheck
 from strands_robots.hardware.lerobot_device import answer_lost, write_to_servos
@@ -344,7 +344,8 @@ class DeviceBody:
             Exception: what else the device raises.
         """
         with self.stopping():
-            if self.lost:
+            # A port that is back is written to at once; the next motion connects and configures the device again.
+            if self.lost and not reopened(self.device):
                 raise ConnectionError("its port is gone; a servo goes on to its last goal")
             if not (self.is_connected or self._holds_unconnected):
                 self._check_known_still()

@@ -224,6 +224,22 @@ def test_an_unplugged_arm_is_told_and_comes_back_when_a_motion_is_asked_for(arm:
     assert robot.halt().stopped is True
 
 
+def test_a_halt_freezes_an_arm_whose_port_is_back_and_a_task_connects_it_again(arm: Arm, bus: FeetechBus) -> None:
+    robot = arm()
+    robot.start_task("wave", duration=30.0)
+    eventually(lambda: robot.get_task_status()["step_count"] > 10)
+    bus.unplug()
+    eventually(lambda: robot.get_task_status()["task_status"] == "error")
+    bus.plug()
+    plugged = time.monotonic()
+    assert robot.halt().stopped is True
+    assert {write.servo for write in bus.written_after(plugged)} == set(bus.servos), "each servo has a new goal"
+    assert not bus.written_after(plugged, "torque_enable"), "an arm that is frozen is not let go of"
+    assert robot.start_task("wave", duration=0.3)["status"] == "success"
+    eventually(lambda: robot.get_task_status()["task_status"] == "completed")
+    assert bus.written_after(plugged, "torque_enable"), "it is configured anew"
+
+
 @pytest.mark.parametrize("options", [{}, {"max_relative_target": 20.0}], ids=["plain", "bounded by LeRobot"])
 def test_a_lost_answer_now_and_then_does_not_end_a_rollout(
     arm: Arm, bus: FeetechBus, options: dict[str, float]
