@@ -422,15 +422,21 @@ class ArmMixin:
 
     @planned
     def wait_for(self, task_id: str = "", seconds: float = WAIT_S, robot_name: str = "") -> Envelope:
-        """Wait for the end of a motion, the last one by default, and return its result."""
-        name = self.body(robot_name).name
+        """Wait for the end of a motion, the last one by default, and return its result.
+
+        Before the first motion this answers at once, that there was none.
+        """
+        name, longest = self.body(robot_name).name, number("seconds", seconds, low=0, high=WAIT_S)
         task = self._tasks.get(name)
         if task_id:
             task = next((each for each in self._recent if each.task_id == task_id), None)
+        if task is None and not task_id:
+            status = "running" if name in self.tasks.running() else "idle"
+            return success(f"{name} has made no motion of this kind yet.", task_id="", task_status=status)
         if task is None:
             known = ", ".join(each.task_id for each in self._recent) or "none"
             raise ValidationError(f"task_id must be a motion of this robot ({known}), not {shown(task_id)}.")
-        task.join(number("seconds", seconds, low=0, high=WAIT_S))
+        task.join(longest)
         return self._result(task)
 
     def outcome_of(self, rollout: Rollout | None) -> dict[str, Any] | None:

@@ -51,6 +51,8 @@ LOCK_PATH, APP_PATH = "/api/daemon/robot-app-lock-status", "/api/apps/current-ap
 
 STORED_KINDS = frozenset({"head_pose", "imu_data", "daemon_status"})
 HEAD_JOINTS = ("body_yaw", "stewart_1", "stewart_2", "stewart_3", "stewart_4", "stewart_5", "stewart_6")
+JOINTS = (*HEAD_JOINTS, "right_antenna", "left_antenna")
+"""Names of the motors, as :meth:`JointSample.named` gives them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,8 +69,7 @@ class JointSample:
 
     def named(self) -> dict[str, float]:
         """Return the positions by motor name."""
-        right, left = self.antennas
-        return {**dict(zip(HEAD_JOINTS, self.head, strict=True)), "right_antenna": right, "left_antenna": left}
+        return dict(zip(JOINTS, (*self.head, *self.antennas), strict=True))
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ from typing import Any
 from strands_robots import settings
 from strands_robots.audit import queue_safety_event
 from strands_robots.contract import AT_REST, Observer, Unsubscribe
-from strands_robots.drivers.reachy.connection import FRESH_S, Connection
+from strands_robots.drivers.reachy.connection import FRESH_S, JOINTS, Connection
 from strands_robots.drivers.reachy.links import (
     DEFAULT_PREFIX,
     SLEEP_DISABLES_SINCE,
@@ -415,13 +415,17 @@ class ReachyDriver:
         return success(f"{task['instruction'] or 'No motion'}: {task['task_status']}.", **self.facts(), **task)
 
     def get_features(self) -> Envelope:
-        """Return ``observation_features``, ``action_features`` and ``ranges``."""
+        """Return the features of observations and actions, ``ranges``, ``joint_units``.
+
+        The joints are those of :meth:`get_state`: the motors, which no action names.
+        """
         features = dict.fromkeys(ACTION_KEYS, "float")
         return success(
             "A Reachy Mini: metres and radians.",
             observation_features=features,
             action_features=features,
             ranges={key: list(bounds) for key, bounds in BOUNDS.items()},
+            joint_units=dict.fromkeys(JOINTS, "radians"),
         )
 
     def get_state(self) -> Envelope:
