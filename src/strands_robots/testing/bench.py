@@ -273,6 +273,26 @@ class ConformanceBench(NetworkBench):
         """Return True while a task or a declared verb of it is under way."""
         return runs(self.body)
 
+    def check_moves_again(self, after: str) -> None:
+        """Have it move and halt within the time to answer.
+
+        What was out of reach may take a while to be found again.
+
+        Raises:
+            NotKeptError: it does not move within the time to answer, or did not stop.
+        """
+        deadline, tries = time.monotonic() + self.subject.answer_s, 0
+        while True:
+            try:
+                with self.moving():
+                    return self.check_still(self.halt(), self.writes, f"halt after {after}")
+            except NotProvenError as exc:
+                tries += 1
+                # A motion that began on the old link ends with it, and takes all of the time to answer.
+                if tries > 1 and time.monotonic() >= deadline:
+                    raise NotKeptError(f"after {after}, it does not move again: {exc}") from exc
+            time.sleep(_EVERY_S)
+
     def check_still(self, verdict: StopVerdict, count: int, how: str) -> None:
         """Check a verdict against the bus: stopped, and no write after ``count``.
 

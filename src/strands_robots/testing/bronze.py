@@ -163,7 +163,10 @@ def check_features(features: Callable[[], Any], state: Callable[[], Any]) -> str
     wrong = [key for key, value in joints.items() if not _is_number(value)]
     if wrong:
         raise NotKeptError(f"joints that are no finite numbers: {', '.join(map(str, wrong))}")
+    # A robot whose actions name no motors states them with their units.
+    units = first.get("joint_units")
     known = stated["observation_features"].keys() | stated["action_features"].keys()
+    known |= units.keys() if isinstance(units, Mapping) else set()
     undeclared = sorted(map(str, joints.keys() - known))
     if joints and undeclared and known:
         raise DriftError(f"get_state has {', '.join(undeclared)}, which its features do not declare")

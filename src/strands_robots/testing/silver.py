@@ -347,6 +347,7 @@ def _recovered(bench: ConformanceBench, how: str) -> None:
     if verdict.stopped is not True:
         said = text_of(verdict.envelope())
         raise NotKeptError(f"after its bus {how}, no halt says stopped any more: {said}")
+    bench.check_moves_again(f"its bus {how}")
 
 
 PROMISES = (halts, again, hundred, threads, networks, own_verbs, unlinked, hung_read, lockout, honest)

@@ -48,25 +48,34 @@ class BusRecorder:
         self._writes: list[BusWrite] = []
         self._fault: Callable[[], None] | None = None
 
-    def wrote(self, what: object = "", values: Values | None = None) -> None:
+    def wrote(self, what: object = "", values: Values | None = None, *, can_fail: bool = True) -> None:
         """Record a write that is made now; raise what a check has the bus raise.
 
         Args:
             what: in a few words.
             values: the positions that it commands, by joint, in the unit of the robot's limits.
+            can_fail: False for a write that no fault keeps from its place.
         """
+        if can_fail:
+            self.fail()
+        self._writes.append(BusWrite(time.monotonic(), str(what)[:200], dict(values or {})))
+
+    def fail(self) -> None:
+        """Raise, or hang in, what a check has the bus do now; usually do nothing."""
         fault = self._fault
         if fault is not None:
             fault()
-        self._writes.append(BusWrite(time.monotonic(), str(what)[:200], dict(values or {})))
 
-    def watch(self, bus: Any, *methods: str, values: Callable[..., Values] | None = None) -> None:
+    def watch(
+        self, bus: Any, *methods: str, values: Callable[..., Values] | None = None, can_fail: bool = True
+    ) -> None:
         """Record each call of these methods of ``bus``.
 
         Args:
             bus: the object that writes.
             methods: names of its methods.
             values: called with a call's arguments; returns the positions that it commands, by joint.
+            can_fail: as of :meth:`wrote`.
 
         Raises:
             ValidationError: it has no such method.
@@ -75,14 +84,15 @@ class BusRecorder:
             method = getattr(bus, name, None)
             if not callable(method):
                 raise ValidationError(f"methods must be methods of {shown(bus)}, not {shown(name)}.")
-            setattr(bus, name, self._recorded(name, method, values))
+            setattr(bus, name, self._recorded(name, method, values, can_fail=can_fail))
 
     def _recorded(
-        self, name: str, method: Callable[..., Any], values_of: Callable[..., Values] | None
+        self, name: str, method: Callable[..., Any], values_of: Callable[..., Values] | None, *, can_fail: bool
     ) -> Callable[..., Any]:
         @wraps(method)
         def call(*values: Any, **named: Any) -> Any:
-            self.wrote(name, None if values_of is None else values_of(*values, **named))
+            commanded = None if values_of is None else values_of(*values, **named)
+            self.wrote(name, commanded, can_fail=can_fail)
             return method(*values, **named)
 
         return call
