@@ -1,4 +1,4 @@
-.PHONY: help demo dashboard soak test test-all lint bench serve api system venv clean mcp bridge real-arm real-arm-test real-arm-next foreign lerobot lerobot-next dds-security models
+.PHONY: help demo dashboard soak test test-all lint bench serve api system venv clean mcp bridge real-arm real-arm-test real-arm-next foreign lerobot lerobot-next dds-security models conform
 .DEFAULT_GOAL := help
 VENV := .venv
 BIN := $(VENV)/bin
@@ -76,6 +76,9 @@ real-arm:  ## LeRobot's own SO-100/SO-101 driver without torch, in .venv-lerobot
 
 real-arm-test: real-arm  ## The tests of a real arm, on emulated servos
 	@./scripts/tests.sh $(REAL_ARM)/python tests/integration/hardware $(ARGS)
+
+conform: venv real-arm  ## Check every built-in robot and driver, and write the README's table of their tiers
+	@$(BIN)/python scripts/conform.py $(ARGS)
 
 models:  ## The models of eight other projects in a world of ours, in .venv-models, and their test
 	@./scripts/models.sh

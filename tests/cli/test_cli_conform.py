@@ -24,6 +24,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "your-robot.md"
     [
         (("math:tau", "--motion", "wave"), "--motion is for real hardware and for --live"),
         (("so100", "--limit", "0"), "--limit must"),
+        (("so101_follower", "--set", "port=/dev/ttyACM0"), "port is that of a real arm"),
         (("so100", "--tier", "iron"), "--tier must be one of bronze, silver, gold, platinum, not 'iron'"),
         (("arm-1", "--live", "--motion", "1up"), "--motion must be VERB KEY=VALUE"),
         (("arm-1", "--live", "--motion", "wave 'to me"), "--motion must be VERB KEY=VALUE"),

@@ -174,14 +174,15 @@ def subject_of(target: str, options: dict[str, Any]) -> Subject:
     Raises:
         ValidationError: it cannot be loaded.
     """
-    from strands_robots.robot import LEROBOT, Robot  # noqa: PLC0415 - heavy, and needed by this command alone
+    from strands_robots.robot import LEROBOT  # noqa: PLC0415 - heavy, and needed by this command alone
     from strands_robots.testing import Subject  # noqa: PLC0415 - as above
+    from strands_robots.testing.built_in import built_in  # noqa: PLC0415 - as above
 
     module, colon, attribute = target.partition(":")
     if target == "reachy_mini" or target.startswith(LEROBOT):
         options = {**options, "mode": "real"}
     if not colon or target.startswith(LEROBOT):
-        return Subject(lambda: Robot(target, **options), name=target)
+        return built_in(target, **options)
     # As a module that is run: the package that is being written need not be installed.
     sys.path.insert(0, str(Path.cwd()))
     try:

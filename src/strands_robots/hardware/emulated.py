@@ -141,6 +141,9 @@ MODEL = 777
 SPEED = 3000.0
 """Counts a second at no load: about 44 turns a minute."""
 
+STILL_SPEED = 20.0
+"""Counts a second of a shaft that has all but settled: less than two degrees."""
+
 STIFFNESS_NM = 0.0273
 """Torque for one count of distance to the target (Nm), 17.8 Nm a radian: assumed for LeRobot's gain of 16."""
 
@@ -332,11 +335,21 @@ class ServoBus:
     Args:
         servos: in the order of the line.
         link: path of a symbolic link to the port, which stays the same when it is plugged in again.
+        on_write: called with servo, address and data of each write, before it is carried out.
     """
 
-    def __init__(self, servos: Iterable[Servo], *, link: Path | None = None) -> None:
+    def __init__(
+        self,
+        servos: Iterable[Servo],
+        *,
+        link: Path | None = None,
+        on_write: Callable[[int, int, bytes], None] = lambda servo, address, data: None,
+    ) -> None:
         self.servos = {servo.number: servo for servo in servos}
+        self.silent = False
+        """While True they take no packet and answer none."""
         self._link = link
+        self._on_write = on_write
         self._moved_at = time.monotonic()
         self._lock = threading.Lock()
         self._master: int | None = None
@@ -348,6 +361,13 @@ class ServoBus:
     def port(self) -> str:
         """The path that a driver opens."""
         return str(self._link or self._port)
+
+    @property
+    def moving(self) -> bool:
+        """True while a shaft turns by more than :data:`STILL_SPEED`."""
+        with self._lock:
+            self._advance()
+            return any(abs(servo.velocity) > STILL_SPEED for servo in self.servos.values())
 
     def __enter__(self) -> Self:
         self.plug()
@@ -391,6 +411,8 @@ class ServoBus:
         parser = Parser()
         while not self._ending.is_set():
             for packet in parser.feed(self._read(master)):
+                if self.silent:
+                    continue
                 answers: list[Packet] = []
                 self._obey(packet, answers.append)
                 if answers:
@@ -442,6 +464,7 @@ class ServoBus:
         return [servo for servo in asked if not servo.dead]
 
     def _write(self, servo: Servo, address: int, data: bytes) -> None:
+        self._on_write(servo.number, address, data)
         servo.write(address, data)
 
     def _advance(self) -> None:
