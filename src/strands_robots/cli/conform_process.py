@@ -77,7 +77,7 @@ def conform_apart(request: ConformRequest, report: Callable[[CheckResult], None]
             process.end()
         from strands_robots.testing import ConformanceReport  # noqa: PLC0415 - loaded beside the process, which loads it too
 
-        return ConformanceReport(process.robot, tuple(process.results.values()))
+        return ConformanceReport(process.robot, tuple(process.results.values()), whole=not request.only)
 
 
 class CheckProcess:

@@ -78,7 +78,7 @@ def conform(
         if results and not isinstance(exc, AssertionError):
             raise
         tell(unserved(exc))
-    return ConformanceReport(name, tuple(results))
+    return ConformanceReport(name, tuple(results), whole=len(chosen) == len(promises(most)))
 
 
 def conform_live(
@@ -114,7 +114,7 @@ def conform_live(
 
     bench = LiveBench(networks, robot, subject)
     _check_each(chosen, lambda each: check_live(each, bench), tell, waits=False)
-    return ConformanceReport(robot, tuple(results))
+    return ConformanceReport(robot, tuple(results), whole=len(chosen) == len(promises(most)))
 
 
 def _made_elsewhere() -> object:

@@ -68,15 +68,22 @@ class CheckResult:
 
 @dataclass(frozen=True, slots=True)
 class ConformanceReport:
-    """Results of all checks of one robot."""
+    """Results of the checks of one robot.
+
+    Args:
+        whole: every promise was checked, and not only chosen ones, which are no tier.
+    """
 
     name: str
     results: Sequence[CheckResult]
+    whole: bool = True
 
     @property
     def tier(self) -> Tier | None:
         """The highest tier up to which every promise is kept; None for none."""
         reached = None
+        if not self.whole:
+            return None
         for tier in Tier:
             marks = [each.mark for each in self.results if each.tier is tier]
             if not marks or not GOOD.issuperset(marks):
@@ -92,7 +99,8 @@ class ConformanceReport:
     def words(self) -> str:
         """Return the report for a person: the tier, each promise not kept, the way on."""
         tier = self.tier
-        lines = [f"{self.name}: {'no tier' if tier is None else tier.label}"]
+        none = "no tier" if self.whole else "no tier, for not every check was made"
+        lines = [f"{self.name}: {none if tier is None else tier.label}"]
         for each in Tier:
             marks = [result.mark for result in self.results if result.tier is each]
             if marks:

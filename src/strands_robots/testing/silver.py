@@ -54,13 +54,21 @@ SEEN_S = 1.0
 
 
 def _check_seen_moving(bench: ConformanceBench, verb: str) -> None:
-    """Check that the recorder sees it move: else no write proves nothing.
+    """Check that the recorder, or the subject's ``moving``, sees it move: else what they see after it proves nothing.
 
     Raises:
-        NotProvenError: it runs without a write.
+        NotProvenError: it runs unseen.
     """
-    recorder = bench.subject.recorder
-    if recorder is None or bench.subject.moving is not None:
+    recorder, moving = bench.subject.recorder, bench.subject.moving
+    if recorder is None:
+        return
+    if moving is not None:
+        unseen = f"{verb} runs, and Subject(moving=...) was False for {SEEN_S:g} s: it has to be True while it moves"
+        until = time.monotonic() + SEEN_S
+        while not moving():
+            if time.monotonic() >= until:
+                raise NotProvenError(unseen)
+            time.sleep(bench.poll_s)
         return
     time.sleep(BEGUN_S)
     count, ends = recorder.count, time.monotonic() + SEEN_S
@@ -331,7 +339,8 @@ def honest(bench: ConformanceBench) -> str:
             with fault():
                 time.sleep(0.05)
                 verdict = bench.halt()
-            count = bench.writes
+                # A write that hangs is made when the fault is over, after the verdict.
+                count = bench.writes
             if verdict.stopped is True:
                 bench.check_no_write(count, f"halt on a bus that {how}")
             seen.append(f"{how}: {'stopped' if verdict.stopped else 'not stopped'}")

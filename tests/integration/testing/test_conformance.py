@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 from fixtures import faulty_robots
-from fixtures.faulty_robots import Rig, subject
+from fixtures.faulty_robots import LIMIT, Rig, subject
 
 from strands_robots import verb
 from strands_robots.hardware import HardwareRobot
@@ -56,7 +56,8 @@ def test_nothing_of_a_run_is_left_behind(tmp_path: Path, monkeypatch: pytest.Mon
 def test_without_a_recorder_silver_is_not_proven() -> None:
     report = conform(Subject(lambda: Rig(BusRecorder())), only=["bronze.status", "silver.halts"])
     assert [each.mark for each in report.results] == [CheckMark.PASSED, CheckMark.NOT_PROVEN]
-    assert report.tier is Tier.BRONZE
+    assert report.tier is None, "two checks are no tier"
+    assert "not every check was made" in report.words()
 
 
 def test_motor_that_goes_on_without_a_write_is_not_proven_to_stand_by_its_writes() -> None:
@@ -64,6 +65,12 @@ def test_motor_that_goes_on_without_a_write_is_not_proven_to_stand_by_its_writes
     unseen = Subject(lambda: faulty_robots.KeepsItsSpeed(recorder), recorder)
     (halts,) = conform(unseen, only=["silver.halts"]).results
     assert (halts.mark, "Subject(moving=...)" in halts.said) == (CheckMark.NOT_PROVEN, True)
+
+
+def test_motor_that_is_never_seen_to_move_is_not_proven_to_stand() -> None:
+    unseen = replace(subject(faulty_robots.KeepsItsSpeed), moving=lambda: False)
+    (halts,) = conform(unseen, only=["silver.halts"]).results
+    assert (halts.mark, "has to be True while it moves" in halts.said) == (CheckMark.NOT_PROVEN, True)
 
 
 def test_one_robot_of_a_subject_lives_at_a_time() -> None:
@@ -138,6 +145,25 @@ def test_limits_without_positions_or_speeds_are_not_proven_and_say_what_to_give(
 
     (result,) = conform(subject(WithoutPositions), Tier.PLATINUM, only=checked).results
     assert (result.mark, "recorder.wrote(" in result.said) == (CheckMark.NOT_PROVEN, True)
+
+
+def test_joint_that_is_sent_to_its_end_by_one_write_is_faster_than_it_says() -> None:
+    class Jumps(Rig):
+        goes = True
+
+        def step(self) -> None:
+            """Go to the other end at once, and stay there for the rest of the motion."""
+            if self.goes:
+                self.goes = False
+                self.write(-LIMIT if self.angle > 0 else LIMIT)
+
+        def stop_task(self) -> Any:
+            answer = super().stop_task()
+            self.goes = True
+            return answer
+
+    (result,) = conform(replace(subject(Jumps), speeds={"angle": 1.0}), Tier.PLATINUM, only=["platinum.limits"]).results
+    assert (result.mark, "1 is declared" in result.said) == (CheckMark.DRIFT, True), result.said
 
 
 def test_read_has_the_time_that_it_declares_and_no_more() -> None:
