@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from fixtures.devices import RecordingDevice
 from fixtures.leaders import ScriptedLeader
 
-from strands_robots.cli.led_robot import LedRobot
-from strands_robots.cli.output import CliError
+from strands_robots.cli import output, teleop
+from strands_robots.cli.led_robot import LedRobot, Serving
+from strands_robots.cli.output import CliError, Screen, wait_until
 from strands_robots.hardware import HardwareRobot
 from strands_robots.safety.lockout import LockoutLatch
 from strands_robots.safety.stop_executor import stop_executor
@@ -81,3 +85,65 @@ def test_it_says_who_stopped_it_and_who_locked_it(arm: HardwareRobot) -> None:
     latch.engage("0" * 32, "bob", "smoke")
     arm.gate.attach(latch)
     assert led.stopped_by.startswith("arm-1 is locked by the emergency stop of bob ('smoke')")
+
+
+def test_robot_that_another_moves_after_the_stop_is_halted_at_the_end(
+    arm: HardwareRobot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    led = LedRobot(arm, "arm-1")
+    lead(led)
+    stop_executor().submit(arm, "arm", "stop by alice").result()
+
+    def hold(screen: Screen) -> Any:
+        arm.stop_teleoperate()
+        assert arm.teleoperate()["status"] == "success"
+        return led.verdict()
+
+    monkeypatch.setattr(led, "hold", hold)
+    verdict, by = teleop._ended(Screen(True), led, teleop._halted(led))
+    assert (verdict.stopped, by) == (True, "stop by alice.")
+    assert not arm.teleoperating()
+
+
+def test_follower_is_halted_before_its_stream_is_closed(arm: HardwareRobot, monkeypatch: pytest.MonkeyPatch) -> None:
+    done: list[str] = []
+    halt: Callable[[str], Any] = arm.halt
+    counters = dict.fromkeys(("frames_received", "errors", "rejected", "slew_rejected", "rate_dropped"), 0)
+
+    @contextmanager
+    def followed(*_: object) -> Iterator[object]:
+        try:
+            yield SimpleNamespace(stats=counters, over=lambda: "It has ended.")
+        finally:
+            done.append("closed")
+
+    @contextmanager
+    def made(*_: object) -> Iterator[LedRobot]:
+        yield LedRobot(arm)
+
+    def halt_noted(reason: str) -> Any:
+        done.append("halted")
+        return halt(reason)
+
+    monkeypatch.setattr("strands_robots.fleet.mesh.leading.followed", followed)
+    monkeypatch.setattr(teleop, "_made_follower", made)
+    monkeypatch.setattr(arm, "halt", halt_noted)
+    how, options = Serving(None), teleop.TeleopOptions()
+    teleop._follow(Screen(True), "lead-1", "arm", {}, how=how, options=options, record=None)
+    assert done == ["halted", "closed"]
+
+
+def test_wait_ends_before_its_bar_is_taken_from_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    done: list[str] = []
+
+    @contextmanager
+    def bar(*_: object) -> Iterator[Callable[[float], None]]:
+        yield lambda _: None
+        done.append("bar")
+
+    def interrupted() -> str:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(output, "progress_bar", bar)
+    assert wait_until(Screen(True), interrupted, 5.0, at_end=lambda: done.append("halted")) == "Ctrl-C."
+    assert done == ["halted", "bar"]

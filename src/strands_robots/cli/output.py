@@ -200,13 +200,16 @@ def progress_bar(screen: Screen, seconds: float | None, title: str = "playing") 
         yield lambda passed: progress.update(task, completed=passed)
 
 
-def wait_until(screen: Screen, over: Callable[[], str], duration: float = 0.0) -> str:
+def wait_until(
+    screen: Screen, over: Callable[[], str], duration: float = 0.0, *, at_end: Callable[[], object] = lambda: None
+) -> str:
     """Wait until ``over`` returns a reason, or for Ctrl-C; return the reason.
 
     Args:
         screen: where a bar is drawn when the duration is known.
         over: empty until the wait ends, then why.
         duration: expected seconds; 0 when unknown.
+        at_end: called first, before the bar is taken from a terminal, which may take no more output.
     """
     began = time.monotonic()
     with progress_bar(screen, duration or None) as moved:
@@ -215,7 +218,9 @@ def wait_until(screen: Screen, over: Callable[[], str], duration: float = 0.0) -
                 moved(time.monotonic() - began)
                 time.sleep(POLL_S)
         except KeyboardInterrupt:
-            return "Ctrl-C."
+            reason = "Ctrl-C."
+        finally:
+            at_end()
     return reason
 
 

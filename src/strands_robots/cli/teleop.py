@@ -226,12 +226,14 @@ def _drive(
         _announce(screen, leader, follower, source)
         if publish is not None:
             screen.say(f"Others may follow {publish}/{_NAME} on the mesh.")
+        ended = list[StopVerdict | None]()
         wait_until(
             screen,
             lambda: "" if session.running and not session.voided else "It has ended.",
             getattr(source, "duration", None) or 0.0,
+            at_end=lambda: ended.append(_halted(led)),
         )
-        verdict, why = _ended(screen, led, stopped=led.stopped)
+        verdict, why = _ended(screen, led, ended[0])
         row: dict[str, Any] = robot.teleop_status()["leaders"][_NAME]
     screen.data({"event": "ended", **row, "stopped": verdict.stopped, **({"stopped_by": why} if why else {})})
     if row["state"] == "error":
@@ -258,17 +260,26 @@ def _begin(screen: Screen, led: LedRobot, leader: str, source: Any, options: Tel
                 raise CliError(text_of(answer))
 
 
-def _ended(screen: Screen, led: LedRobot, *, stopped: bool) -> tuple[StopVerdict, str]:
-    """Halt the robot at the end; return the verdict, and who stopped it before.
+def _halted(led: LedRobot) -> StopVerdict | None:
+    """Halt the robot and return the verdict; None where a caller of the network has stopped it."""
+    return None if led.stopped else led.robot.halt("teleop ended")
+
+
+def _ended(screen: Screen, led: LedRobot, verdict: StopVerdict | None) -> tuple[StopVerdict, str]:
+    """Tell the end; return the verdict on it, and who stopped the robot before.
 
     Args:
-        stopped: by a caller of the network; then it is halted already, and stays there until Ctrl-C.
+        verdict: of the halt at the end; None for a robot that was stopped from the network, and stays there until
+            Ctrl-C.
     """
-    if not stopped:
-        return _stop(screen, led.robot), ""
+    if verdict is not None:
+        _tell_stop(screen, led.robot, verdict)
+        return verdict, ""
     why = led.stopped_by
-    verdict = led.hold(screen)
-    return verdict or _stop(screen, led.robot), why
+    held = led.hold(screen)
+    # Another caller may have moved it since.
+    verdict = led.robot.halt("teleop ended")
+    return held if held is not None and not held.stopped else verdict, why
 
 
 def _follow(
@@ -285,14 +296,17 @@ def _follow(
     from strands_robots.fleet.mesh.leading import DEVICE, FollowedPeer, followed  # noqa: PLC0415 - loaded when the network is used
 
     with _made_follower(screen, follower, arm, record, how) as led, halted_first(led.robot):
-        robot, leaders = led.robot, list[FollowedPeer]()
+        robot, leaders, ended = led.robot, list[FollowedPeer](), list[StopVerdict | None]()
         with _refused(), ExitStack() as stack:
             with led.held_by(peer, lambda: bool(leaders)):
                 leaders.append(stack.enter_context(followed(robot, peer, options.max_speed)))
+            # The end of the stream waits for its last frame and for the network.
+            stack.enter_context(halted_first(robot))
             leading = leaders[0]
             _announce(screen, f"{peer}/{DEVICE}", robot.tool_name_str, leading)
-            why, stats = wait_until(screen, options.timed(leading.over)), leading.stats
-        verdict, by = _ended(screen, led, stopped=led.stopped)
+            why = wait_until(screen, options.timed(leading.over), at_end=lambda: ended.append(_halted(led)))
+            stats = leading.stats
+        verdict, by = _ended(screen, led, ended[0])
     row = {key: stats[key] for key in ("frames_received", "errors", "rejected", "slew_rejected", "rate_dropped")}
     screen.data({"event": "ended", **row, "why": why, "stopped": verdict.stopped, **({"stopped_by": by} if by else {})})
     _check_stopped(verdict, by)
@@ -319,16 +333,22 @@ def _lead_peer(
             policy = LeaderPolicy(source, device=DEVICE, method=options.method, max_speed=speed, period=1 / rate)
             led = LedPeer(follower, mesh.peer_id, policy)
             publishing = publisher(mesh, led.bounded, options.method, rate)
+            standing = threading.Event()
+
+            def stop() -> None:
+                if not standing.is_set():
+                    follower.stop()
+                    standing.set()
+
             follower.open_stream(mesh.peer_id)
             try:
                 publishing.start()
                 _announce(screen, leader, peer, source)
-                why = wait_until(screen, options.timed(led.over), getattr(source, "duration", None) or 0.0)
+                why = wait_until(screen, options.timed(led.over), getattr(source, "duration", None) or 0.0, at_end=stop)
             finally:
                 # The follower is stopped first; publishing ends even when it does not answer.
                 try:
-                    screen.say(f"Stopping {peer}...")
-                    follower.stop()
+                    stop()
                     screen.say(f"{peer} stands still.", "green")
                 finally:
                     sent = publishing.stop()
@@ -429,15 +449,12 @@ def _made_follower(
         robot.cleanup()
 
 
-def _stop(screen: Screen, robot: Any) -> StopVerdict:
-    # A terminal that takes no more output must not delay it.
-    verdict: StopVerdict = robot.halt("teleop ended")
+def _tell_stop(screen: Screen, robot: Any, verdict: StopVerdict) -> None:
     screen.say("Stopping the follower...")
     if verdict.stopped:
         screen.say("The follower stands still.", "green")
     if verdict.settling:
         screen.say(robot.wait_settled())
-    return verdict
 
 
 def _check_stopped(verdict: StopVerdict, stopped_by: str) -> None:
