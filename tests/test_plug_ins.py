@@ -31,6 +31,14 @@ def part(name: str) -> PlugIn:
     return found
 
 
+def test_part_is_known_by_the_place_of_its_callable(site: Path) -> None:
+    imported = install(site, "my-robots", "def make(): return 1", {ROBOTS: {"a": "my_robots:make"}})
+    plug_ins = PlugIns("robot", ())
+    assert plug_ins.makes("my_robots:make")
+    assert not plug_ins.makes("my_robots:other")
+    assert not imported.exists()
+
+
 def test_names_are_listed_without_an_import(site: Path) -> None:
     imported = install(
         site, "my-robots", "def make(): return 1", {ROBOTS: {"b": "my_robots:make", "a": "my_robots:make"}}

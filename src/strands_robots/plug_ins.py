@@ -103,6 +103,10 @@ class PlugIns:
             raise ValidationError(f"{self.kind} {name} is stated by {packages}; uninstall all of them but one.")
         return stated[0] if stated else None
 
+    def makes(self, target: str) -> bool:
+        """Return True for the ``module:NAME`` by which a package states a part; nothing is imported."""
+        return any(part.entry.value == target for parts in self._stated().values() for part in parts)
+
     def refused(self) -> Mapping[str, str]:
         """Return the names that cannot be asked for, and the reason."""
         reasons = {}

@@ -35,6 +35,9 @@ DETECTOR = "detector"
 LEROBOT = "lerobot:"
 """Prefix of the name of a LeRobot type, those of its plug-ins among them: always real."""
 
+DRIVERS = "strands_robots.drivers."
+"""Prefix of the modules of this package's own drivers."""
+
 PLUG_INS = PlugIns("robot", ("so100", "so101", "rover", "so100_follower", "so101_follower", "reachy_mini"))
 """Robots of other packages; each is a callable that takes keyword options and returns a robot."""
 
@@ -169,9 +172,11 @@ def Robot(  # the factory reads as the class it stands for
 def counts_as_hardware(name: str) -> bool:
     """Return True for a robot that is real hardware in any mode; nothing is imported.
 
-    A robot of another package may move anything, so it needs the operator's approval in its own simulation, too.
+    A robot of another package may move anything, so it needs the operator's approval in its own simulation, too. Its
+    ``module:NAME`` is the same robot.
     """
-    return name == "reachy_mini" or name.startswith(LEROBOT) or PLUG_INS.get(name) is not None
+    ours = name == "reachy_mini" or name.startswith((LEROBOT, DRIVERS))
+    return ours or PLUG_INS.get(name) is not None or PLUG_INS.makes(name)
 
 
 def run(

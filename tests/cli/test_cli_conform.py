@@ -53,7 +53,15 @@ def test_list_has_each_check_with_its_promise_and_why_it_matters(run: Run) -> No
 
 
 @pytest.mark.parametrize(
-    "arguments", [("reachy_mini",), ("lerobot:so100",), ("so100", "--set", "mode=real", "--set", "port=/dev/ttyACM0")]
+    "arguments",
+    [
+        ("reachy_mini",),
+        ("lerobot:so100",),
+        ("so100", "--set", "mode=real", "--set", "port=/dev/ttyACM0"),
+        ("strands_robots:Robot", "--set", "name=lerobot:so100", "--set", "port=/dev/ttyACM0"),
+        ("strands_robots:Robot", "--set", "name=reachy_mini"),
+        ("strands_robots.drivers.reachy:make_reachy",),
+    ],
 )
 def test_conform_moves_no_hardware_before_its_list_is_approved(run: Run, arguments: tuple[str, ...]) -> None:
     refused = run(
@@ -63,7 +71,7 @@ def test_conform_moves_no_hardware_before_its_list_is_approved(run: Run, argumen
     made, moved, wrong, let_go = listed["motions"]
     assert refused.exit_code == Exit.REFUSED
     assert made.startswith("It is made")
-    assert ("/dev/ttyACM0" in made) is ("--set" in arguments)
+    assert ("/dev/ttyACM0" in made) is ("port=/dev/ttyACM0" in arguments)
     assert moved.startswith("execute(instruction='wave', duration=2), up to 5 times")
     assert "wrong" in wrong
     assert "sinks" in let_go

@@ -138,7 +138,9 @@ def _approved(screen: Screen, request: ConformRequest, chosen: _Chosen) -> Confo
     """Return the request, for real hardware once its motions are approved."""
     from strands_robots.robot import counts_as_hardware  # noqa: PLC0415 - heavy, and needed by this command alone
 
-    if not (counts_as_hardware(request.target) or request.options.get("mode") == "real"):
+    # The name of the robot for a target that makes one by it, such as strands_robots:Robot.
+    named = (request.target, str(request.options.get("name", "")))
+    if not (any(map(counts_as_hardware, named)) or request.options.get("mode") == "real"):
         if chosen.motion is not None:
             raise ValidationError("--motion is for real hardware and for --live; a Subject has its motion.")
         return request
