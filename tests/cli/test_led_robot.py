@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from fixtures.devices import RecordingDevice
 from fixtures.leaders import ScriptedLeader
+from fixtures.waiting import eventually
 
 from strands_robots.cli import output, teleop
 from strands_robots.cli.led_robot import LedRobot, Serving
@@ -102,7 +103,9 @@ def test_robot_that_another_moves_after_the_stop_is_halted_at_the_end(
     monkeypatch.setattr(led, "hold", hold)
     verdict, by = teleop._ended(Screen(True), led, teleop._halted(led))
     assert (verdict.stopped, by) == (True, "stop by alice.")
-    assert not arm.teleoperating()
+    eventually(lambda: not arm.teleoperating())
+    refused = arm.teleoperate()
+    assert "the robot is being taken off its network" in refused["reason"]
 
 
 def test_follower_is_halted_before_its_stream_is_closed(arm: HardwareRobot, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,6 +15,7 @@ from strands_robots.cli.network import Network
 from strands_robots.cli.output import CliError, Exit, Screen, wait_until
 from strands_robots.cli.own_robot import device_of, peer_of
 from strands_robots.cli.readiness import mesh_problems, shortcomings
+from strands_robots.contract import put_away
 from strands_robots.envelope import text_of
 from strands_robots.safety.gate import OrderedStop
 from strands_robots.safety.stopping import StopVerdict
@@ -149,6 +150,12 @@ class LedRobot:
         with contextlib.suppress(TimeoutError):
             return None if stop is None else stop.verdict.result(VERDICT_S)
         return None
+
+    def halt_last(self) -> StopVerdict:
+        """Halt it at the end: on its networks still, it begins no other motion."""
+        put_away(self.robot)
+        verdict: StopVerdict = self.robot.halt("teleop ended")
+        return verdict
 
     def hold(self, screen: Screen) -> StopVerdict | None:
         """Tell who stopped it, and stay on the network until Ctrl-C."""

@@ -22,6 +22,7 @@ from strands_robots.cli.record import record_robot
 from strands_robots.envelope import is_error, text_of
 from strands_robots.errors import NoAnswerError, NoSuchRobotError, RefusalError
 from strands_robots.policies.base import Ranges
+from strands_robots.policies.rollout import STOP_JOIN_S
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.teleoperators import FULL_RANGES_PER_S, PLUG_INS, LeaderPolicy
 from strands_robots.utils import ValidationError, identifier, number
@@ -234,6 +235,7 @@ def _drive(
             at_end=lambda: ended.append(_halted(led)),
         )
         verdict, why = _ended(screen, led, ended[0])
+        session.join(STOP_JOIN_S)
         row: dict[str, Any] = robot.teleop_status()["leaders"][_NAME]
     screen.data({"event": "ended", **row, "stopped": verdict.stopped, **({"stopped_by": why} if why else {})})
     if row["state"] == "error":
@@ -262,7 +264,7 @@ def _begin(screen: Screen, led: LedRobot, leader: str, source: Any, options: Tel
 
 def _halted(led: LedRobot) -> StopVerdict | None:
     """Halt the robot and return the verdict; None where a caller of the network has stopped it."""
-    return None if led.stopped else led.robot.halt("teleop ended")
+    return None if led.stopped else led.halt_last()
 
 
 def _ended(screen: Screen, led: LedRobot, verdict: StopVerdict | None) -> tuple[StopVerdict, str]:
@@ -278,7 +280,7 @@ def _ended(screen: Screen, led: LedRobot, verdict: StopVerdict | None) -> tuple[
     why = led.stopped_by
     held = led.hold(screen)
     # Another caller may have moved it since.
-    verdict = led.robot.halt("teleop ended")
+    verdict = led.halt_last()
     return held if held is not None and not held.stopped else verdict, why
 
 
@@ -444,7 +446,7 @@ def _made_follower(
                     yield led
             finally:
                 # On the network still: a stop reaches it until it stands.
-                robot.halt("teleop ended")
+                led.halt_last()
     finally:
         robot.cleanup()
 
