@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import SimpleNamespace
@@ -13,7 +14,7 @@ from fixtures.leaders import ScriptedLeader
 from fixtures.waiting import eventually
 
 from strands_robots.cli import output, teleop
-from strands_robots.cli.led_robot import LedRobot, Serving
+from strands_robots.cli.led_robot import LedRobot, Serving, halted_first
 from strands_robots.cli.output import CliError, Screen, wait_until
 from strands_robots.hardware import HardwareRobot
 from strands_robots.safety.lockout import LockoutLatch
@@ -150,3 +151,13 @@ def test_wait_ends_before_its_bar_is_taken_from_a_terminal(monkeypatch: pytest.M
     monkeypatch.setattr(output, "progress_bar", bar)
     assert wait_until(Screen(True), interrupted, 5.0, at_end=lambda: done.append("halted")) == "Ctrl-C."
     assert done == ["halted", "bar"]
+
+
+@pytest.mark.parametrize("ended_by", [signal.SIGTERM, signal.SIGHUP])
+def test_robot_is_halted_when_its_command_or_its_terminal_ends(arm: HardwareRobot, ended_by: signal.Signals) -> None:
+    before = signal.getsignal(ended_by)
+    arm.teleoperate()
+    with pytest.raises(KeyboardInterrupt), halted_first(arm):
+        signal.raise_signal(ended_by)
+    eventually(lambda: not arm.teleoperating())
+    assert signal.getsignal(ended_by) is before

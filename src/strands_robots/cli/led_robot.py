@@ -28,6 +28,9 @@ if TYPE_CHECKING:
 
 NO_NETWORK = "--no-network leads it without one: then Ctrl-C here is the only stop."
 
+ENDS = (signal.SIGTERM, signal.SIGHUP)
+"""Signals that end a command, beside Ctrl-C."""
+
 VERDICT_S = 60.0
 """Longest wait for the verdict on a stop of others, which is there within the halt deadline."""
 
@@ -239,17 +242,21 @@ def _leave_mesh(robot: Any) -> None:
 
 @contextmanager
 def halted_first(robot: Any) -> Iterator[None]:
-    """Halt ``robot`` first where the block raises; SIGTERM is Ctrl-C inside.
+    """Halt ``robot`` first where the block raises.
 
+    SIGTERM and the end of the terminal are Ctrl-C inside.
     What was entered before, such as the leader's device, may take its time to be left.
     """
-    main = threading.current_thread() is threading.main_thread()
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler) if main else None
+    before = {}
+    if threading.current_thread() is threading.main_thread():
+        # With nohup the end of the terminal is ignored, and stays so.
+        ends = [each for each in ENDS if signal.getsignal(each) is not signal.SIG_IGN]
+        before = {each: signal.signal(each, signal.default_int_handler) for each in ends}
     try:
         yield
     except BaseException:
         robot.halt("teleop ended")
         raise
     finally:
-        if main:
-            signal.signal(signal.SIGTERM, before)
+        for each, handler in before.items():
+            signal.signal(each, handler)

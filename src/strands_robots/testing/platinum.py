@@ -325,7 +325,10 @@ def _last(name: str, writes: Sequence[BusWrite]) -> list[BusWrite]:
 
 
 def _fastest(name: str, writes: Sequence[BusWrite]) -> float:
-    """Return the greatest speed of a joint over any window of the writes; a shorter way counts as a whole window."""
+    """Return the greatest speed of a joint over any window of the writes.
+
+    A shorter way counts as one of a whole window.
+    """
     times, paths = [0.0], [0.0]
     points = [(write.at, write.values[name]) for write in writes if name in write.values]
     for (before, start), (at, end) in pairwise(points):

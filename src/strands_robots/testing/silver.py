@@ -54,7 +54,7 @@ SEEN_S = 1.0
 
 
 def _check_seen_moving(bench: ConformanceBench, verb: str) -> None:
-    """Check that the recorder, or the subject's ``moving``, sees it move: else what they see after it proves nothing.
+    """Check that it is seen to move: else what is seen after it proves nothing.
 
     Raises:
         NotProvenError: it runs unseen.
