@@ -104,7 +104,7 @@ class PlugIns:
         return stated[0] if stated else None
 
     def makes(self, target: str) -> bool:
-        """Return True for the ``module:NAME`` by which a package states a part; nothing is imported."""
+        """Return True for the ``module:NAME`` of a stated part; nothing is imported."""
         return any(part.entry.value == target for parts in self._stated().values() for part in parts)
 
     def refused(self) -> Mapping[str, str]:

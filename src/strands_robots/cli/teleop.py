@@ -263,7 +263,7 @@ def _begin(screen: Screen, led: LedRobot, leader: str, source: Any, options: Tel
 
 
 def _halted(led: LedRobot) -> StopVerdict | None:
-    """Halt the robot and return the verdict; None where a caller of the network has stopped it."""
+    """Halt the robot; return None where a caller of the network has stopped it."""
     return None if led.stopped else led.halt_last()
 
 
