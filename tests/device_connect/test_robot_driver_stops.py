@@ -14,7 +14,7 @@ from fixtures.waiting import eventually
 
 from strands_robots.audit import read_audit_log
 from strands_robots.device_connect import base_driver
-from strands_robots.device_connect.command_records import EACH_PER_S
+from strands_robots.device_connect.command_records import EACH_PER_S, IN_ALL_PER_S
 from strands_robots.mesh.resume_authority import keygen
 from strands_robots.safety.ed25519 import load_signing_key
 from strands_robots.safety.plane import plane
@@ -54,6 +54,14 @@ async def test_stops_and_refused_motions_are_recorded_and_a_flood_of_them_is_cou
     assert "DEVICE_CONNECT_RPC_ALLOW" in refused[0]["reason"]
     stops = [each["payload"] for each in found if each["event"] == "command_executed"]
     assert stops == [{"about": "stranger", "action": "stop"}]
+
+
+async def test_flood_of_motions_under_many_names_keeps_no_stop_out_of_the_records(robot: ToyRobot) -> None:
+    async with DriverBench(drive(robot)) as bench:
+        for nth in range(2 * IN_ALL_PER_S):
+            await bench.call("execute", f"stranger-{nth}", instruction="wave")
+        await bench.call("stop", "operator")
+    assert "command_executed" in [each["event"] for each in read_audit_log() if each["peer_id"] == "bench-1"]
 
 
 async def test_nothing_to_stop_is_a_success(robot: ToyRobot) -> None:

@@ -12,7 +12,10 @@ from strands_robots.safety.authorization import ANONYMOUS, caller_name
 from strands_robots.serving.pipeline import Command
 
 EACH_PER_S, IN_ALL_PER_S = 5, 50
-"""Records a second of one kind and caller, and of all; the next one states how many were left out."""
+"""Records a second of one kind and caller, and of all; the next one states how many were left out.
+
+Stops and refused motions count apart.
+"""
 
 REASON_MAX = 200
 FAILED = "the verb failed inside the robot"
@@ -22,7 +25,9 @@ class CommandRecords:
     """Records of one device; each returns at once and never raises."""
 
     def __init__(self) -> None:
-        self._budget = EventBudget(EACH_PER_S, IN_ALL_PER_S, pooled=True)
+        # A flood of motions must not keep a stop out of the records.
+        self._refusals = EventBudget(EACH_PER_S, IN_ALL_PER_S, pooled=True)
+        self._stops = EventBudget(EACH_PER_S, IN_ALL_PER_S, pooled=True)
 
     def refused(self, peer_id: str, command: Command, refusal: Refused | None, answer: Envelope) -> None:
         """Record a motion that was answered with an error."""
@@ -32,18 +37,18 @@ class CommandRecords:
             # What a robot raised may be a text of any length, and is in the log.
             reason = FAILED if refusal.why is RefusalReason.FAILED else refusal.reason
         facts = {"action": command.verb.name, "reason": reason[:REASON_MAX]}
-        self._record("command_refused", peer_id, command.caller, facts)
+        self._record(self._refusals, "command_refused", peer_id, command.caller, facts)
 
     def stopped(self, peer_id: str, caller: object, answer: Envelope) -> None:
         """Record a plain stop that was answered."""
         event = "command_refused" if is_error(answer) else "command_executed"
         why = {"reason": text_of(answer)[:REASON_MAX]} if is_error(answer) else {}
-        self._record(event, peer_id, caller, {"action": "stop", **why})
+        self._record(self._stops, event, peer_id, caller, {"action": "stop", **why})
 
-    def _record(self, event: str, peer_id: str, caller: object, facts: dict[str, Any]) -> None:
+    def _record(self, budget: EventBudget, event: str, peer_id: str, caller: object, facts: dict[str, Any]) -> None:
         now, about = time.monotonic(), caller_name(caller) or ANONYMOUS
-        admitted = self._budget.allows(f"{event} {about}", now)
-        left_out = self._budget.count(f"{event} {about}", now)
+        admitted = budget.allows(f"{event} {about}", now)
+        left_out = budget.count(f"{event} {about}", now)
         if admitted:
             more = {"left_out_before": left_out} if left_out else {}
             queue_safety_event(event, peer_id, {"about": about, **facts, **more})

@@ -10,8 +10,10 @@ from itertools import pairwise
 
 from strands_robots.envelope import text_of
 from strands_robots.errors import RefusalError
+from strands_robots.fleet.verdicts import FleetVerdict
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.testing.bench import (
+    PEER,
     ConformanceBench,
     NotKeptError,
     NotProvenError,
@@ -288,7 +290,8 @@ def _read(bench: ConformanceBench) -> None:
 def lockout(bench: ConformanceBench) -> str:
     """Stop a motion by an emergency stop, and ask for each motion again."""
     with bench.moving() as run, bench.halts_noted() as halts:
-        sending = threading.Thread(target=bench.estop, name="conform estop", daemon=True)
+        verdicts: list[FleetVerdict] = []
+        sending = threading.Thread(target=lambda: verdicts.append(bench.estop()), name="conform estop", daemon=True)
         sending.start()
         wait_for(lambda: not runs(bench.body), bench.subject.answer_s, "the end of the motion after an emergency stop")
         # A robot on a bus is frozen after its loop has ended; this halt's verdict comes after that.
@@ -296,6 +299,10 @@ def lockout(bench: ConformanceBench) -> str:
         count = bench.writes
         bench.check_no_write(count, "emergency stop", halts)
         sending.join()
+        answer = verdicts[0].get(PEER) if verdicts else None
+        if answer is None or answer.stopped is not True:
+            said = "no answer" if answer is None else text_of(answer.envelope())
+            raise NotKeptError(f"the verdict on an emergency stop: {said}")
         run.join()
         count = bench.writes
         for robot in bench.on.values():
