@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from fixtures.leaders import write_csv
@@ -36,6 +37,16 @@ def test_keyboard_is_refused_without_a_terminal(run: Run) -> None:
 def test_unknown_real_follower_is_refused(run: Run) -> None:
     result = run("teleop", "keyboard", "no-such-arm@/dev/ttyACM0", "--json")
     assert result.exit_code in (1, 2)
+
+
+def test_robot_that_no_leader_can_lead_is_refused_by_name_and_let_go(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    let_go: list[str] = []
+    barista = SimpleNamespace(tool_name_str="barista", cleanup=lambda: let_go.append("barista"))
+    monkeypatch.setattr("strands_robots.robot.Robot", lambda *_, **__: barista)
+    result = run("teleop", "keyboard", "barista", "--no-network", "--json")
+    assert result.exit_code == 2
+    assert "barista has no attach_teleop" in json.loads(result.stdout)["reason"]
+    assert let_go == ["barista"]
 
 
 def test_replay_to_a_device_connect_device_is_refused(run: Run, tmp_path: Path) -> None:

@@ -440,6 +440,8 @@ def _made_follower(
         hint = "A device of Device Connect takes no frames; serve its robot on the mesh too, and name it mesh:PEER."
         raise ValidationError(f"{exc} {hint}") from exc
     try:
+        if not callable(getattr(robot, "attach_teleop", None)):
+            raise ValidationError(f"follower must be a robot that a leader can lead; {kind} has no attach_teleop.")
         with served(screen, robot, how, "real" if at or counts_as_hardware(kind) else "sim") as led:
             try:
                 with record_robot(screen, robot, how.peer_id or robot.tool_name_str, record):
