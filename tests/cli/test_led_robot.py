@@ -89,6 +89,16 @@ def test_it_says_who_stopped_it_and_who_locked_it(arm: HardwareRobot) -> None:
     assert led.stopped_by.startswith("arm-1 is locked by the emergency stop of bob ('smoke')")
 
 
+def test_stop_that_comes_while_it_begins_to_be_led_ends_that(arm: HardwareRobot) -> None:
+    led = LedRobot(arm, "arm-1")
+    with led.held_by("keyboard", lambda: bool(arm.teleoperating())):
+        stop_executor().submit(arm, "arm", "stop by alice").result()
+        assert arm.teleoperate()["status"] == "success"
+    eventually(lambda: not arm.teleoperating(), within=2.0)
+    assert led.stopped
+    assert led.stopped_by.startswith("stop by alice")
+
+
 def test_robot_that_another_moves_after_the_stop_is_halted_at_the_end(
     arm: HardwareRobot, monkeypatch: pytest.MonkeyPatch
 ) -> None:

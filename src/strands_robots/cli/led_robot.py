@@ -127,6 +127,8 @@ class LedRobot:
     def held_by(self, leader: str, leads: Callable[[], bool]) -> Iterator[None]:
         """Begin to lead in the block; hold the control lease while the leader leads.
 
+        A stop that comes meanwhile ends that.
+
         Args:
             leader: the holder's name, as other callers are told.
             leads: returns whether it leads already.
@@ -146,6 +148,10 @@ class LedRobot:
             yield
         finally:
             leave.settle(leads())
+        stop = self.robot.gate.newest_stop
+        if stop is not None and stop is not self._before:
+            # It may have come before the first permit, which it then has not voided.
+            self.robot.halt(f"{stop.reason}, as it began to be led")
 
     def verdict(self) -> StopVerdict | None:
         """Return the verdict on the newest stop once it is there; None without one."""
