@@ -313,6 +313,24 @@ class ConformanceBench(NetworkBench):
                 stack.enter_context(put(self.body, name, _noted(getattr(self.body, name), calls)))
             yield calls
 
+    def wait_for_fault(self) -> None:
+        """Wait until something has met the fault, at most ``watch_s``."""
+        ends = time.monotonic() + self.subject.watch_s
+        while self.subject.recorder and not self.subject.recorder.fault_met and time.monotonic() < ends:
+            time.sleep(_EVERY_S)
+
+    def check_fault_met(self, how: str) -> None:
+        """Check that something on the bus met its fault.
+
+        Raises:
+            NotProvenError: nothing did.
+        """
+        if self.subject.recorder and not self.subject.recorder.fault_met:
+            raise NotProvenError(
+                f"nothing met the bus that {how}: call recorder.fail() before each line that the device answers, the "
+                "stop's too (docs/your-robot.md, The bus and its recorder)"
+            )
+
     def check_no_write(self, count: int, how: str, halts: Sequence[HaltCall] = ()) -> None:
         """Check that nothing is written after ``count`` for the subject's ``watch_s``.
 
@@ -404,7 +422,10 @@ class MotionRun:
             if begun and moved and not isinstance(self.answer, RefusalError):
                 return
             if over:
-                raise NotProvenError(f"{self.motion.verb} ended before it moved the robot: {self._said}")
+                raise NotProvenError(
+                    f"{self.motion.verb} ended before it moved the robot: {self._said} Give Subject(motion=...) "
+                    "that moves it from wherever it stands"
+                )
             time.sleep(self._bench.poll_s)
         if self._bench.subject.recorder is not None and self._bench.runs():
             look = "is recorder.wrote() called where the motor is written?"

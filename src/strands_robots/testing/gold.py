@@ -227,8 +227,10 @@ def recovers(bench: ConformanceBench) -> str:
     with bench.moving() as run:
         with recorder.raising(OSError(5, "the emulated cable is out")):
             time.sleep(0.2)
+            bench.wait_for_fault()
         bench.halt()
         run.join()
+    bench.check_fault_met("raises")
     wait_for(
         lambda: bench.halt().stopped is True,
         bench.subject.answer_s,

@@ -345,11 +345,13 @@ def honest(bench: ConformanceBench) -> str:
         with bench.moving():
             with fault():
                 time.sleep(0.05)
+                bench.wait_for_fault()
                 verdict = bench.halt()
                 # A write that hangs is made when the fault is over, after the verdict.
                 count = bench.writes
             if verdict.stopped is True:
                 bench.check_no_write(count, f"halt on a bus that {how}")
+            bench.check_fault_met(how)
             seen.append(f"{how}: {'stopped' if verdict.stopped else 'not stopped'}")
         _recovered(bench, how)
     return ", ".join(seen)

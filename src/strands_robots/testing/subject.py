@@ -47,6 +47,7 @@ class BusRecorder:
     def __init__(self) -> None:
         self._writes: list[BusWrite] = []
         self._fault: Callable[[], None] | None = None
+        self._met = True
 
     def wrote(self, what: object = "", values: Values | None = None, *, can_fail: bool = True) -> None:
         """Record a write that is made now; raise what a check has the bus raise.
@@ -64,6 +65,7 @@ class BusRecorder:
         """Raise, or hang in, what a check has the bus do now; usually do nothing."""
         fault = self._fault
         if fault is not None:
+            self._met = True
             fault()
 
     def watch(
@@ -106,6 +108,14 @@ class BusRecorder:
         """Return the writes after the first ``count``."""
         return self._writes[count:]
 
+    @property
+    def fault_met(self) -> bool:
+        """False until something on the bus has met the last fault.
+
+        True where a fault does not go through :meth:`fail`: a bus that is really cut is met by whatever asks it.
+        """
+        return self._met
+
     @contextmanager
     def raising(self, problem: Exception) -> Iterator[None]:
         """Have each write raise, as when a cable is pulled."""
@@ -132,6 +142,7 @@ class BusRecorder:
 
     @contextmanager
     def _faulty(self, fault: Callable[[], None]) -> Iterator[None]:
+        self._met = False
         self._fault = fault
         try:
             yield

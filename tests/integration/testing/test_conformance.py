@@ -67,6 +67,13 @@ def test_motor_that_goes_on_without_a_write_is_not_proven_to_stand_by_its_writes
     assert (halts.mark, "Subject(moving=...)" in halts.said) == (CheckMark.NOT_PROVEN, True)
 
 
+def test_bus_that_meets_no_fault_proves_no_halt_without_a_cable(monkeypatch: pytest.MonkeyPatch) -> None:
+    unmet = subject(Rig)
+    monkeypatch.setattr(unmet.recorder, "fail", lambda: None)
+    for each in conform(unmet, only=["silver.honest", "gold.recovers"]).results:
+        assert (each.mark, "call recorder.fail()" in each.said) == (CheckMark.NOT_PROVEN, True)
+
+
 def test_motor_that_is_never_seen_to_move_is_not_proven_to_stand() -> None:
     unseen = replace(subject(faulty_robots.KeepsItsSpeed), moving=lambda: False)
     (halts,) = conform(unseen, only=["silver.halts"]).results
