@@ -188,13 +188,18 @@ def networks(bench: ConformanceBench) -> str:
 )
 def own_verbs(bench: ConformanceBench) -> str:
     """Halt each declared motion while it runs."""
-    halted, short = [], []
+    halted, short, unseen = list[str](), list[str](), list[str]()
     for verb in bench.motions():
         if not verb.own:
             continue
         motion = LongMotion(verb.name, bench.arguments(verb))
         try:
             with bench.moving(motion) as run:
+                try:
+                    _check_seen_moving(bench, verb.name)
+                except NotProvenError as exc:
+                    (short if run.over else unseen).append(str(exc))
+                    continue
                 verdict = bench.halt()
                 bench.check_still(verdict, bench.writes, f"halt of {verb.name}")
                 run.join()
@@ -203,6 +208,8 @@ def own_verbs(bench: ConformanceBench) -> str:
             halted.append(verb.name)
         except NotProvenError as exc:
             short.append(str(exc))
+    if unseen:
+        raise NotProvenError("; ".join(unseen))
     if short and not halted:
         raise NotProvenError("; ".join(short))
     return "; ".join([", ".join(halted), *short] if halted else ["it has none of its own"])

@@ -14,7 +14,7 @@ import pytest
 from fixtures import faulty_robots
 from fixtures.faulty_robots import LIMIT, Rig, subject
 
-from strands_robots import verb
+from strands_robots import Permit, verb
 from strands_robots.hardware import HardwareRobot
 from strands_robots.testing import BusRecorder, CheckMark, Subject, Tier, conform
 
@@ -78,6 +78,19 @@ def test_motor_that_is_never_seen_to_move_is_not_proven_to_stand() -> None:
     unseen = replace(subject(faulty_robots.KeepsItsSpeed), moving=lambda: False)
     (halts,) = conform(unseen, only=["silver.halts"]).results
     assert (halts.mark, "has to be True while it moves" in halts.said) == (CheckMark.NOT_PROVEN, True)
+
+
+def test_verb_that_turns_its_motor_on_is_not_proven_to_stand_by_its_writes() -> None:
+    class Spins(Rig):
+        @verb(motion=True, lasts=60.0)
+        def spin(self, permit: Permit) -> None:
+            """Tell the motor a speed, which no stop takes back."""
+            self.write(self.angle)
+            while permit.valid:
+                time.sleep(0.01)
+
+    (result,) = conform(subject(Spins), only=["silver.verbs"]).results
+    assert (result.mark, "spin had no two writes" in result.said) == (CheckMark.NOT_PROVEN, True), result.said
 
 
 def test_one_robot_of_a_subject_lives_at_a_time() -> None:
