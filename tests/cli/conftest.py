@@ -23,9 +23,10 @@ Run = Callable[..., Result]
 
 
 @pytest.fixture(autouse=True)
-def no_mesh_here(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No command meets the mesh of the user."""
-    monkeypatch.setenv("STRANDS_MESH_PORT", str(free_port()))
+def networks_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No command meets the user's networks, or those of a test beside this one."""
+    for name in ("STRANDS_DC_PORT", "STRANDS_MESH_PORT"):
+        monkeypatch.setenv(name, str(free_port()))
 
 
 @pytest.fixture

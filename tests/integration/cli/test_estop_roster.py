@@ -216,5 +216,5 @@ authorization {
             code, said = machine.json(*stop)
         assert code == 3, said
         assert "permissions violation" in said["reasons"]["arm-1"].lower()
-        records = machine.json("audit", "show", "--last", "600")[1]
-        assert "permissions violation" in json.dumps(records).lower()
+        records = machine.run("audit", "show", "--last", "600", "--json").stdout
+        assert "permissions violation" in records.lower()
