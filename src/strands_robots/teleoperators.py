@@ -491,6 +491,10 @@ class RecordedLeader:
         self._started_at: float | None = None
         self.is_connected = True
 
+    def rewind(self) -> None:
+        """Play from the beginning at the next ``get_action``."""
+        self._started_at = None
+
     def get_action(self) -> Action:
         """Return the present targets.
 

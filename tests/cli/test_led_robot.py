@@ -140,7 +140,7 @@ def test_follower_is_halted_before_its_stream_is_closed(arm: HardwareRobot, monk
         return halt(reason)
 
     monkeypatch.setattr("strands_robots.fleet.mesh.leading.followed", followed)
-    monkeypatch.setattr(teleop, "_made_follower", made)
+    monkeypatch.setattr(teleop, "made_follower", made)
     monkeypatch.setattr(arm, "halt", halt_noted)
     how, options = Serving(None), teleop.TeleopOptions()
     teleop._follow(Screen(True), "lead-1", "arm", {}, how=how, options=options, record=None)

@@ -2,14 +2,101 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
+from strands_robots.cli.leading import (
+    LEADER,
+    MANUAL,
+    TeleopOptions,
+    announce,
+    arm_options,
+    begin,
+    check_keys,
+    connected_leader,
+    made_follower,
+)
+from strands_robots.cli.led_robot import Serving, halted_first
+from strands_robots.cli.network import Network
 from strands_robots.cli.output import CliError, Screen
+from strands_robots.cli.record import NO_CAMERAS
+from strands_robots.cli.teleop import MESH_PREFIX, Calibration, FollowerId, NoNetwork, PeerId
 from strands_robots.utils import ValidationError, number, text, whole
+
+
+def record(
+    screen: Screen,
+    network: Network,
+    *,
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="The dataset: a new folder, or one of the same robot.")],
+    robot: Annotated[str, typer.Option("--robot", help="TYPE@PORT of a real arm, or a simulated robot's name.")],
+    leader: Annotated[str, typer.Option("--leader", help="TYPE@PORT of a leader arm, or a recording.")],
+    task: Annotated[str, typer.Option("--task", help="What is to be done, in words.")],
+    episodes: Annotated[int, typer.Option("--episodes", help="How many to save.")] = 50,
+    fps: Annotated[int, typer.Option("--fps", help="Frames a second.")] = 30,
+    episode_s: Annotated[
+        float | None, typer.Option("--episode-s", help="Longest time of one; needed without a terminal.", metavar="S")
+    ] = None,
+    pause_s: Annotated[
+        float, typer.Option("--pause-s", help="Between two, to put things back, without a terminal.", metavar="S")
+    ] = 5.0,
+    success: Annotated[bool, typer.Option("--success", help="An attempt that ends by its time has succeeded.")] = False,
+    cameras: Annotated[
+        str | None, typer.Option("--cameras", help="Names with commas, or none; by default all.", metavar="LIST")
+    ] = None,
+    follower_id: FollowerId = None,
+    calibration: Calibration = None,
+    leader_id: Annotated[str | None, typer.Option("--leader-id", help="Calibration id of the leader.")] = None,
+    leader_calibration: Annotated[
+        Path | None, typer.Option("--leader-calibration", help="Calibration file of the leader.")
+    ] = None,
+    peer_id: PeerId = None,
+    no_network: NoNetwork = False,
+) -> None:
+    """Record episodes of a led robot. What is saved outlives a kill."""
+    from strands_robots.cli.dataset_recording import Attempts, Keys, record_attempts  # noqa: PLC0415 - an extra
+    from strands_robots.datasets.session import RecordingSession  # noqa: PLC0415 - as above
+    from strands_robots.recording.cameras import chosen_frames  # noqa: PLC0415 - as above
+    from strands_robots.teleoperators import RecordedLeader  # noqa: PLC0415 - as above
+
+    whole("--episodes", episodes, low=1, high=10_000)
+    number("--pause-s", pause_s, low=0, high=3600)
+    longest = None if episode_s is None else number("--episode-s", episode_s, above=0, high=3600)
+    if leader.startswith(MESH_PREFIX) or robot.startswith(MESH_PREFIX) or leader in MANUAL:
+        raise ValidationError("--leader must be a leader arm or a recording, and --robot one of this machine.")
+    asked = screen.live and sys.stdin.isatty()
+    if not asked and longest is None:
+        raise ValidationError("--episode-s is needed without a terminal: nobody says when an attempt is over.")
+    how = Serving.of(network, peer_id, None, alone=no_network)
+    arm, options = arm_options("", follower_id, calibration), TeleopOptions()
+    kind = robot.partition("@")[0]
+    with (
+        RecordingSession(folder, fps, task, kind, lambda said: screen.say(said, "yellow")) as session,
+        made_follower(screen, robot, arm, None, how) as led,
+        connected_leader(leader, led.robot, arm_options("", leader_id, leader_calibration)) as source,
+        halted_first(led.robot),
+    ):
+        check_keys(robot, source, led.robot.body().bounds)
+        announce(screen, leader, robot, source)
+
+        def lead() -> Any:
+            if isinstance(source, RecordedLeader):
+                source.rewind()
+            begin(screen, led, leader, source, options, publish=False)
+            return led.robot.tasks.by_leader[LEADER]
+
+        keys = Keys() if asked else None
+        names = None if cameras is None else [name for name in cameras.split(",") if name]
+        frames = None if names == [NO_CAMERAS] else chosen_frames(led.robot, names)
+        attempts = Attempts(episodes, lead, fps, frames, longest, pause_s, success, keys)
+        record_attempts(screen, led, session, attempts)
+        count = session.episodes
+    screen.data({"event": "dataset", "folder": str(folder), "episodes": count})
+    screen.say(f"{folder} has {count} episodes.", "bold")
 
 
 def from_mcap(

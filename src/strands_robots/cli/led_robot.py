@@ -108,7 +108,10 @@ class LedRobot:
 
     @property
     def stopped(self) -> bool:
-        """True where it was stopped, or locked, since it began to be led; False on no network."""
+        """True where it was stopped or locked since it began to be led.
+
+        False on no network.
+        """
         return bool(self.peer_id) and (self.robot.gate.newest_stop is not self._before or bool(self.locked))
 
     @property

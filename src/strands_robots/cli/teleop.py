@@ -7,7 +7,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,16 +14,26 @@ import typer
 from rich.control import Control
 
 from strands_robots.cli.app import Seconds
-from strands_robots.cli.led_robot import LedRobot, Serving, halted_first, served
+from strands_robots.cli.leading import (
+    LEADER,
+    MANUAL,
+    TeleopOptions,
+    announce,
+    arm_options,
+    begin,
+    check_keys,
+    connected_leader,
+    made_follower,
+    recorded_leader,
+)
+from strands_robots.cli.led_robot import LedRobot, Serving, halted_first
 from strands_robots.cli.network import Network, mesh_peer
 from strands_robots.cli.output import POLL_S, CliError, Exit, Screen, table, wait_until
-from strands_robots.cli.record import record_robot
-from strands_robots.envelope import is_error, text_of
+from strands_robots.envelope import text_of
 from strands_robots.errors import NoAnswerError, NoSuchRobotError, RefusalError
-from strands_robots.policies.base import Ranges
 from strands_robots.policies.rollout import STOP_JOIN_S
 from strands_robots.safety.stopping import StopVerdict
-from strands_robots.teleoperators import FULL_RANGES_PER_S, PLUG_INS, LeaderPolicy
+from strands_robots.teleoperators import FULL_RANGES_PER_S, LeaderPolicy
 from strands_robots.utils import ValidationError, identifier, number
 
 if TYPE_CHECKING:
@@ -36,39 +45,10 @@ MESH_PREFIX = "mesh:"
 NO_FOLLOWER = "none"
 """Follower of a leader that is only published."""
 
-_NAME = "leader"
-_MANUAL = ("keyboard", "gamepad")
 FollowerId = Annotated[str | None, typer.Option("--id", help="Calibration id of the follower.")]
 Calibration = Annotated[Path | None, typer.Option("--calibration", help="Calibration file of the follower.")]
 PeerId = Annotated[str | None, typer.Option("--peer-id", help="Id of the follower on the network.")]
 NoNetwork = Annotated[bool, typer.Option("--no-network", help="Lead it on no network: only Ctrl-C stops it.")]
-
-
-@dataclass(frozen=True, slots=True)
-class TeleopOptions:
-    """Options of one teleoperation.
-
-    Args:
-        method: arm, gamepad or keyboard.
-        seconds: end after so many; None for no limit.
-        hz: frames a second.
-        max_speed: whole joint ranges a second that the follower may cross.
-    """
-
-    method: str = "arm"
-    seconds: float | None = None
-    hz: float = 50.0
-    max_speed: float = FULL_RANGES_PER_S
-
-    def timed(self, over: Callable[[], str]) -> Callable[[], str]:
-        """Return ``over``, or that the seconds are over."""
-        began = time.monotonic()
-
-        def timed_over() -> str:
-            late = self.seconds is not None and time.monotonic() - began >= self.seconds
-            return over() or (f"{self.seconds:g} s are over." if late else "")
-
-        return timed_over
 
 
 class NoFollower:
@@ -113,10 +93,10 @@ def teleop(
     no_network: NoNetwork = False,
 ) -> None:
     """Let a leader drive a follower, served meanwhile, until it ends or Ctrl-C."""
-    arm = _arm_options("", follower_id, calibration)
+    arm = arm_options("", follower_id, calibration)
     remote = "" if leader.startswith(MESH_PREFIX) else publish
     how = _how_served(network, follower, peer_id, remote, alone=no_network)
-    options = TeleopOptions(leader if leader in _MANUAL else "arm", seconds, hz, max_speed)
+    options = TeleopOptions(leader if leader in MANUAL else "arm", seconds, hz, max_speed)
     if leader.startswith(MESH_PREFIX):
         if follower.startswith(MESH_PREFIX) or publish is not None:
             raise ValidationError("a leader of the mesh leads a follower of this machine, and publishes itself.")
@@ -125,7 +105,7 @@ def teleop(
         return
 
     def connected(robot: Any) -> AbstractContextManager[Any]:
-        return _connected_leader(leader, robot, _arm_options("", leader_id, leader_calibration))
+        return connected_leader(leader, robot, arm_options("", leader_id, leader_calibration))
 
     _drive(screen, leader, follower, connected, arm, how=how, options=options, publish=publish, record=record)
 
@@ -144,8 +124,8 @@ def replay(
     no_network: NoNetwork = False,
 ) -> None:
     """Play the recorded actions of a device to a follower, here or on the mesh, and stop it at the end."""
-    leader = _recorded_leader(file, device, speed)
-    arm = _arm_options("", follower_id, calibration)
+    leader = recorded_leader(file, device, speed)
+    arm = arm_options("", follower_id, calibration)
     how = _how_served(network, to, peer_id, None, alone=no_network)
     _drive(screen, file.name, to, lambda _: nullcontext(leader), arm, how=how, options=TeleopOptions())
 
@@ -161,7 +141,7 @@ def calibrate(
     """Measure an arm's middle and the ends of its joints, moved by hand. Its torque goes off: hold it."""
     from strands_robots.hardware.lerobot_device import Calibrator, make_device  # noqa: PLC0415 - a real arm only
 
-    made = make_device(arm, _arm_options(port, device, None), "leader" if leader else "follower", calibrated=False)
+    made = make_device(arm, arm_options(port, device, None), "leader" if leader else "follower", calibrated=False)
     steps = Calibrator(made)
     try:
         steps.begin()
@@ -216,17 +196,17 @@ def _drive(
             _publish(screen, leader, peer, source, options)
         return
     with (
-        _made_follower(screen, follower, arm, record, how) as led,
+        made_follower(screen, follower, arm, record, how) as led,
         connected(led.robot) as source,
         halted_first(led.robot),
     ):
         robot = led.robot
-        _check_keys(follower, source, robot.body().bounds)
-        _begin(screen, led, leader, source, options, publish=publish is not None)
-        session = robot.tasks.by_leader[_NAME]
-        _announce(screen, leader, follower, source)
+        check_keys(follower, source, robot.body().bounds)
+        begin(screen, led, leader, source, options, publish=publish is not None)
+        session = robot.tasks.by_leader[LEADER]
+        announce(screen, leader, follower, source)
         if publish is not None:
-            screen.say(f"Others may follow {publish}/{_NAME} on the mesh.")
+            screen.say(f"Others may follow {publish}/{LEADER} on the mesh.")
         ended = list[StopVerdict | None]()
         wait_until(
             screen,
@@ -236,30 +216,12 @@ def _drive(
         )
         verdict, why = _ended(screen, led, ended[0])
         session.join(STOP_JOIN_S)
-        row: dict[str, Any] = robot.teleop_status()["leaders"][_NAME]
+        row: dict[str, Any] = robot.teleop_status()["leaders"][LEADER]
     screen.data({"event": "ended", **row, "stopped": verdict.stopped, **({"stopped_by": why} if why else {})})
     if row["state"] == "error":
         raise CliError(f"The teleoperation failed: {row['error']}", **row)
     screen.say(f"{row['state'].capitalize()} after {row['step']} frames, {row['errors']} of them unusable.", "green")
     _check_stopped(verdict, why)
-
-
-def _begin(screen: Screen, led: LedRobot, leader: str, source: Any, options: TeleopOptions, *, publish: bool) -> None:
-    """Let the leader lead from the robot's present position.
-
-    Raises:
-        CliError: it was refused. A locked robot stays on the network before, so that its resume reaches it.
-    """
-    robot = led.robot
-    with led.held_by(leader if "@" in leader else Path(leader).name, lambda: _NAME in robot.teleoperating()):
-        for answer in (
-            robot.attach_teleop(source, _NAME, method=options.method, max_speed=options.max_speed),
-            robot.teleoperate(_NAME, duration=options.seconds, hz=options.hz, publish=publish),
-        ):
-            if is_error(answer):
-                if led.peer_id and led.locked:
-                    led.hold(screen)
-                raise CliError(text_of(answer))
 
 
 def _halted(led: LedRobot) -> StopVerdict | None:
@@ -297,7 +259,7 @@ def _follow(
     """Let a leader published on the mesh drive a follower of this machine."""
     from strands_robots.fleet.mesh.leading import DEVICE, FollowedPeer, followed  # noqa: PLC0415 - loaded when the network is used
 
-    with _made_follower(screen, follower, arm, record, how) as led, halted_first(led.robot):
+    with made_follower(screen, follower, arm, record, how) as led, halted_first(led.robot):
         robot, leaders, ended = led.robot, list[FollowedPeer](), list[StopVerdict | None]()
         with _refused(), ExitStack() as stack:
             with led.held_by(peer, lambda: bool(leaders)):
@@ -305,7 +267,7 @@ def _follow(
             # The end of the stream waits for its last frame and for the network.
             stack.enter_context(halted_first(robot))
             leading = leaders[0]
-            _announce(screen, f"{peer}/{DEVICE}", robot.tool_name_str, leading)
+            announce(screen, f"{peer}/{DEVICE}", robot.tool_name_str, leading)
             why = wait_until(screen, options.timed(leading.over), at_end=lambda: ended.append(_halted(led)))
             stats = leading.stats
         verdict, by = _ended(screen, led, ended[0])
@@ -331,7 +293,7 @@ def _lead_peer(
     with dialled("lead", peer) as mesh:
         follower = RemoteFollower(mesh, peer)
         with connected(follower) as source:
-            _check_keys(peer, source, follower.bounds)
+            check_keys(peer, source, follower.bounds)
             policy = LeaderPolicy(source, device=DEVICE, method=options.method, max_speed=speed, period=1 / rate)
             led = LedPeer(follower, mesh.peer_id, policy)
             publishing = publisher(mesh, led.bounded, options.method, rate)
@@ -345,7 +307,7 @@ def _lead_peer(
             follower.open_stream(mesh.peer_id)
             try:
                 publishing.start()
-                _announce(screen, leader, peer, source)
+                announce(screen, leader, peer, source)
                 why = wait_until(screen, options.timed(led.over), getattr(source, "duration", None) or 0.0, at_end=stop)
             finally:
                 # The follower is stopped first; publishing ends even when it does not answer.
@@ -388,20 +350,6 @@ def _report_sent(screen: Screen, why: str, row: Mapping[str, Any]) -> None:
     screen.say(f"{why} {row['frames']} frames sent, {row['errors']} of the leader's unusable.", "green")
 
 
-def _check_keys(follower: str, leader: Any, bounds: Ranges) -> None:
-    """Refuse a leader of joints that the follower lacks, before anything moves."""
-    unknown = [key for key in getattr(leader, "keys", ()) if key not in bounds]
-    if unknown:
-        raise ValidationError(f"{follower} has {', '.join(bounds)}, not {', '.join(unknown)}, which the leader leads.")
-
-
-def _announce(screen: Screen, leader: str, follower: str, source: Any) -> None:
-    """Print which leader leads which follower, and its keys."""
-    screen.say(f"{leader} leads {follower}. Ctrl-C stops the follower.")
-    for name, up, down in getattr(source, "help", []):
-        screen.say(f"  {up} and {down} move {name}")
-
-
 @contextmanager
 def _refused() -> Iterator[None]:
     """Raise a refusal as the command's failure."""
@@ -423,36 +371,6 @@ def _how_served(network: Network, follower: str, peer_id: str | None, on_mesh: s
     return Serving(network)
 
 
-@contextmanager
-def _made_follower(
-    screen: Screen, follower: str, arm: dict[str, Any], record: Path | None, how: Serving
-) -> Iterator[LedRobot]:
-    """Make, serve and record ``TYPE@PORT`` or a model; halt it at the end."""
-    from strands_robots.robot import NO_SUCH_MODEL, Robot, counts_as_hardware  # noqa: PLC0415 - heavy, and needed by these commands alone
-
-    kind, at, port = follower.partition("@")
-    how.check()
-    try:
-        robot: Any = Robot(kind, mode="real" if at else "sim", mesh=False, **({**arm, "port": port} if at else {}))
-    except ValidationError as exc:
-        if exc.code != NO_SUCH_MODEL or "/" in kind or "." in kind:
-            raise
-        hint = "A device of Device Connect takes no frames; serve its robot on the mesh too, and name it mesh:PEER."
-        raise ValidationError(f"{exc} {hint}") from exc
-    try:
-        if not callable(getattr(robot, "attach_teleop", None)):
-            raise ValidationError(f"follower must be a robot that a leader can lead; {kind} has no attach_teleop.")
-        with served(screen, robot, how, "real" if at or counts_as_hardware(kind) else "sim") as led:
-            try:
-                with record_robot(screen, robot, how.peer_id or robot.tool_name_str, record):
-                    yield led
-            finally:
-                # On the network still: a stop reaches it until it stands.
-                led.halt_last()
-    finally:
-        robot.cleanup()
-
-
 def _tell_stop(screen: Screen, robot: Any, verdict: StopVerdict) -> None:
     screen.say("Stopping the follower...")
     if verdict.stopped:
@@ -466,75 +384,6 @@ def _check_stopped(verdict: StopVerdict, stopped_by: str) -> None:
         raise CliError(f"The follower did not confirm its stop: {text_of(verdict.envelope())}")
     if stopped_by:
         raise CliError(f"Stopped from the network: {stopped_by}")
-
-
-@contextmanager
-def _connected_leader(leader: str, robot: Any, options: dict[str, Any]) -> Iterator[Any]:
-    """Yield the leader of that name, ready to lead ``robot``.
-
-    Raises:
-        ConnectionError: a leader arm cannot be connected.
-    """
-    from strands_robots.robot import LEROBOT  # noqa: PLC0415 - heavy, and needed by these commands alone
-
-    if leader in _MANUAL:
-        from strands_robots.teleoperators import GamepadLeader, KeyboardLeader  # noqa: PLC0415 - as above
-
-        body = robot.body()
-        present = body.get_joints()
-        start = {key: present[key] for key in body.bounds if key in present}
-        manual = KeyboardLeader if leader == "keyboard" else GamepadLeader
-        with manual(start, body.bounds) as source:
-            yield source
-        return
-    kind, at, port = leader.partition("@")
-    stated = {**options, "port": port} if at else options
-    plug_in = PLUG_INS.get(kind)
-    made = None if plug_in is None else plug_in.make(**stated)
-    if made is not None and not callable(getattr(made, "connect", None)):
-        yield made
-        return
-    if made is None and not at:
-        yield _recorded_leader(Path(leader))
-        return
-    from strands_robots.hardware import LeaderArm  # noqa: PLC0415 - real arms only
-    from strands_robots.hardware.lerobot_device import make_device  # noqa: PLC0415
-
-    with ExitStack() as stack:
-        arm = LeaderArm(make_device(kind.removeprefix(LEROBOT), stated, "leader") if made is None else made)
-        try:
-            stack.enter_context(arm)
-        except Exception as exc:
-            raise ConnectionError(f"{leader} could not be connected: {' '.join(str(exc).split())}") from exc
-        yield arm
-
-
-def _recorded_leader(path: Path, device: str | None = None, speed: float = 1.0) -> Any:
-    """Return a recording as a leader: ``.csv``, ``.parquet`` or ``.mcap``.
-
-    Args:
-        path: the file.
-        device: the device in an ``.mcap`` of several; the episode of a ``.parquet``.
-        speed: times as fast.
-
-    Raises:
-        ValidationError: it cannot be read, or it has no actions of that device.
-        MissingExtraError: the package that reads it is not installed.
-    """
-    from strands_robots.recording.file import recorded_actions  # noqa: PLC0415 - as above
-    from strands_robots.teleoperators import RecordedLeader, read_episode, read_frames  # noqa: PLC0415
-
-    if path.suffix == ".mcap":
-        frames = recorded_actions(path, device)
-    else:
-        frames = read_episode(path, device) if path.suffix == ".parquet" else read_frames(path)
-    return RecordedLeader(frames, speed)
-
-
-def _arm_options(port: str, device: str | None, calibration: Path | None) -> dict[str, Any]:
-    """Return the options of a real arm that were given."""
-    options = {"port": port or None, "id": device, "calibration": calibration}
-    return {key: value for key, value in options.items() if value is not None}
 
 
 class _EnterKey:

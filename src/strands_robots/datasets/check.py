@@ -34,6 +34,9 @@ FROZEN_S = 1.0
 JUMP_SHARE = 0.5
 """Part of a joint's whole range that it may go in one frame."""
 
+STILL = 0.01
+"""Way of a joint, in its unit, that is not looked at."""
+
 _GRID_S = 1e-4
 """Tolerance of LeRobot's loaders in time."""
 
@@ -148,7 +151,7 @@ def _jumps(info: DatasetInfo, frames: dict[str, NDArray[Any]]) -> Iterator[str]:
             continue
         values = np.asarray(frames[key], dtype=np.float64)
         reach, steps = np.ptp(values, axis=0), np.abs(np.diff(values, axis=0))
-        for column in np.flatnonzero((steps.max(axis=0) > JUMP_SHARE * reach) & (reach > 0)):
+        for column in np.flatnonzero((steps.max(axis=0) > JUMP_SHARE * reach) & (reach > STILL)):
             at = int(steps[:, column].argmax()) + 1
             yield f"{feature.names[column]} of {key} jumps by {steps[at - 1, column]:.3g} at frame {at}"
 

@@ -45,6 +45,9 @@ from strands_robots.utils import ValidationError, shown, text
 LOCK, RUNNING = ".recorder.lock", ".running"
 """File that the process that records holds, and folder of what is not saved yet. LeRobot reads neither."""
 
+RECORDING = ".mcap"
+"""Suffix of a recording in that folder, which only :mod:`~strands_robots.datasets.session` removes."""
+
 TASK_MAX = 1000
 """Longest task, in characters."""
 
@@ -67,12 +70,43 @@ class DatasetEpisode:
     videos: Mapping[str, Video] = field(default_factory=dict)
 
 
+class DatasetHold:
+    """Folder of a dataset that this process alone writes into, until it is closed.
+
+    Args:
+        folder: has a dataset, or is made.
+
+    Raises:
+        DatasetError: another process holds it, or it is a folder of others' files.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        if not (folder / INFO).is_file():
+            _require_empty(folder)
+        with _told(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            self._lock = _locked(folder)
+
+    @property
+    def closed(self) -> bool:
+        """True once it was let go of."""
+        return self._lock < 0
+
+    def close(self) -> None:
+        """Let go of it. Twice is once."""
+        if self._lock >= 0:
+            os.close(self._lock)
+            self._lock = -1
+
+
 class Dataset:
     """Dataset in a folder, held by this process until it is closed.
 
     Args:
         folder: has a dataset, or is made.
         info: what is recorded into it; None to open what is there.
+        hold: of the folder, which the dataset closes with itself; its own by default.
 
     Raises:
         DatasetError: another process records into it, it cannot be read or written, or it is a folder of others' files.
@@ -80,7 +114,7 @@ class Dataset:
         MissingExtraError: the [dataset] extra is not installed.
     """
 
-    def __init__(self, folder: Path, info: DatasetInfo | None = None) -> None:
+    def __init__(self, folder: Path, info: DatasetInfo | None = None, hold: DatasetHold | None = None) -> None:
         tables.pyarrow()
         self.folder = folder
         self.mended: list[str] = []
@@ -93,16 +127,14 @@ class Dataset:
         known = (folder / INFO).is_file()
         if not known and info is None:
             raise DatasetError(f"{folder} has no dataset: there is no {INFO}")
-        if not known:
-            _require_empty(folder)
-        with _told(folder):
-            folder.mkdir(parents=True, exist_ok=True)
-            self._lock = _locked(folder)
-            try:
+        self._hold = DatasetHold(folder) if hold is None else hold
+        try:
+            with _told(folder):
                 self._open(info, known)
-            except BaseException:
-                os.close(self._lock)
-                raise
+        except BaseException:
+            if hold is None:
+                self._hold.close()
+            raise
 
     def __enter__(self) -> Self:
         return self
@@ -117,10 +149,9 @@ class Dataset:
 
     def close(self) -> None:
         """Let go of it. Twice is once."""
-        if self._lock >= 0:
-            self._remove(tables.files_in(self.running))
-            os.close(self._lock)
-            self._lock = -1
+        if not self._hold.closed:
+            self._remove(self._unsaved())
+            self._hold.close()
 
     def save(self, episode: DatasetEpisode) -> int:
         """Save an episode: once this returns, it outlives a kill and a power cut.
@@ -132,7 +163,7 @@ class Dataset:
             ValidationError: a column is missing, too many, of another length or not finite.
             DatasetError: it cannot be written; the dataset is as it was.
         """
-        if self._lock < 0:
+        if self._hold.closed:
             raise DatasetError(f"{self.folder} is closed")
         number, count = self.info.episodes, self._checked(episode)
         tasks = self.tasks if episode.task in self.tasks else [*self.tasks, episode.task]
@@ -289,10 +320,14 @@ class Dataset:
     def _uncounted(self) -> Iterator[Path]:
         """Yield the files that the index does not count: of a killed recorder."""
         known = {self.folder / path for number in self._numbers() for path in self._files(number)}
-        tops = [DATA_PATH.partition("/")[0], EPISODES_PATH.rpartition("/chunk")[0], "videos", RUNNING]
-        for top in tops:
+        for top in (DATA_PATH.partition("/")[0], EPISODES_PATH.rpartition("/chunk")[0], "videos"):
             yield from (path for path in tables.files_in(self.folder / top) if path not in known)
+        yield from self._unsaved()
         yield from (self.folder / "meta").glob(".*.part")
+
+    def _unsaved(self) -> Iterator[Path]:
+        """Yield what is half made of an episode, without its recording."""
+        return (path for path in tables.files_in(self.running) if path.suffix != RECORDING)
 
     def _remove(self, paths: Iterator[Path], *, told: bool = False) -> None:
         for path in paths:

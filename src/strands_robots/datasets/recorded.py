@@ -29,7 +29,13 @@ AGE, SAME, IMAGES = "observation.age_ms.", "observation.same.", "observation.ima
 STOPPED, EMERGENCY = 1, 2
 """Values of the feature ``stop``; 0 is none."""
 
+SOON_S = 1e-5
+"""A reading that comes so soon after a frame's moment, in seconds, is that frame's: times are rounded."""
+
 _STOPS = {"halted": STOPPED, "locked": EMERGENCY, "emergencyStop": EMERGENCY}
+ATTEMPT_ENDED = "attemptEnded"
+"""Event of a recording: the person who records has ended the attempt. What follows is none of it."""
+
 _ENDS = ("taskComplete", "policyComplete")
 _STARTS = ("taskStarted", "policyStarted")
 
@@ -75,12 +81,25 @@ def attempts_of(path: Path, robot: str | None = None) -> list[Attempt]:
     return attempts
 
 
+def has_steps(path: Path) -> bool:
+    """Return True for a recording with a step of a task.
+
+    Raises:
+        ValidationError: it is no recording.
+    """
+    return any(isinstance(each, RecordedEvent) and each.event == STEP for each in read_items(path))
+
+
 def _attempts(items: Sequence[RecordedItem], robot: str) -> Iterator[Attempt]:
     attempt = Attempt()
     for each in items:
         if not isinstance(each, RecordedEvent) or each.robot not in (robot, robot.partition("/")[0]):
             continue
-        if each.event in _STARTS or each.event in _ENDS:
+        if each.event == ATTEMPT_ENDED:
+            if attempt.steps:
+                yield attempt
+            attempt = Attempt()
+        elif each.event in _STARTS or each.event in _ENDS:
             if attempt.steps and each.event in _STARTS:
                 yield attempt
                 attempt = Attempt()
@@ -148,7 +167,8 @@ def save_attempt(dataset: Dataset, attempt: Attempt, task: str, *, success: bool
     """
     steps, fps = attempt.steps, dataset.info.fps
     began = steps[0][0]
-    count = int((steps[-1][0] - began) * fps) + 1
+    # Times are kept in nanoseconds, and a step belongs to the frame that it comes with.
+    count = int((steps[-1][0] - began) * fps + 1e-3) + 1
     if count > FRAMES_MAX:
         raise ValidationError(f"an episode must have 1 to {FRAMES_MAX:,} frames, not {count:,}.")
     moments = began + np.arange(count) / fps
@@ -211,8 +231,7 @@ def _newest(moments: NDArray[np.float64], times: Sequence[float]) -> list[int]:
     """Return the index of the newest time at each moment, else of the first."""
     if not times:
         raise ValidationError("a camera has no picture.")
-    # A step at its own moment counts although its time was rounded to nanoseconds.
-    return list(np.maximum(np.searchsorted(np.array(times), moments + 1e-6, side="right") - 1, 0))
+    return list(np.maximum(np.searchsorted(np.array(times), moments + SOON_S, side="right") - 1, 0))
 
 
 def _told(steps: Sequence[tuple[float, Mapping[str, float], Mapping[str, float]]]) -> list[dict[str, float]]:
@@ -229,7 +248,9 @@ def _rows(names: Sequence[str], rows: Sequence[Mapping[str, float]]) -> NDArray[
     lacking = sorted({name for row in rows for name in names if name not in row})
     if lacking:
         raise ValidationError(f"{', '.join(lacking)} is missing in a step.")
-    return np.array([[row[name] for name in names] for row in rows], dtype=np.float32)
+    table = np.array([[row[name] for name in names] for row in rows], dtype=np.float32)
+    # LeRobot has a vector of one number as a plain column.
+    return table[:, 0] if len(names) == 1 else table
 
 
 def _stops(moments: NDArray[np.float64], stops: Sequence[tuple[float, int]]) -> NDArray[np.int64]:

@@ -1,0 +1,199 @@
+"""Recording of episodes: a led robot, and a person who judges each attempt."""
+
+from __future__ import annotations
+
+import queue
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
+from enum import Enum
+from typing import TYPE_CHECKING, Any
+
+from strands_robots.cli.led_robot import LedRobot
+from strands_robots.cli.output import POLL_S, CliError, Screen, wait_until
+from strands_robots.datasets.recorded import ATTEMPT_ENDED
+from strands_robots.recording.cameras import Frames
+from strands_robots.recording.file import Recorder, RobotRecording
+from strands_robots.safety.stopping import StopVerdict
+
+if TYPE_CHECKING:
+    from strands_robots.datasets.session import RecordingSession
+
+CAMERAS_HZ_MAX = 60
+
+
+class Said(Enum):
+    """Word of a person on an attempt, by the key before Enter."""
+
+    SUCCESS = ""
+    FAILURE = "f"
+    REDO = "r"
+    END = "q"
+
+
+KEYS = "Enter keeps it as a success, f Enter as a failure, r Enter redoes it, q Enter drops it and ends."
+
+
+class Keys:
+    """Lines of the terminal, read on a thread; none where nobody sits at it."""
+
+    def __init__(self) -> None:
+        self._lines: queue.SimpleQueue[str] = queue.SimpleQueue()
+        threading.Thread(target=self._read, name="keys", daemon=True).start()
+
+    def said(self) -> Said | None:
+        """Return the next word of the person; None while there is none."""
+        try:
+            line = self._lines.get_nowait()
+        except queue.Empty:
+            return None
+        return next((each for each in Said if each.value == line.strip().lower()), None)
+
+    def wait(self) -> Said:
+        """Wait for a word. What was typed before does not count."""
+        while self.said() is not None:
+            pass
+        while (word := self.said()) is None:
+            time.sleep(POLL_S)
+        return word
+
+    def _read(self) -> None:
+        for line in sys.stdin:
+            self._lines.put(line)
+        self._lines.put(Said.END.value)
+
+
+@dataclass(frozen=True, slots=True)
+class Attempts:
+    """Number of attempts, and the end of each.
+
+    Args:
+        count: of episodes to save.
+        begin: lets the leader lead; returns its task.
+        fps: frames a second, and pictures that are asked of each camera.
+        frames: takes the pictures; None for none.
+        seconds: longest time of one; None for as long as the person likes.
+        pause_s: between two, where nobody is asked.
+        success: of an attempt that ends by its time.
+        keys: of the person; None for nobody.
+    """
+
+    count: int
+    begin: Callable[[], Any]
+    fps: int
+    frames: Frames | None
+    seconds: float | None
+    pause_s: float
+    success: bool
+    keys: Keys | None = None
+
+
+def record_attempts(screen: Screen, led: LedRobot, session: RecordingSession, attempts: Attempts) -> None:
+    """Record attempts until all are saved or the person ends it.
+
+    Args:
+        screen: where it is told.
+        led: the robot, served.
+        session: takes what is kept.
+        attempts: how many, and their ends.
+
+    Raises:
+        CliError: the robot was stopped by others, its leader failed, or its stop was not confirmed.
+    """
+    saved = 0
+    while saved < attempts.count:
+        if not _ready(screen, attempts, saved):
+            return
+        ended = _attempt(screen, led, session, attempts)
+        if ended.stopped_by:
+            _save(screen, session, success=False)
+            led.hold(screen)
+            raise CliError(f"Stopped from the network: {ended.stopped_by}")
+        if ended.verdict is None or not ended.verdict.stopped:
+            raise CliError("The follower did not confirm its stop; the attempt is saved at the next start.")
+        if ended.said in (Said.REDO, Said.END):
+            session.discard()
+            screen.say("Dropped.", "yellow")
+        else:
+            kept = _save(screen, session, success=ended.said is Said.SUCCESS)
+            if not kept and attempts.keys is None:
+                raise CliError("The leader did not move the robot; nothing more is recorded.")
+            saved += kept
+        if ended.failed:
+            raise CliError(f"The leader failed: {ended.failed}")
+        if ended.said is Said.END or ended.interrupted:
+            return
+
+
+@dataclass(frozen=True, slots=True)
+class _Ended:
+    """End of one attempt: what was said of it, who stopped it, why it failed."""
+
+    said: Said
+    stopped_by: str
+    failed: str
+    interrupted: bool
+    verdict: StopVerdict | None
+
+
+def _ready(screen: Screen, attempts: Attempts, saved: int) -> bool:
+    """Wait until the next attempt may begin; False where none shall."""
+    if attempts.keys is not None:
+        screen.say(f"Attempt {saved + 1} of {attempts.count}: Enter begins, q Enter ends.", "bold")
+        return attempts.keys.wait() is not Said.END
+    if saved:
+        over = time.monotonic() + attempts.pause_s
+        return wait_until(screen, lambda: "over" if time.monotonic() >= over else "") != "Ctrl-C."
+    return True
+
+
+def _attempt(screen: Screen, led: LedRobot, session: RecordingSession, attempts: Attempts) -> _Ended:
+    """Lead and record one attempt, and halt the robot."""
+    robot, said, ends = led.robot, list[Said](), list[tuple[str, StopVerdict | None]]()
+    with ExitStack() as recorded:
+        recorder = recorded.enter_context(Recorder(session.recording, joints_of_events=False))
+        sampled = RobotRecording(
+            robot, recorder, robot.tool_name_str, frames=attempts.frames, cameras_hz=min(attempts.fps, CAMERAS_HZ_MAX)
+        )
+        recorded.enter_context(sampled)
+        task, began = attempts.begin(), time.monotonic()
+        if attempts.keys is not None:
+            screen.say(KEYS)
+
+        def over() -> str:
+            word = None if attempts.keys is None else attempts.keys.said()
+            if word is not None:
+                said.append(word)
+                return "said"
+            if attempts.seconds is not None and time.monotonic() - began >= attempts.seconds:
+                return "time"
+            return "" if task.running and not task.voided else "ended"
+
+        def end() -> None:
+            if led.stopped:
+                ends.append((led.stopped_by, None))
+                return
+            # What ends an attempt here is no stop of it.
+            recorder.take(robot.tool_name_str, ATTEMPT_ENDED, {})
+            ends.append(("", robot.halt("attempt ended")))
+
+        why = wait_until(screen, over, attempts.seconds or 0.0, at_end=end)
+    stopped_by, verdict = ends[0]
+    done = attempts.success and why in ("time", "ended") and not task.error
+    word = said[0] if said else Said.SUCCESS if done else Said.FAILURE
+    return _Ended(word, stopped_by, task.error, why == "Ctrl-C.", verdict)
+
+
+def _save(screen: Screen, session: RecordingSession, *, success: bool) -> bool:
+    kept = session.keep(success=success)
+    if kept is None:
+        screen.say("The robot made no step: there is nothing to save.", "yellow")
+        return False
+    index, frames = kept
+    row: Mapping[str, Any] = {"event": "saved", "episode": index, "frames": frames, "success": success}
+    screen.data(dict(row))
+    screen.say(f"episode {index} is saved: {frames} frames, {'a success' if success else 'no success'}.", "green")
+    return True

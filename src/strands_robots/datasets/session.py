@@ -1,0 +1,140 @@
+"""Attempts of one robot, recorded into a dataset one after another.
+
+The running attempt is a recording (MCAP) inside the dataset's folder, whole to its last second whenever the process
+ends. It becomes an episode when it is kept; one that a killed process left becomes one when the next session begins.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Self
+
+from strands_robots.datasets.episodes import RECORDING, RUNNING, Dataset, DatasetHold
+from strands_robots.datasets.layout import INFO, DatasetInfo, read_info
+from strands_robots.datasets.recorded import Attempt, attempts_of, has_steps, info_of, save_attempt
+from strands_robots.utils import ValidationError, text, whole
+
+
+class RecordingSession:
+    """Session of recording into the dataset of a folder; entered as a context.
+
+    Args:
+        folder: has a dataset of the same robot, or is made.
+        fps: frames a second.
+        task: in words, of each attempt.
+        robot_type: kind of the robot.
+        tell: called with a sentence for each thing that the beginning mended.
+
+    Raises:
+        DatasetError: another process records into it, or it is a folder of others' files.
+        ValidationError: a value outside its domain, or a dataset of another rate.
+
+    Entering it raises as :meth:`keep` does, where a killed process left an attempt of another kind.
+    """
+
+    def __init__(self, folder: Path, fps: int, task: str, robot_type: str, tell: Callable[[str], None]) -> None:
+        self.folder, self._tell = folder, tell
+        self._fps = whole("fps", fps, low=1, high=1000)
+        self._task = text("task", task, longest=1000)
+        self._robot_type = text("robot_type", robot_type, longest=100)
+        self._dataset: Dataset | None = None
+        self._hold = DatasetHold(folder)
+        try:
+            self._open()
+        except BaseException:
+            self._hold.close()
+            raise
+
+    def __enter__(self) -> Self:
+        self._mend()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        if self._dataset is not None:
+            self._dataset.close()
+        self._hold.close()
+
+    @property
+    def episodes(self) -> int:
+        """Number of saved episodes, those of earlier sessions as well."""
+        return 0 if self._dataset is None else self._dataset.info.episodes
+
+    @property
+    def recording(self) -> Path:
+        """File to record the next attempt into; its folder is there."""
+        return self._recording(self.episodes)
+
+    def keep(self, *, success: bool) -> tuple[int, int] | None:
+        """Save the recorded attempt as an episode.
+
+        Returns:
+            Its index, and the number of its frames; None for an attempt without a step, which is removed.
+
+        Raises:
+            ValidationError: it is of another kind than the dataset; its recording is still there.
+            DatasetError: it cannot be written; its recording is still there.
+        """
+        recording = self.recording
+        attempts = attempts_of(recording) if recording.exists() and has_steps(recording) else []
+        if not attempts:
+            recording.unlink(missing_ok=True)
+            return None
+        attempt = max(attempts, key=lambda each: len(each.steps))
+        dataset = self._dataset_for(attempt)
+        before = dataset.info.frames
+        index = save_attempt(dataset, attempt, self._task, success=success)
+        recording.unlink()
+        return index, dataset.info.frames - before
+
+    def discard(self) -> None:
+        """Remove the recorded attempt."""
+        self.recording.unlink(missing_ok=True)
+
+    def _open(self) -> None:
+        if not (self.folder / INFO).is_file():
+            return
+        if (fps := read_info(self.folder).fps) != self._fps:
+            raise ValidationError(f"fps must be {fps}, as {self.folder} has it, not {self._fps}.")
+        self._take(Dataset(self.folder, hold=self._hold))
+
+    def _recording(self, episode: int) -> Path:
+        running = self.folder / RUNNING
+        running.mkdir(exist_ok=True)
+        return running / f"attempt-{episode:06d}{RECORDING}"
+
+    def _mend(self) -> None:
+        """Make an episode of the attempt that a killed process left."""
+        current = self.recording
+        for left in sorted(current.parent.glob(f"*{RECORDING}")):
+            if left != current:
+                # Its episode was saved; the process was killed before it removed this.
+                left.unlink()
+                self._tell(f"{left.name} is of an episode that was saved, and is removed.")
+        if not current.exists():
+            return
+        kept = self.keep(success=False)
+        if kept is None:
+            self._tell("The attempt that was running has no whole second, and is removed.")
+        else:
+            index, frames = kept
+            self._tell(f"episode {index} is the attempt that was running, cut to its last second: {frames} frames.")
+
+    def _dataset_for(self, attempt: Attempt) -> Dataset:
+        """Return the dataset for an attempt, made by the first one.
+
+        Raises:
+            ValidationError: the attempt is of another kind.
+        """
+        info: DatasetInfo = info_of([attempt], self._fps, self._robot_type)
+        if self._dataset is None:
+            self._take(Dataset(self.folder, info, hold=self._hold))
+        assert self._dataset is not None
+        if differences := self._dataset.info.differences(info):
+            raise ValidationError(f"{self.folder} has another kind of episodes: {'; '.join(differences)}.")
+        return self._dataset
+
+    def _take(self, dataset: Dataset) -> None:
+        self._dataset = dataset
+        for said in dataset.mended:
+            self._tell(f"{said}.")
