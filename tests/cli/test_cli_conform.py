@@ -102,12 +102,22 @@ def test_target_that_makes_no_robot_is_refused_by_name(target: str, said: str) -
         subject_of(target, {})
 
 
-@pytest.mark.parametrize("name", ["", "My_Robot", "my-robot", "1robot", "a" * 51, "../x", "class", "json", "numpy"])
+@pytest.mark.parametrize(
+    "name", ["", "My_Robot", "my-robot", "1robot", "a" * 51, "../x", "class", "json", "numpy", "so100"]
+)
 def test_new_refuses_a_name_that_is_no_free_package(run: Run, name: str, tmp_path: Path) -> None:
     refused = run("new", name, "--folder", str(tmp_path / "made"), "--json")
     assert refused.exit_code == Exit.USAGE
     assert "name must" in json.loads(refused.stdout)["reason"]
     assert list(tmp_path.iterdir()) == []
+
+
+def test_approval_of_a_robot_is_none_of_its_namesake_on_another_network(run: Run) -> None:
+    digests = set()
+    for flags in ((), ("--port", "7447"), ("--mesh",)):
+        refused = run("conform", "arm-1", "--live", "--motion", "wave", *flags, "--json")
+        digests.add(json.loads(refused.stdout.splitlines()[0])["digest"])
+    assert len(digests) == 3
 
 
 def test_new_writes_into_no_folder_that_exists(run: Run, tmp_path: Path) -> None:

@@ -159,7 +159,8 @@ def _live(
 
     robot = identifier("TARGET", robot)
     if moved := chosen.motions():
-        MotionList(robot, moved).approve(screen, chosen.approval)
+        # With its network: another one may have a robot of the same id.
+        MotionList(f"{robot}{network.flags}", moved).approve(screen, chosen.approval)
     try:
         with network.joined() as there, answering(there, robot, ""):
             return conform_live(there, robot, Tier[chosen.most], motion=chosen.motion, only=chosen.only, report=tell)
@@ -212,8 +213,12 @@ def new(
     ] = None,
 ) -> None:
     """Write a package with a robot of your own, its emulated bus and its tests."""
+    from strands_robots.robot import PLUG_INS  # noqa: PLC0415 - heavy, and needed by this command alone
+
     if not re.fullmatch(r"[a-z][a-z0-9_]{0,49}", name) or keyword.iskeyword(name):
         raise ValidationError(f"name must begin with a letter and have a-z, 0-9 and _ alone, not {shown(name)}.")
+    if name in PLUG_INS.built_in:
+        raise ValidationError(f"name must not be {name}: it is a built-in robot.")
     if find_spec(name) is not None:
         raise ValidationError(f"name must be free: there is a package {name} already.")
     root = folder or Path(name)

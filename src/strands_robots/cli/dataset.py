@@ -96,7 +96,7 @@ def record(
         record_attempts(screen, led, session, attempts)
         count = session.episodes
     screen.data({"event": "dataset", "folder": str(folder), "episodes": count})
-    screen.say(f"{folder} has {count} episodes.", "bold")
+    screen.say(f"{folder}: episodes: {count}.", "bold")
 
 
 def from_mcap(
@@ -132,7 +132,7 @@ def from_mcap(
             screen.say(f"episode {index}: {steps} steps of {path.name}")
         info = dataset.info
     screen.data({"event": "dataset", "folder": str(out), "episodes": info.episodes, "frames": info.frames})
-    screen.say(f"{out} has {info.episodes} episodes, {info.frames} frames at {info.fps} a second.", "bold")
+    screen.say(f"{out}: episodes: {info.episodes}, frames: {info.frames} at {info.fps} a second.", "bold")
 
 
 def check(
@@ -157,6 +157,7 @@ def check(
     wrong = sum(each.wrong for each in found)
     facts = {"episodes": info.episodes, "frames": info.frames, "fps": info.fps}
     screen.data({"event": "checked", **facts, "wrong": wrong, "look": len(found) - wrong})
-    screen.say(f"{info.episodes} episodes, {info.frames} frames at {info.fps} a second; {len(info.videos)} cameras.")
+    cameras = f"cameras: {', '.join(sorted(info.videos)) or 'none'}"
+    screen.say(f"Episodes: {info.episodes}, frames: {info.frames} at {info.fps} a second, {cameras}.")
     if wrong:
         raise CliError(f"{folder}: {wrong} things are wrong.")

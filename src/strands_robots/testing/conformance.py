@@ -167,7 +167,7 @@ class PromiseChecks:
 
 def waiting(promise: Promise, needed: str) -> CheckResult:
     """Return the result of a promise that waits for another one."""
-    said = f"{needed} is not proven, without which it cannot be checked"
+    said = f"{needed} did not pass, without which it cannot be checked"
     return replace(promise.result(CheckMark.NOT_PROVEN, said), waits_for=needed)
 
 
