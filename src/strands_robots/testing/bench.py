@@ -35,6 +35,7 @@ from strands_robots.safety.plane import plane
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.advertised import RESUMES, AdvertisedParameter, AdvertisedVerb
 from strands_robots.testing.private_network import private_network
+from strands_robots.testing.raised import RaisedExceptions
 from strands_robots.testing.subject import LongMotion, Subject
 
 T = TypeVar("T")
@@ -111,6 +112,7 @@ class NetworkBench:
         subject: limits, exemptions and the motion of its checks.
         on: the robot by network.
         poll_s: seconds between two looks whether it moves.
+        raised: exceptions of a robot of this process.
     """
 
     poll_s = _EVERY_S
@@ -118,6 +120,7 @@ class NetworkBench:
     def __init__(self, subject: Subject) -> None:
         self.subject = subject
         self.on: dict[str, RemoteRobot] = {}
+        self.raised = RaisedExceptions()
 
     @property
     def remote(self) -> RemoteRobot:
@@ -219,7 +222,7 @@ class ConformanceBench(NetworkBench):
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
-            stack.enter_context(private_network(self.subject.deadline_s, OPEN_GATES, quiet=True))
+            stack.enter_context(private_network(self.subject.deadline_s, OPEN_GATES, log=self.raised))
             self.body = stack.enter_context(made(self.subject))
             try:
                 self.halted_unlinked = self.halt()

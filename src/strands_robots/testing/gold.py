@@ -22,6 +22,7 @@ from strands_robots.testing.bench import (
     wait_for,
 )
 from strands_robots.testing.promise import promise
+from strands_robots.testing.raised import CABLE_OUT
 
 STARTS = 20
 WARM_UP = 3
@@ -225,7 +226,7 @@ def recovers(bench: ConformanceBench) -> str:
     recorder = bench.subject.recorder
     assert recorder is not None
     with bench.moving() as run:
-        with recorder.raising(OSError(5, "the emulated cable is out")):
+        with recorder.raising(OSError(5, CABLE_OUT)):
             time.sleep(0.2)
             bench.wait_for_fault()
         bench.halt()

@@ -6,7 +6,7 @@ import logging
 import socket
 import tempfile
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 
 from strands_robots import settings
 from strands_robots.audit import flush_audit
@@ -14,7 +14,9 @@ from strands_robots.safety.sightings import flush_sightings
 
 
 @contextmanager
-def private_network(deadline_s: float, more: Mapping[str, str], *, quiet: bool = False) -> Iterator[None]:
+def private_network(
+    deadline_s: float, more: Mapping[str, str], *, log: logging.Handler | None = None
+) -> Iterator[None]:
     """Put the user's settings aside for free ports and own state.
 
     It is the environment of the whole process, so one block at a time.
@@ -22,11 +24,9 @@ def private_network(deadline_s: float, more: Mapping[str, str], *, quiet: bool =
     Args:
         deadline_s: seconds in which a halt has to answer.
         more: further settings.
-        quiet: log nothing of this package.
+        log: takes the errors that this package logs, in the place of its log, which each refusal and stop of a check
+            would fill.
     """
-    # By its level, so that whoever configured the log keeps it: each refusal and stop of a check would fill it.
-    ours = logging.getLogger("strands_robots")
-    level = ours.level
     with tempfile.TemporaryDirectory(prefix="strands-robots-", ignore_cleanup_errors=True) as state:
         values = {
             "STRANDS_STATE_DIR": state,
@@ -35,16 +35,27 @@ def private_network(deadline_s: float, more: Mapping[str, str], *, quiet: bool =
             "STRANDS_HALT_DEADLINE_S": str(deadline_s),
             **more,
         }
-        with settings.only(values):
-            if quiet:
-                ours.setLevel(logging.CRITICAL + 1)
+        with settings.only(values), nullcontext() if log is None else _logging_to(log):
             try:
                 yield
             finally:
                 # What is still queued belongs into the directory that is removed.
                 flush_audit()
                 flush_sightings()
-                ours.setLevel(level)
+
+
+@contextmanager
+def _logging_to(log: logging.Handler) -> Iterator[None]:
+    """Have this package log to ``log`` alone, and as before at the end."""
+    ours = logging.getLogger("strands_robots")
+    before = ours.handlers, ours.level, ours.propagate
+    ours.handlers, ours.propagate = [log], False
+    ours.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        ours.handlers, ours.propagate = before[0], before[2]
+        ours.setLevel(before[1])
 
 
 def _free_port() -> int:

@@ -40,7 +40,10 @@ class Promise:
         """Check it on a bench; never raises for what the robot does."""
         exempt = bench.subject.exempt.get(self.name, "")
         began = time.monotonic()
+        bench.raised.take()
         mark, said = self._judged(bench)
+        if mark is not CheckMark.PASSED and (raised := bench.raised.take()):
+            said = f"{said}; the robot raised {', then '.join(raised)}"
         if exempt:
             kept = mark is CheckMark.PASSED
             mark = CheckMark.STALE if kept else CheckMark.EXEMPT

@@ -24,6 +24,7 @@ from strands_robots.testing.bench import (
     within,
 )
 from strands_robots.testing.promise import promise
+from strands_robots.testing.raised import CABLE_OUT
 from strands_robots.testing.subject import LongMotion
 
 WHILE_LOCKED = frozenset({"releaseTorque"})
@@ -344,7 +345,7 @@ def honest(bench: ConformanceBench) -> str:
     recorder = bench.subject.recorder
     assert recorder is not None
     faults: dict[str, Callable[[], AbstractContextManager[None]]] = {
-        "raises": lambda: recorder.raising(OSError(5, "the emulated cable is out")),
+        "raises": lambda: recorder.raising(OSError(5, CABLE_OUT)),
         "hangs": recorder.hanging,
     }
     seen = []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 import tempfile
 import time
 from dataclasses import replace
@@ -108,6 +109,13 @@ def test_one_robot_of_a_subject_lives_at_a_time() -> None:
     report = conform(Subject(make), only=["silver.unlinked"])
     assert [each.mark for each in report.results] == [CheckMark.PASSED]
     assert alive == []
+
+
+def test_exception_of_a_robot_is_named_with_its_place() -> None:
+    report = conform(subject(faulty_robots.RaisesInARead), only=["bronze.reads"])
+    assert re.search(r"the robot raised \w+: .+ \(faulty_robots\.py:\d+ in \w+\)", report.results[-1].said), (
+        report.words()
+    )
 
 
 def test_robot_that_cannot_be_made_is_named_with_its_error() -> None:
