@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import logging
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -20,6 +22,7 @@ from strands_robots.testing import (
 )
 from strands_robots.testing.bench import DriftError, NotKeptError, NotProvenError
 from strands_robots.testing.promise import Promise
+from strands_robots.testing.raised import CABLE_OUT, RaisedExceptions
 from strands_robots.utils import ValidationError
 
 
@@ -28,6 +31,7 @@ class Bench:
 
     def __init__(self, **subject: Any) -> None:
         self.subject = Subject(object, **subject)
+        self.raised = RaisedExceptions()
 
 
 def kept(tier: Tier, name: str = "x.y", raises: Exception | None = None, *, needs_recorder: bool = False) -> Promise:
@@ -175,3 +179,18 @@ def test_words_name_together_what_is_not_proven_for_one_reason() -> None:
     lines = ConformanceReport("rig", [*results, *failed]).words().splitlines()
     assert "NOT PROVEN x.a, x.b: no recorder" in lines
     assert [each for each in lines if each.startswith("FAILED")] == ["FAILED x.c: it wrote", "FAILED x.d: it wrote"]
+
+
+def test_exceptions_that_were_logged_are_kept_with_their_place_once_and_those_of_a_check_are_not() -> None:
+    raised, log = RaisedExceptions(), logging.getLogger("of a robot")
+    log.propagate = False
+    log.addHandler(raised)
+    for problem in (ValueError("no sensor"), ValueError("no sensor"), OSError(5, CABLE_OUT)):
+        try:
+            raise problem
+        except Exception:
+            log.exception("It failed.")
+    log.error("It failed without one.")
+    (told,) = raised.take()
+    assert re.fullmatch(r"ValueError: no sensor \(test_report\.py:\d+ in test_\w+\)", told)
+    assert raised.take() == []
