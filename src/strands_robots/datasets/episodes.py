@@ -11,7 +11,7 @@ import errno
 import fcntl
 import os
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
@@ -336,19 +336,14 @@ class Dataset:
                 self.mended.append(f"{path.relative_to(self.folder)} was not saved, and is removed")
 
 
-class _told:  # noqa: N801 - a context manager, used as a function
+@contextmanager
+def _told(folder: Path) -> Iterator[None]:
     """Raise what the disk refuses as a :class:`DatasetError` that says so."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-
-    def __enter__(self) -> None:
-        return None
-
-    def __exit__(self, kind: object, problem: BaseException | None, trace: object) -> None:
-        if isinstance(problem, OSError):
-            full = " The disk is full." if problem.errno in (errno.ENOSPC, errno.EDQUOT) else ""
-            raise DatasetError(f"{self._folder} cannot be written: {problem.strerror or problem}.{full}") from problem
+    try:
+        yield
+    except OSError as problem:
+        full = " The disk is full." if problem.errno in (errno.ENOSPC, errno.EDQUOT) else ""
+        raise DatasetError(f"{folder} cannot be written: {problem.strerror or problem}.{full}") from problem
 
 
 def _require_empty(folder: Path) -> None:

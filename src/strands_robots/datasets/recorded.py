@@ -64,10 +64,21 @@ def attempts_of(path: Path, robot: str | None = None) -> list[Attempt]:
         ValidationError: no recording, no steps in it, or those of several robots and none named.
         MissingExtraError: the [dataset] extra is not installed.
     """
+    attempts = attempts_in(path, robot)
+    if not attempts:
+        raise ValidationError(f"{path.name} has no steps of a task: nothing in it is an episode.")
+    return attempts
+
+
+def attempts_in(path: Path, robot: str | None = None) -> list[Attempt]:
+    """Return the attempts in a recording, none where it has no steps.
+
+    Arguments and errors are those of :func:`attempts_of`.
+    """
     items = list(read_items(path))
     known = sorted({each.robot for each in items if isinstance(each, RecordedEvent) and each.event == STEP})
     if not known:
-        raise ValidationError(f"{path.name} has no steps of a task: nothing in it is an episode.")
+        return []
     if robot not in known and (robot is not None or len(known) > 1):
         raise ValidationError(
             f"robot must be one of those that were recorded ({', '.join(known)}), not {shown(robot)}."
@@ -79,15 +90,6 @@ def attempts_of(path: Path, robot: str | None = None) -> list[Attempt]:
             for attempt in attempts:
                 attempt.pictures.setdefault(each.camera, []).append((each.at, each.jpeg))
     return attempts
-
-
-def has_steps(path: Path) -> bool:
-    """Return True for a recording with a step of a task.
-
-    Raises:
-        ValidationError: it is no recording.
-    """
-    return any(isinstance(each, RecordedEvent) and each.event == STEP for each in read_items(path))
 
 
 def _attempts(items: Sequence[RecordedItem], robot: str) -> Iterator[Attempt]:

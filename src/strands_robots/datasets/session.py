@@ -12,7 +12,7 @@ from typing import Self
 
 from strands_robots.datasets.episodes import RECORDING, RUNNING, Dataset, DatasetHold
 from strands_robots.datasets.layout import INFO, DatasetInfo, read_info
-from strands_robots.datasets.recorded import Attempt, attempts_of, has_steps, info_of, save_attempt
+from strands_robots.datasets.recorded import Attempt, attempts_in, info_of, save_attempt
 from strands_robots.utils import ValidationError, text, whole
 
 
@@ -76,7 +76,7 @@ class RecordingSession:
             DatasetError: it cannot be written; its recording is still there.
         """
         recording = self.recording
-        attempts = attempts_of(recording) if recording.exists() and has_steps(recording) else []
+        attempts = attempts_in(recording) if recording.exists() else []
         if not attempts:
             recording.unlink(missing_ok=True)
             return None

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from strands_robots.datasets.layout import DatasetError, Feature, replaced
 from strands_robots.datasets.statistics import Statistics
-from strands_robots.utils import missing_extra
+from strands_robots.utils import optional_module
 
 STATS = "stats"
 TASK_COLUMN = "task"
@@ -27,11 +27,8 @@ def pyarrow() -> Any:
     Raises:
         MissingExtraError: the [dataset] extra is not installed.
     """
-    try:
-        import pyarrow.parquet  # noqa: PLC0415 - an extra
-    except ModuleNotFoundError as exc:
-        raise missing_extra("A dataset", "dataset") from exc
-    return pyarrow
+    optional_module("pyarrow.parquet", what="A dataset", extra="dataset")
+    return optional_module("pyarrow", what="A dataset", extra="dataset")
 
 
 def write_frames(path: Path, features: Mapping[str, Feature], columns: Mapping[str, NDArray[Any]]) -> None:
@@ -79,7 +76,9 @@ def read_tasks(path: Path) -> list[str]:
     Raises:
         DatasetError: the file cannot be read.
     """
-    rows = _read(path, ["task_index", None])
+    rows = _read(path)
+    if "task_index" not in rows:
+        raise DatasetError(f"{path} has no column task_index")
     names = [name for name in rows if name != "task_index"]
     return [str(task) for _, task in sorted(zip(rows["task_index"], rows[names[0]], strict=True))]
 
@@ -90,7 +89,7 @@ def read_row(path: Path) -> dict[str, Any]:
     Raises:
         DatasetError: the file cannot be read, or has several.
     """
-    rows = _read(path, None)
+    rows = _read(path)
     if any(len(values) != 1 for values in rows.values()):
         raise DatasetError(f"{path} has not one episode")
     return {name: values[0] for name, values in rows.items()}
@@ -112,10 +111,10 @@ def read_frames(path: Path) -> dict[str, NDArray[Any]]:
     Raises:
         DatasetError: it cannot be read.
     """
-    return {name: np.asarray(values) for name, values in _read(path, None).items()}
+    return {name: np.asarray(values) for name, values in _read(path).items()}
 
 
-def _read(path: Path, columns: Sequence[str | None] | None) -> dict[str, list[Any]]:
+def _read(path: Path) -> dict[str, list[Any]]:
     pa = pyarrow()
     try:
         with pa.parquet.ParquetFile(path) as file:
@@ -124,9 +123,6 @@ def _read(path: Path, columns: Sequence[str | None] | None) -> dict[str, list[An
             rows: dict[str, list[Any]] = file.read().to_pydict()
     except (OSError, pa.ArrowException) as exc:
         raise DatasetError(f"{path} cannot be read: {exc}") from exc
-    missing = [name for name in columns or () if name is not None and name not in rows]
-    if missing:
-        raise DatasetError(f"{path} has no column {missing[0]}")
     return rows
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from strands_robots.datasets.layout import DatasetError, sync
 from strands_robots.datasets.statistics import PictureStatistics, Statistics
-from strands_robots.utils import ValidationError, choice, missing_extra, shown, whole
+from strands_robots.utils import ValidationError, choice, optional_module, shown, whole
 
 CODECS = {
     "h264": ("libx264", {"preset": "veryfast", "crf": "23"}),
@@ -53,10 +53,7 @@ class VideoWriter:
     """
 
     def __init__(self, path: Path, fps: int, width: int, height: int, codec: str = "h264") -> None:
-        try:
-            import av  # noqa: PLC0415 - an extra
-        except ModuleNotFoundError as exc:
-            raise missing_extra("A video", "dataset") from exc
+        av = _pyav()
         for name, side in (("width", width), ("height", height)):
             if whole(name, side, low=2, high=16_384) % 2:
                 raise ValidationError(f"{name} must be even, not {side}: a video halves its colours.")
@@ -140,13 +137,14 @@ def pictures_of(path: Path) -> Iterator[NDArray[np.uint8]]:
         DatasetError: it is no video, or it is cut off.
         MissingExtraError: the [dataset] extra is not installed.
     """
-    try:
-        import av  # noqa: PLC0415 - an extra
-    except ModuleNotFoundError as exc:
-        raise missing_extra("A video", "dataset") from exc
+    av = _pyav()
     try:
         with av.open(str(path)) as file:
             for frame in file.decode(video=0):
                 yield np.asarray(frame.to_ndarray(format="rgb24"), dtype=np.uint8)
     except (OSError, av.FFmpegError, IndexError) as exc:
         raise DatasetError(f"{shown(str(path))} cannot be read: {exc}") from exc
+
+
+def _pyav() -> Any:
+    return optional_module("av", what="A video", extra="dataset")
