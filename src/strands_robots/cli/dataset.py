@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -21,11 +24,17 @@ from strands_robots.cli.leading import (
     made_follower,
 )
 from strands_robots.cli.led_robot import Serving, halted_first
-from strands_robots.cli.network import Network
+from strands_robots.cli.network import Network, answering, say_missing
 from strands_robots.cli.output import CliError, Screen
 from strands_robots.cli.record import NO_CAMERAS
 from strands_robots.cli.teleop import MESH_PREFIX, Calibration, FollowerId, NoNetwork, PeerId
-from strands_robots.utils import ValidationError, number, text, whole
+from strands_robots.utils import ValidationError, identifier, number, text, whole
+
+if TYPE_CHECKING:
+    from strands_robots.cli.far_recording import FarRobot
+
+PAGE = "page"
+"""Leader of a served robot that others move: the page, an agent, another terminal."""
 
 
 def record(
@@ -33,9 +42,22 @@ def record(
     network: Network,
     *,
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="The dataset: a new folder, or one of the same robot.")],
-    robot: Annotated[str, typer.Option("--robot", help="TYPE@PORT of a real arm, or a simulated robot's name.")],
-    leader: Annotated[str, typer.Option("--leader", help="TYPE@PORT of a leader arm, or a recording.")],
+    robot: Annotated[
+        str,
+        typer.Option(
+            "--robot", help="TYPE@PORT of a real arm, a simulated robot's name, or the id of one that is served."
+        ),
+    ],
     task: Annotated[str, typer.Option("--task", help="What is to be done, in words.")],
+    leader: Annotated[
+        str | None,
+        typer.Option(
+            "--leader", help="TYPE@PORT of a leader arm, a recording, or page: whoever moves a served robot meanwhile."
+        ),
+    ] = None,
+    policy: Annotated[
+        str | None, typer.Option("--policy", help="In its place: a policy that a served robot runs.", metavar="NAME")
+    ] = None,
     episodes: Annotated[int, typer.Option("--episodes", help="How many to save.")] = 50,
     fps: Annotated[int, typer.Option("--fps", help="Frames a second.")] = 30,
     episode_s: Annotated[
@@ -57,8 +79,8 @@ def record(
     peer_id: PeerId = None,
     no_network: NoNetwork = False,
 ) -> None:
-    """Record episodes of a led robot. What is saved outlives a kill."""
-    from strands_robots.cli.dataset_recording import Attempts, Keys, record_attempts  # noqa: PLC0415 - an extra
+    """Record episodes of a robot that is led. What is saved outlives a kill."""
+    from strands_robots.cli.dataset_recording import Attempts, Keys, LocalAttempts, record_attempts  # noqa: PLC0415 - an extra
     from strands_robots.datasets.session import RecordingSession  # noqa: PLC0415 - as above
     from strands_robots.recording.cameras import chosen_frames  # noqa: PLC0415 - as above
     from strands_robots.teleoperators import RecordedLeader  # noqa: PLC0415 - as above
@@ -66,11 +88,33 @@ def record(
     whole("--episodes", episodes, low=1, high=10_000)
     number("--pause-s", pause_s, low=0, high=3600)
     longest = None if episode_s is None else number("--episode-s", episode_s, above=0, high=3600)
-    if leader.startswith(MESH_PREFIX) or robot.startswith(MESH_PREFIX) or leader in MANUAL:
-        raise ValidationError("--leader must be a leader arm or a recording, and --robot one of this machine.")
+    if (leader is None) == (policy is None):
+        raise ValidationError("give either --leader or --policy.")
     asked = screen.live and sys.stdin.isatty()
     if not asked and longest is None:
         raise ValidationError("--episode-s is needed without a terminal: nobody says when an attempt is over.")
+    names = None if cameras is None else [name for name in cameras.split(",") if name]
+    if leader is None or leader == PAGE:
+        given = (follower_id, calibration, leader_id, leader_calibration, peer_id)
+        if no_network or any(each is not None for each in given):
+            raise ValidationError(
+                f"--policy and --leader {PAGE} go with a served robot, and without options of an arm."
+            )
+        with (
+            served_robot(screen, network, robot, policy or "", task, names) as far,
+            RecordingSession(folder, fps, task, far.kind, lambda said: screen.say(said, "yellow")) as session,
+        ):
+            keys = Keys() if asked else None
+            begin_far = partial(far.begin, longest)
+            record_attempts(screen, far, session, Attempts(episodes, begin_far, fps, longest, pause_s, success, keys))
+            count = session.episodes
+        _tell_dataset(screen, folder, count)
+        return
+    if leader.startswith(MESH_PREFIX) or robot.startswith(MESH_PREFIX) or leader in MANUAL:
+        raise ValidationError(
+            "--leader must be a leader arm or a recording, and --robot one of this machine. For a served robot let "
+            f"teleop lead it from another terminal, and record it here with --leader {PAGE}."
+        )
     how = Serving.of(network, peer_id, None, alone=no_network)
     arm, options = arm_options("", follower_id, calibration), TeleopOptions()
     kind = robot.partition("@")[0]
@@ -90,13 +134,39 @@ def record(
             return led.robot.tasks.by_leader[LEADER]
 
         keys = Keys() if asked else None
-        names = None if cameras is None else [name for name in cameras.split(",") if name]
         frames = None if names == [NO_CAMERAS] else chosen_frames(led.robot, names)
-        attempts = Attempts(episodes, lead, fps, frames, longest, pause_s, success, keys)
-        record_attempts(screen, led, session, attempts)
+        attempts = Attempts(episodes, lead, fps, longest, pause_s, success, keys)
+        record_attempts(screen, LocalAttempts(led, frames), session, attempts)
         count = session.episodes
+    _tell_dataset(screen, folder, count)
+
+
+def _tell_dataset(screen: Screen, folder: Path, count: int) -> None:
     screen.data({"event": "dataset", "folder": str(folder), "episodes": count})
     screen.say(f"{folder}: episodes: {count}.", "bold")
+
+
+@contextmanager
+def served_robot(  # noqa: PLR0917 - one robot, and what is asked of it
+    screen: Screen, network: Network, robot: str, policy: str, task: str, cameras: list[str] | None
+) -> Iterator[FarRobot]:
+    """Join the networks, and yield the served robot ``ID`` or ``WORLD/ROBOT``.
+
+    Raises:
+        CliError: there is no such robot, or it does not answer.
+        ValidationError: no id, or a camera that it does not have.
+    """
+    from strands_robots.cli.far_recording import FarRobot  # noqa: PLC0415 - loaded when a network is used
+    from strands_robots.fleet import Fleet  # noqa: PLC0415 - as above
+
+    peer, _, part = robot.partition("/")
+    identifier("--robot", peer)
+    with network.joined(stays=True) as there:
+        there.settled()
+        say_missing(screen, there)
+        with answering(there, peer, ""):
+            far = FarRobot(Fleet(there)[peer], there, part, policy, task, cameras)
+        yield far
 
 
 def from_mcap(

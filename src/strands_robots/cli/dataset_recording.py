@@ -7,10 +7,10 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from enum import Enum
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from strands_robots.cli.led_robot import LedRobot
 from strands_robots.cli.output import POLL_S, CliError, Screen, wait_until
@@ -74,7 +74,6 @@ class Attempts:
         count: of episodes to save.
         begin: lets the leader lead; returns its task.
         fps: frames a second, and pictures that are asked of each camera.
-        frames: takes the pictures; None for none.
         seconds: longest time of one; None for as long as the person likes.
         pause_s: between two, where nobody is asked.
         success: of an attempt that ends by its time.
@@ -84,19 +83,84 @@ class Attempts:
     count: int
     begin: Callable[[], Any]
     fps: int
-    frames: Frames | None
     seconds: float | None
     pause_s: float
     success: bool
     keys: Keys | None = None
 
 
-def record_attempts(screen: Screen, led: LedRobot, session: RecordingSession, attempts: Attempts) -> None:
+class AttemptRobot(Protocol):
+    """A robot whose attempts are recorded, of this process or another."""
+
+    @property
+    def name(self) -> str:
+        """Its name in the recording."""
+
+    @property
+    def stopped(self) -> bool:
+        """True where others stopped it in this attempt."""
+
+    @property
+    def stopped_by(self) -> str:
+        """The reason of the stop, with its caller."""
+
+    def recorded(self, recorder: Recorder, fps: int) -> AbstractContextManager[object]:
+        """Record it in the block."""
+
+    def halt(self, reason: str) -> StopVerdict:
+        """Halt it, and return the verdict."""
+
+    def hold(self, screen: Screen) -> object:
+        """Tell who stopped it, and keep it on the network."""
+
+
+class LocalAttempts:
+    """A led robot of this process, as :func:`record_attempts` takes it.
+
+    Args:
+        led: the robot, served.
+        frames: takes its pictures; None for none.
+    """
+
+    def __init__(self, led: LedRobot, frames: Frames | None) -> None:
+        self._led, self._frames = led, frames
+
+    @property
+    def name(self) -> str:
+        """Its name in the recording."""
+        return str(self._led.robot.tool_name_str)
+
+    @property
+    def stopped(self) -> bool:
+        """True where others stopped it in this attempt."""
+        return self._led.stopped
+
+    @property
+    def stopped_by(self) -> str:
+        """The reason of the stop, with its caller."""
+        return self._led.stopped_by
+
+    def recorded(self, recorder: Recorder, fps: int) -> AbstractContextManager[object]:
+        """Record it in the block."""
+        hz = min(fps, CAMERAS_HZ_MAX)
+        return RobotRecording(self._led.robot, recorder, self.name, frames=self._frames, cameras_hz=hz)
+
+    def halt(self, reason: str) -> StopVerdict:
+        """Halt it, and return the verdict."""
+        verdict: StopVerdict = self._led.robot.halt(reason)
+        return verdict
+
+    def hold(self, screen: Screen) -> object:
+        """Tell who stopped it, and stay on the network until Ctrl-C."""
+        return self._led.hold(screen)
+
+
+def record_attempts(screen: Screen, led: AttemptRobot, session: RecordingSession, attempts: Attempts) -> None:
     """Record attempts until all are saved or the person ends it.
 
     Args:
         screen: where it is told.
-        led: the robot, served.
+        led: the robot.
         session: takes what is kept.
         attempts: how many, and their ends.
 
@@ -150,15 +214,12 @@ def _ready(screen: Screen, attempts: Attempts, saved: int) -> bool:
     return True
 
 
-def _attempt(screen: Screen, led: LedRobot, session: RecordingSession, attempts: Attempts) -> _Ended:
+def _attempt(screen: Screen, led: AttemptRobot, session: RecordingSession, attempts: Attempts) -> _Ended:
     """Lead and record one attempt, and halt the robot."""
-    robot, said, ends = led.robot, list[Said](), list[tuple[str, StopVerdict | None]]()
+    said, ends = list[Said](), list[tuple[str, StopVerdict | None]]()
     with ExitStack() as recorded:
         recorder = recorded.enter_context(Recorder(session.recording, joints_of_events=False))
-        sampled = RobotRecording(
-            robot, recorder, robot.tool_name_str, frames=attempts.frames, cameras_hz=min(attempts.fps, CAMERAS_HZ_MAX)
-        )
-        recorded.enter_context(sampled)
+        recorded.enter_context(led.recorded(recorder, attempts.fps))
         task, began = attempts.begin(), time.monotonic()
         if attempts.keys is not None:
             screen.say(KEYS)
@@ -177,8 +238,8 @@ def _attempt(screen: Screen, led: LedRobot, session: RecordingSession, attempts:
                 ends.append((led.stopped_by, None))
                 return
             # What ends an attempt here is no stop of it.
-            recorder.take(robot.tool_name_str, ATTEMPT_ENDED, {})
-            ends.append(("", robot.halt("attempt ended")))
+            recorder.take(led.name, ATTEMPT_ENDED, {})
+            ends.append(("", led.halt("attempt ended")))
 
         why = wait_until(screen, over, attempts.seconds or 0.0, at_end=end)
     stopped_by, verdict = ends[0]

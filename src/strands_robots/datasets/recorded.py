@@ -70,10 +70,15 @@ def attempts_of(path: Path, robot: str | None = None) -> list[Attempt]:
     return attempts
 
 
-def attempts_in(path: Path, robot: str | None = None) -> list[Attempt]:
+def attempts_in(path: Path, robot: str | None = None, *, whole: bool = False) -> list[Attempt]:
     """Return the attempts in a recording, none where it has no steps.
 
-    Arguments and errors are those of :func:`attempts_of`.
+    Other arguments and errors are those of :func:`attempts_of`.
+
+    Args:
+        path: the file.
+        robot: whose.
+        whole: an attempt ends where the person who recorded it says so, whatever tasks it has.
     """
     items = list(read_items(path))
     known = sorted({each.robot for each in items if isinstance(each, RecordedEvent) and each.event == STEP})
@@ -84,7 +89,7 @@ def attempts_in(path: Path, robot: str | None = None) -> list[Attempt]:
             f"robot must be one of those that were recorded ({', '.join(known)}), not {shown(robot)}."
         )
     chosen = robot or known[0]
-    attempts = list(_attempts(items, chosen))
+    attempts = list(_attempts(items, chosen, whole=whole))
     for each in items:
         if isinstance(each, RecordedPicture) and chosen.partition("/")[0] == each.device.partition("/")[0]:
             for attempt in attempts:
@@ -92,7 +97,7 @@ def attempts_in(path: Path, robot: str | None = None) -> list[Attempt]:
     return attempts
 
 
-def _attempts(items: Sequence[RecordedItem], robot: str) -> Iterator[Attempt]:
+def _attempts(items: Sequence[RecordedItem], robot: str, *, whole: bool) -> Iterator[Attempt]:
     attempt = Attempt()
     for each in items:
         if not isinstance(each, RecordedEvent) or each.robot not in (robot, robot.partition("/")[0]):
@@ -102,13 +107,13 @@ def _attempts(items: Sequence[RecordedItem], robot: str) -> Iterator[Attempt]:
                 yield attempt
             attempt = Attempt()
         elif each.event in _STARTS or each.event in _ENDS:
-            if attempt.steps and each.event in _STARTS:
+            if attempt.steps and each.event in _STARTS and not whole:
                 yield attempt
                 attempt = Attempt()
             if each.event in _ENDS and each.payload.get("state") == "stopped":
                 attempt.stops.append((each.at, STOPPED))
             attempt.instruction = str(each.payload.get("instruction") or attempt.instruction)
-            if each.event in _ENDS and attempt.steps:
+            if each.event in _ENDS and attempt.steps and not whole:
                 yield attempt
                 attempt = Attempt()
         elif each.event == STEP and each.robot == robot:

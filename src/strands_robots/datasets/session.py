@@ -76,7 +76,7 @@ class RecordingSession:
             DatasetError: it cannot be written; its recording is still there.
         """
         recording = self.recording
-        attempts = attempts_in(recording) if recording.exists() else []
+        attempts = attempts_in(recording, whole=True) if recording.exists() else []
         if not attempts:
             recording.unlink(missing_ok=True)
             return None

@@ -1,0 +1,268 @@
+"""Recording of a robot that another process serves: its events, its pictures, its stops.
+
+Nothing of it is led from here but a policy that it runs itself. Whoever else moves it meanwhile (the page, an agent,
+``teleop`` in another terminal) is in the recording as well. Readings count from their arrival here.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import threading
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+from strands_robots.cli.output import CliError, Screen
+from strands_robots.cli.record import NO_CAMERAS
+from strands_robots.errors import RefusalError, RobotError
+from strands_robots.fleet.adapter import Detail, RobotEvent
+from strands_robots.fleet.networks import Networks
+from strands_robots.fleet.remote_robot import ROBOT_NAME, RemoteRobot
+from strands_robots.fleet.reports import runs, said
+from strands_robots.recording.cameras import OVERVIEW
+from strands_robots.recording.file import STEP, Recorder
+from strands_robots.safety.stopping import StopVerdict
+from strands_robots.utils import DURATION_MAX_S, ValidationError
+
+LOOK_S = 0.25
+"""Pause between two looks at the robot's status."""
+
+SILENT_S = 3.0
+"""Time without an answer of the robot after which an attempt ends."""
+
+PICTURE_S = 2.0
+"""Longest wait for one picture."""
+
+PICTURE_WIDTH, PICTURE_HEIGHT = 640, 480
+
+TELLING = frozenset({STEP, "taskStarted", "policyStarted", "taskComplete", "policyComplete", "emergencyStop"})
+"""Events of a robot of which an episode is made."""
+
+_ENDS = ("taskComplete", "policyComplete")
+
+
+class FarTask:
+    """Attempt at a robot of another process, as it is watched from here.
+
+    Attributes:
+        error: why it failed; empty while it has not.
+        voided: the robot was stopped or locked meanwhile.
+    """
+
+    def __init__(self) -> None:
+        self.error = ""
+        self.voided = False
+        self._over = threading.Event()
+
+    @property
+    def running(self) -> bool:
+        """True until its end."""
+        return not self._over.is_set()
+
+    def end(self, error: str = "", *, voided: bool = False) -> None:
+        """Note the end; the first one counts."""
+        if self.running:
+            self.error, self.voided = error, voided
+            self._over.set()
+
+
+class FarRobot:
+    """A served robot, as ``dataset record`` needs it.
+
+    Args:
+        remote: the robot, or the world that it is in.
+        networks: on which its events are followed.
+        part: which robot of a world; empty for the only one.
+        policy: runs there in each attempt; empty for none, where others move it.
+        task: told to the policy.
+        cameras: names, or None for those of the robot itself.
+    """
+
+    def __init__(  # noqa: PLR0917 - one robot, and what is asked of it
+        self, remote: RemoteRobot, networks: Networks, part: str, policy: str, task: str, cameras: Sequence[str] | None
+    ) -> None:
+        self.remote = remote
+        self._networks, self._part, self._policy, self._task = networks, part, policy, task
+        self._cameras = _cameras_of(remote, cameras)
+        several = list(remote.robots) if not part else []
+        if len(several) > 1:
+            raise ValidationError(
+                f"--robot must name one of the world's robots, {remote.address}/{several[0]} for example: it has "
+                f"{', '.join(several)}."
+            )
+        self._stopped_by = ""
+        self._halting, self._halted = False, threading.Event()
+        self._attempt: FarTask | None = None
+        self._recorder: Recorder | None = None
+
+    @property
+    def name(self) -> str:
+        """Its id in recordings."""
+        return self.remote.address
+
+    @property
+    def kind(self) -> str:
+        """Its kind, as it states it."""
+        return self.remote.model or self.remote.type or "unknown"
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """The cameras whose pictures are taken."""
+        return self._cameras
+
+    @property
+    def stopped(self) -> bool:
+        """True where others stopped or locked it in this attempt."""
+        return bool(self._stopped_by)
+
+    @property
+    def stopped_by(self) -> str:
+        """The reason of the stop; empty while there was none."""
+        return self._stopped_by
+
+    def begin(self, seconds: float | None) -> FarTask:
+        """Begin an attempt, and start the policy where it has one.
+
+        Raises:
+            CliError: the robot refused it.
+        """
+        self._stopped_by, self._halting = "", False
+        self._halted.clear()
+        task = self._attempt = FarTask()
+        if self._policy:
+            arguments: dict[str, Any] = {"instruction": self._task, "policy_provider": self._policy, **self._named()}
+            arguments["duration"] = min(seconds or DURATION_MAX_S, DURATION_MAX_S)
+            try:
+                self.remote.call(self._starts(), **arguments)
+            except RefusalError as refused:
+                task.end(said(refused))
+                raise CliError(said(refused)) from refused
+        threading.Thread(target=self._watch, args=(task,), name=f"attempt {self.name}", daemon=True).start()
+        return task
+
+    def halt(self, reason: str) -> StopVerdict:
+        """Halt it at the end of an attempt."""
+        self._halting = True
+        if self._attempt is not None:
+            self._attempt.end()
+        return self.remote.halt(reason)
+
+    def hold(self, screen: Screen) -> None:
+        """Tell who stopped it; its own process keeps it on the network."""
+        screen.say(f"Stopped: {self._stopped_by}", "bold red")
+        screen.data({"event": "held", "peer_id": self.name, "stopped_by": self._stopped_by})
+
+    @contextmanager
+    def recorded(self, recorder: Recorder, fps: int) -> Iterator[None]:
+        """Record its events and the pictures of its cameras in the block."""
+        self._recorder, over = recorder, threading.Event()
+        threads = [
+            threading.Thread(target=self._take_pictures, args=(recorder, camera, fps, over), name=f"pictures {camera}")
+            for camera in self._cameras
+        ]
+        end = self._networks.subscribe(self.name, lambda event: self._take(recorder, event), Detail.ALL)
+        try:
+            for thread in threads:
+                thread.start()
+            yield
+        finally:
+            over.set()
+            end()
+            for thread in threads:
+                thread.join()
+
+    def _take(self, recorder: Recorder, event: RobotEvent) -> None:
+        if event.name not in TELLING:
+            return
+        named = event.payload.get(ROBOT_NAME)
+        if self._part and named not in (None, "", self._part):
+            return
+        if event.name in _ENDS and self._attempt is not None and not self._halting:
+            self._ended(self._attempt, event.payload)
+        recorder.take(self.name, event.name, event.payload)
+
+    def _ended(self, task: FarTask, payload: Mapping[str, Any]) -> None:
+        """Note the end of a motion of the robot."""
+        if payload.get("state") == "stopped":
+            # Whether it is locked as well is asked on another thread: this one is the network's.
+            self._halted.set()
+        elif self._policy:
+            task.end(str(payload.get("error") or ""))
+
+    def _stopped(self, task: FarTask, status: Mapping[str, Any]) -> None:
+        """End an attempt at a robot that others stopped."""
+        locked = status.get("locked") is True
+        self._stopped_by = f"{self.name} is locked by an emergency stop." if locked else f"{self.name} was stopped."
+        if locked and self._recorder is not None:
+            self._recorder.take(self.name, "locked", {"reason": self._stopped_by})
+        task.end(voided=True)
+
+    def _watch(self, task: FarTask) -> None:
+        """Look at the robot until the attempt is over."""
+        answered, ran = time.monotonic(), False
+        while True:
+            halted = self._halted.wait(LOOK_S)
+            if not task.running:
+                return
+            try:
+                status = self.remote.status()
+            except RefusalError as silent:
+                if halted:
+                    self._stopped(task, {})
+                elif time.monotonic() - answered > SILENT_S:
+                    task.end(f"{self.name} is out of reach: {said(silent)}")
+                continue
+            answered, now = time.monotonic(), runs(status, self._part)
+            if halted or status.get("locked") is True:
+                self._stopped(task, status)
+            elif self._policy and ran and not now and not self._halted.wait(LOOK_S):
+                # A network that tells no ends of tasks.
+                task.end()
+            ran = ran or now
+
+    def _take_pictures(self, recorder: Recorder, camera: str, fps: int, over: threading.Event) -> None:
+        """Ask for a picture at each beat; the ages tell of a gap."""
+        began, beat = time.monotonic(), 0
+        while not over.wait(max(0.0, began + beat / fps - time.monotonic())):
+            # The picture is no older than its request.
+            asked = time.time()
+            try:
+                answer = self.remote.call(
+                    "getPicture", camera=camera, width=PICTURE_WIDTH, height=PICTURE_HEIGHT, timeout=PICTURE_S
+                )
+                jpeg = base64.b64decode(str(answer.get("jpeg", "")), validate=True)
+            except (RefusalError, binascii.Error) as failed:
+                recorder.take(self.name, "notRecorded", {"what": f"pictures of {camera}", "error": str(failed)[:200]})
+                over.wait(LOOK_S)
+            else:
+                recorder.take_picture(self.name, camera.replace("/", "."), jpeg, asked)
+            beat = max(beat + 1, int((time.monotonic() - began) * fps))
+
+    def _named(self) -> dict[str, str]:
+        return {ROBOT_NAME: self._part} if self._part else {}
+
+    def _starts(self) -> str:
+        verbs = self.remote.verbs
+        return next((verb for verb in ("start", "execute") if verb in verbs), "execute")
+
+
+def _cameras_of(remote: RemoteRobot, names: Sequence[str] | None) -> tuple[str, ...]:
+    """Return the cameras to record: those named, else the robot's own.
+
+    Raises:
+        ValidationError: it has no camera of that name.
+        RobotError: it names none that can be read.
+    """
+    if names == [NO_CAMERAS] or (names is None and "listCameras" not in remote.verbs):
+        return ()
+    listed = remote.call("listCameras").get("cameras")
+    if not isinstance(listed, list) or not all(isinstance(each, str) for each in listed):
+        raise RobotError("Its list of cameras cannot be read", robot=remote.id, verb="listCameras")
+    if names is None:
+        own = [name for name in listed if "/" in name]
+        return tuple(own or ([OVERVIEW] if OVERVIEW in listed else listed))
+    if unknown := [name for name in names if name not in listed]:
+        raise ValidationError(f"--cameras must be of {', '.join(listed) or 'none'}, not {', '.join(unknown)}.")
+    return tuple(names)

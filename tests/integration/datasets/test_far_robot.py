@@ -1,0 +1,122 @@
+"""``dataset record`` of a robot that another process serves."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from fixtures.command_line import COMMAND
+from fixtures.waiting import eventually, free_port
+from typer.testing import CliRunner
+
+from strands_robots.cli.app import build
+from strands_robots.datasets import tables
+from strands_robots.datasets.check import check_dataset
+from strands_robots.datasets.layout import data_file
+
+
+@contextmanager
+def arm(*network: str) -> Iterator[None]:
+    """An SO-100 of another process as ``arm-1``."""
+    child = subprocess.Popen(
+        [*COMMAND, "serve", "so100", "--peer-id", "arm-1", "--json", *network], stdout=subprocess.PIPE
+    )
+    try:
+        eventually(lambda: on("peers", *network, code=None)[0] == 0, within=60)
+        yield
+    finally:
+        child.kill()
+        child.communicate()
+
+
+def on(command: str, *words: str, code: int | None = 0) -> tuple[int, list[dict[str, object]]]:
+    """Run a command here; return its exit code, and what it told."""
+    done = CliRunner().invoke(build(command), [command, *words, "--json"])
+    assert code in (None, done.exit_code), done.output
+    lines = [line for line in done.output.splitlines() if line.startswith("{")]
+    return done.exit_code, [json.loads(line) for line in lines]
+
+
+def recording(folder: Path, *more: str) -> subprocess.Popen[str]:
+    line = ["dataset", "record", str(folder), "--robot", "arm-1", "--task", "wave", "--json", *more]
+    return subprocess.Popen([*COMMAND, *line], stdout=subprocess.PIPE, text=True)
+
+
+def told(child: subprocess.Popen[str]) -> list[dict[str, object]]:
+    output, _ = child.communicate(timeout=60)
+    return [json.loads(line) for line in output.splitlines()]
+
+
+def running(folder: Path) -> None:
+    attempt = folder / ".running" / "attempt-000000.mcap"
+    eventually(lambda: attempt.exists() and attempt.stat().st_size > 2000, within=60)
+
+
+@pytest.mark.parametrize("network", [(), ("--mesh",)], ids=["device_connect", "mesh"])
+def test_policy_that_a_served_robot_runs_is_recorded_attempt_by_attempt(
+    tmp_path: Path, network: tuple[str, ...]
+) -> None:
+    folder, at = tmp_path / "set", ("--port", str(free_port()), *network)
+    with arm(*at):
+        rows = told(recording(folder, "--policy", "mock", "--episodes", "2", "--episode-s", "1", "--pause-s", "0", *at))
+    assert [each["event"] for each in rows] == ["saved", "saved", "dataset"]
+    info, found = check_dataset(folder)
+    assert (info.episodes, [each for each in found if each.wrong]) == (2, [])
+    for number in range(2):
+        frames = tables.read_frames(folder / data_file(number))
+        assert len(frames["index"]) > 15
+        assert set(frames["stop"].tolist()) == {0}, "the end of an attempt is no stop"
+        assert frames["observation.state"].std(axis=0).max() > 0.001, "it moves"
+    if not network:
+        assert [name.rpartition(".")[2] for name in info.videos] == ["wrist"]
+
+
+def test_what_others_have_it_do_is_one_episode_and_a_stop_is_in_it(tmp_path: Path) -> None:
+    folder, at = tmp_path / "set", ("--port", str(free_port()))
+    with arm(*at):
+        child = recording(folder, "--leader", "page", "--cameras", "none", "--episode-s", "60", *at)
+        try:
+            running_dir = folder / ".running"
+            eventually(lambda: any(running_dir.glob("*.mcap")), within=60)
+            for way in ("dx=0.02", "dz=-0.02"):
+                on("call", "arm-1", "moveBy", way, *at)
+            running(folder)
+            on("call", "arm-1", "execute", "instruction=wave", "policy_provider=mock", "duration=30", *at)
+            size = (running_dir / "attempt-000000.mcap").stat().st_size
+            eventually(lambda: (running_dir / "attempt-000000.mcap").stat().st_size > size + 4000, within=30)
+            on("estop", *at, code=None)
+            rows = told(child)
+        finally:
+            child.kill()
+            child.communicate()
+        assert [each.get("event", each.get("status")) for each in rows] == ["saved", "held", "error"]
+        assert "locked by an emergency stop" in str(rows[1]["stopped_by"])
+        refused = told(recording(folder, "--policy", "mock", "--cameras", "none", "--episode-s", "1", *at))
+        assert "locked" in str(refused[-1]["reason"])
+    frames = tables.read_frames(folder / data_file(0))
+    assert frames["stop"][-1] == 2
+    assert not frames["next.success"].any()
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (("--episode-s", "1"), "either --leader or --policy"),
+        (("--policy", "mock", "--leader", "page", "--episode-s", "1"), "either --leader or --policy"),
+        (("--policy", "mock"), "--episode-s is needed without a terminal"),
+        (("--policy", "mock", "--episode-s", "1", "--peer-id", "x"), "go with a served robot"),
+        (("--leader", "keyboard", "--episode-s", "1"), "--leader page"),
+    ],
+)
+def test_what_a_served_robot_cannot_be_recorded_with_is_refused(
+    tmp_path: Path, words: tuple[str, ...], why: str
+) -> None:
+    line = ["dataset", "record", str(tmp_path / "set"), "--robot", "arm-1", "--task", "wave", "--json", *words]
+    done = CliRunner().invoke(build("dataset"), line)
+    assert done.exit_code != 0
+    assert why in done.output
+    assert not (tmp_path / "set").exists()
