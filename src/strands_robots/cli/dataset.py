@@ -103,6 +103,9 @@ def record(
         with (
             served_robot(screen, network, robot, policy or "", task, names) as far,
             RecordingSession(folder, fps, task, far.kind, lambda said: screen.say(said, "yellow")) as session,
+            halted_first(far),
+            answering(far.networks, far.name, ""),
+            far.held(),
         ):
             keys = Keys() if asked else None
             begin_far = partial(far.begin, longest)

@@ -187,7 +187,7 @@ def record_attempts(screen: Screen, led: AttemptRobot, session: RecordingSession
                 raise CliError("The leader did not move the robot; nothing more is recorded.")
             saved += kept
         if ended.failed:
-            raise CliError(f"The leader failed: {ended.failed}")
+            raise CliError(f"The attempt failed: {ended.failed}")
         if ended.said is Said.END or ended.interrupted:
             return
 

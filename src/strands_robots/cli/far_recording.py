@@ -16,7 +16,7 @@ from typing import Any
 
 from strands_robots.cli.output import CliError, Screen
 from strands_robots.cli.record import NO_CAMERAS
-from strands_robots.errors import RefusalError, RobotError
+from strands_robots.errors import NoAnswerError, RefusalError, RobotError, UnreachableError
 from strands_robots.fleet.adapter import Detail, RobotEvent
 from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.remote_robot import ROBOT_NAME, RemoteRobot
@@ -24,7 +24,7 @@ from strands_robots.fleet.reports import runs, said
 from strands_robots.recording.cameras import OVERVIEW
 from strands_robots.recording.file import STEP, Recorder
 from strands_robots.safety.stopping import StopVerdict
-from strands_robots.utils import DURATION_MAX_S, ValidationError
+from strands_robots.utils import DURATION_MAX_S, ValidationError, shown
 
 LOOK_S = 0.25
 """Pause between two looks at the robot's status."""
@@ -34,6 +34,9 @@ SILENT_S = 3.0
 
 PICTURE_S = 2.0
 """Longest wait for one picture."""
+
+LEASE_S = 2.0
+"""Time of the lease on a robot whose policy was started from here."""
 
 PICTURE_WIDTH, PICTURE_HEIGHT = 640, 480
 
@@ -72,26 +75,28 @@ class FarRobot:
     """A served robot, as ``dataset record`` needs it.
 
     Args:
-        remote: the robot, or the world that it is in.
+        world: the robot, or the world that it is in.
         networks: on which its events are followed.
         part: which robot of a world; empty for the only one.
         policy: runs there in each attempt; empty for none, where others move it.
         task: told to the policy.
         cameras: names, or None for those of the robot itself.
+
+    Raises:
+        ValidationError: the world has several robots, or none of that name, or there is no such camera.
+        RefusalError: it does not answer.
     """
 
     def __init__(  # noqa: PLR0917 - one robot, and what is asked of it
-        self, remote: RemoteRobot, networks: Networks, part: str, policy: str, task: str, cameras: Sequence[str] | None
+        self, world: RemoteRobot, networks: Networks, part: str, policy: str, task: str, cameras: Sequence[str] | None
     ) -> None:
-        self.remote = remote
-        self._networks, self._part, self._policy, self._task = networks, part, policy, task
-        self._cameras = _cameras_of(remote, cameras)
-        several = list(remote.robots) if not part else []
-        if len(several) > 1:
-            raise ValidationError(
-                f"--robot must name one of the world's robots, {remote.address}/{several[0]} for example: it has "
-                f"{', '.join(several)}."
-            )
+        robots = world.robots
+        if part not in robots and (part or len(robots) > 1):
+            known = ", ".join(f"{world.id}/{name}" for name in robots) or world.id
+            raise ValidationError(f"--robot must be one of {known}, not {shown(f'{world.id}/{part}')}.")
+        self.remote = robots[part] if part else world
+        self.networks, self._part, self._policy, self._task = networks, part, policy, task
+        self._cameras = _cameras_of(world, part, cameras)
         self._stopped_by = ""
         self._halting, self._halted = False, threading.Event()
         self._attempt: FarTask | None = None
@@ -132,12 +137,16 @@ class FarRobot:
         self._halted.clear()
         task = self._attempt = FarTask()
         if self._policy:
-            arguments: dict[str, Any] = {"instruction": self._task, "policy_provider": self._policy, **self._named()}
-            arguments["duration"] = min(seconds or DURATION_MAX_S, DURATION_MAX_S)
+            duration = min(seconds or DURATION_MAX_S, DURATION_MAX_S)
             try:
-                self.remote.call(self._starts(), **arguments)
+                self.remote.call(
+                    self._starts(), instruction=self._task, policy_provider=self._policy, duration=duration
+                )
             except RefusalError as refused:
                 task.end(said(refused))
+                if isinstance(refused, NoAnswerError | UnreachableError):
+                    # It may have begun all the same.
+                    self.remote.halt("its start was not answered")
                 raise CliError(said(refused)) from refused
         threading.Thread(target=self._watch, args=(task,), name=f"attempt {self.name}", daemon=True).start()
         return task
@@ -155,6 +164,21 @@ class FarRobot:
         screen.data({"event": "held", "peer_id": self.name, "stopped_by": self._stopped_by})
 
     @contextmanager
+    def held(self) -> Iterator[None]:
+        """Hold the robot in the block where its policy is started from here.
+
+        If this process dies, the robot halts when :data:`LEASE_S` are over.
+
+        Raises:
+            RefusalError: another caller holds it.
+        """
+        if self._policy and self.remote.has_lease:
+            with self.remote.control(LEASE_S):
+                yield
+        else:
+            yield
+
+    @contextmanager
     def recorded(self, recorder: Recorder, fps: int) -> Iterator[None]:
         """Record its events and the pictures of its cameras in the block."""
         self._recorder, over = recorder, threading.Event()
@@ -162,7 +186,7 @@ class FarRobot:
             threading.Thread(target=self._take_pictures, args=(recorder, camera, fps, over), name=f"pictures {camera}")
             for camera in self._cameras
         ]
-        end = self._networks.subscribe(self.name, lambda event: self._take(recorder, event), Detail.ALL)
+        end = self.networks.subscribe(self.name, lambda event: self._take(recorder, event), Detail.ALL)
         try:
             for thread in threads:
                 thread.start()
@@ -240,15 +264,12 @@ class FarRobot:
                 recorder.take_picture(self.name, camera.replace("/", "."), jpeg, asked)
             beat = max(beat + 1, int((time.monotonic() - began) * fps))
 
-    def _named(self) -> dict[str, str]:
-        return {ROBOT_NAME: self._part} if self._part else {}
-
     def _starts(self) -> str:
         verbs = self.remote.verbs
         return next((verb for verb in ("start", "execute") if verb in verbs), "execute")
 
 
-def _cameras_of(remote: RemoteRobot, names: Sequence[str] | None) -> tuple[str, ...]:
+def _cameras_of(remote: RemoteRobot, part: str, names: Sequence[str] | None) -> tuple[str, ...]:
     """Return the cameras to record: those named, else the robot's own.
 
     Raises:
@@ -261,7 +282,7 @@ def _cameras_of(remote: RemoteRobot, names: Sequence[str] | None) -> tuple[str, 
     if not isinstance(listed, list) or not all(isinstance(each, str) for each in listed):
         raise RobotError("Its list of cameras cannot be read", robot=remote.id, verb="listCameras")
     if names is None:
-        own = [name for name in listed if "/" in name]
+        own = [name for name in listed if (name.startswith(f"{part}/") if part else "/" in name)]
         return tuple(own or ([OVERVIEW] if OVERVIEW in listed else listed))
     if unknown := [name for name in names if name not in listed]:
         raise ValidationError(f"--cameras must be of {', '.join(listed) or 'none'}, not {', '.join(unknown)}.")

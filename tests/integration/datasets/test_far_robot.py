@@ -120,3 +120,23 @@ def test_what_a_served_robot_cannot_be_recorded_with_is_refused(
     assert done.exit_code != 0
     assert why in done.output
     assert not (tmp_path / "set").exists()
+
+
+def test_robot_of_a_world_is_halted_when_the_recorder_of_its_policy_is_killed(tmp_path: Path) -> None:
+    folder, at = tmp_path / "set", ("--port", str(free_port()))
+    with arm(*at):
+        line = ("--policy", "mock", "--cameras", "none", "--episode-s", "60", *at)
+        child = recording(folder, *line)
+        try:
+            running(folder)
+        finally:
+            child.kill()
+            child.communicate()
+        eventually(lambda: not on("call", "arm-1", "getStatus", *at)[1][-1]["running_policies"], within=10)
+        rows = told(
+            recording(folder, "--policy", "mock", "--cameras", "none", "--episodes", "1", "--episode-s", "1", *at)
+        )
+        other = told(recording(folder, "--robot", "arm-1/left", "--policy", "mock", "--episode-s", "1", *at))
+    assert [each["event"] for each in rows] == ["saved", "dataset"]
+    assert check_dataset(folder)[0].episodes == 2, "what was running when it was killed is the first"
+    assert "--robot must be one of arm-1/so100, not 'arm-1/left'" in str(other[-1]["reason"])
