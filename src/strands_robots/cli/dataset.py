@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from strands_robots.cli.far_recording import FarRobot
 
 PAGE = "page"
-"""Leader of a served robot that others move: the page, an agent, another terminal."""
+"""Leader of a served robot that others move: the page, or an agent."""
 
 
 def record(
@@ -115,8 +115,8 @@ def record(
         return
     if leader.startswith(MESH_PREFIX) or robot.startswith(MESH_PREFIX) or leader in MANUAL:
         raise ValidationError(
-            "--leader must be a leader arm or a recording, and --robot one of this machine. For a served robot let "
-            f"teleop lead it from another terminal, and record it here with --leader {PAGE}."
+            "--leader must be a leader arm or a recording, and --robot one of this machine; "
+            f"--leader {PAGE} and --policy NAME record a served robot."
         )
     how = Serving.of(network, peer_id, None, alone=no_network)
     arm, options = arm_options("", follower_id, calibration), TeleopOptions()

@@ -1,7 +1,7 @@
 """Recording of a robot that another process serves: its events, its pictures, its stops.
 
-Nothing of it is led from here but a policy that it runs itself. Whoever else moves it meanwhile (the page, an agent,
-``teleop`` in another terminal) is in the recording as well. Readings count from their arrival here.
+Nothing of it is led from here but a policy that it runs itself. The tasks and motions that others give it (the page,
+an agent) are in the recording as well. Readings count from their arrival here.
 """
 
 from __future__ import annotations
