@@ -274,7 +274,7 @@ COMMANDS = {
 
 GROUPS: Mapping[str, tuple[str, tuple[str, ...]]] = {
     "policy": ("Look at trained policies before a robot moves by them.", ("check", "bench")),
-    "dataset": ("Episodes to train by, in LeRobot's format.", ("record", "from-mcap", "check")),
+    "dataset": ("Episodes to train by, in LeRobot's format.", ("record", "from-mcap", "check", "show")),
     "audit": ("The safety record of this machine.", ("tail", "show", "verify")),
     "keys": ("Keys that free robots and sign their stops.", ("resume", "estop", "console", "mcp")),
     "mesh": ("The native mesh: certificates and access rules.", ("keys",)),

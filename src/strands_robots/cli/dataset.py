@@ -234,3 +234,27 @@ def check(
     screen.say(f"Episodes: {info.episodes}, frames: {info.frames} at {info.fps} a second, {cameras}.")
     if wrong:
         raise CliError(f"{folder}: {wrong} things are wrong.")
+
+
+def show(
+    screen: Screen,
+    *,
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="The dataset.")],
+    out: Annotated[Path | None, typer.Option("--out", help="The page; DIR.html by default.", metavar="FILE")] = None,
+    episode: Annotated[
+        list[int] | None, typer.Option("--episode", help="One to draw (repeat); by default the first 50.")
+    ] = None,
+) -> None:
+    """Write a page of a dataset: episodes, plots, pictures, stops. One HTML file."""
+    from strands_robots.datasets.page import dataset_page  # noqa: PLC0415 - an extra
+
+    if not folder.is_dir():
+        raise ValidationError(f"DIR must be a folder with a dataset: {folder} is none.")
+    file = folder.resolve().with_name(f"{folder.resolve().name}.html") if out is None else out
+    page = dataset_page(folder, episode)
+    try:
+        file.write_text(page, encoding="utf-8")
+    except OSError as problem:
+        raise CliError(f"{file} cannot be written: {problem.strerror}.") from problem
+    screen.data({"event": "shown", "file": str(file), "bytes": len(page)})
+    screen.say(f"{file} is written; open it in a browser.", "green")
