@@ -314,12 +314,19 @@ class KeyboardLeader:
         start: the follower's position by action key; at most ten joints.
         ranges: of the follower's action keys.
         fd: the terminal; standard input by default.
+        other: gets each key that neither moves a joint nor ends it.
 
     Raises:
         ValidationError: too many joints, or ``fd`` is no terminal.
     """
 
-    def __init__(self, start: Mapping[str, float], ranges: Ranges, fd: int | None = None) -> None:
+    def __init__(
+        self,
+        start: Mapping[str, float],
+        ranges: Ranges,
+        fd: int | None = None,
+        other: Callable[[str], None] = lambda key: None,
+    ) -> None:
         if len(start) > len(UP):
             raise ValidationError(f"start must hold at most {len(UP)} joints, not {len(start)}.")
         self._fd = sys.stdin.fileno() if fd is None else fd
@@ -329,6 +336,7 @@ class KeyboardLeader:
         self._pushes = {up: (key, 1.0) for up, key in zip(UP, self._jog.keys, strict=False)}
         self._pushes |= {down: (key, -1.0) for down, key in zip(DOWN, self._jog.keys, strict=False)}
         self._before: list[int | list[bytes | int]] | None = None
+        self._other = other
 
     @property
     def is_connected(self) -> bool:
@@ -366,6 +374,8 @@ class KeyboardLeader:
                 if char.lower() in self._pushes:
                     key, push = self._pushes[char.lower()]
                     self._jog.move(key, push, STEP_S)
+                else:
+                    self._other(char)
         return self._jog.targets
 
 

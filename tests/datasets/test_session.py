@@ -93,3 +93,17 @@ def test_second_session_and_another_rate_are_refused(tmp_path: Path) -> None:
         session(tmp_path, fps=30)
     with session(tmp_path) as again:
         assert again.episodes == 1
+
+
+def test_session_that_records_nothing_leaves_no_folder(tmp_path: Path) -> None:
+    folder = tmp_path / "new"
+    with RecordingSession(folder, 30, "wave", "so100", lambda said: None) as session:
+        assert session.recording.parent.is_dir()
+    assert not folder.exists()
+    with RecordingSession(folder, 30, "wave", "so100", lambda said: None) as session:
+        session.recording.write_bytes(b"cut off")
+    assert session.recording.exists(), "what was recorded is never removed unasked"
+    (tmp_path / "there").mkdir()
+    with RecordingSession(tmp_path / "there", 30, "wave", "so100", lambda said: None):
+        pass
+    assert (tmp_path / "there").is_dir()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -31,7 +31,10 @@ from strands_robots.cli.teleop import MESH_PREFIX, Calibration, FollowerId, NoNe
 from strands_robots.utils import ValidationError, identifier, number, text, whole
 
 if TYPE_CHECKING:
+    from strands_robots.cli.dataset_recording import Attempts
     from strands_robots.cli.far_recording import FarRobot
+
+SERVED = "A robot that another process serves is recorded with --policy NAME or --leader page."
 
 PAGE = "page"
 """Leader of a served robot that others move: the page, or an agent."""
@@ -52,7 +55,8 @@ def record(
     leader: Annotated[
         str | None,
         typer.Option(
-            "--leader", help="TYPE@PORT of a leader arm, a recording, or page: whoever moves a served robot meanwhile."
+            "--leader",
+            help="TYPE@PORT of a leader arm, keyboard, gamepad, a recording, or page: whoever moves a served robot.",
         ),
     ] = None,
     policy: Annotated[
@@ -100,46 +104,69 @@ def record(
             raise ValidationError(
                 f"--policy and --leader {PAGE} go with a served robot, and without options of an arm."
             )
-        with (
-            served_robot(screen, network, robot, policy or "", task, names) as far,
-            RecordingSession(folder, fps, task, far.kind, lambda said: screen.say(said, "yellow")) as session,
-            halted_first(far),
-            answering(far.networks, far.name, ""),
-            far.held(),
-        ):
-            keys = Keys() if asked else None
-            begin_far = partial(far.begin, longest)
-            record_attempts(screen, far, session, Attempts(episodes, begin_far, fps, longest, pause_s, success, keys))
-            count = session.episodes
-        _tell_dataset(screen, folder, count)
+        made = partial(Attempts, episodes, fps=fps, seconds=longest, pause_s=pause_s, success=success)
+        with served_robot(screen, network, robot, policy or "", task, names) as far:
+            _record_served(
+                screen, folder, far, task, made(begin=partial(far.begin, longest), keys=Keys() if asked else None)
+            )
         return
-    if leader.startswith(MESH_PREFIX) or robot.startswith(MESH_PREFIX) or leader in MANUAL:
+    if leader.startswith(MESH_PREFIX) or robot.startswith(MESH_PREFIX):
         raise ValidationError(
-            "--leader must be a leader arm or a recording, and --robot one of this machine; "
+            "--leader must be of this machine, and --robot one of this command; "
             f"--leader {PAGE} and --policy NAME record a served robot."
         )
     how = Serving.of(network, peer_id, None, alone=no_network)
-    arm, options = arm_options("", follower_id, calibration), TeleopOptions()
-    kind = robot.partition("@")[0]
+    manual, arm = leader in MANUAL, arm_options("", follower_id, calibration)
+    options = TeleopOptions(leader if manual else "arm")
+    kind, of_leader = robot.partition("@")[0], arm_options("", leader_id, leader_calibration)
+    keys, turn = Keys(leads=leader == "keyboard") if asked else None, ExitStack()
+
+    def connected() -> AbstractContextManager[Any]:
+        return connected_leader(leader, led.robot, of_leader, (lambda key: None) if keys is None else keys.pressed)
+
     with (
         RecordingSession(folder, fps, task, kind, lambda said: screen.say(said, "yellow")) as session,
-        made_follower(screen, robot, arm, None, how) as led,
-        connected_leader(leader, led.robot, arm_options("", leader_id, leader_calibration)) as source,
+        made_follower(screen, robot, arm, None, how, SERVED) as led,
+        # What a hand moves begins each attempt where the robot then is.
+        nullcontext() if manual else connected() as lasting,
         halted_first(led.robot),
     ):
-        check_keys(robot, source, led.robot.body().bounds)
-        announce(screen, leader, robot, source)
+        recorded = isinstance(lasting, RecordedLeader)
+        if not manual:
+            check_keys(robot, lasting, led.robot.body().bounds)
+            announce(screen, leader, robot, lasting)
 
         def lead() -> Any:
-            if isinstance(source, RecordedLeader):
+            source: Any = turn.enter_context(connected()) if manual else lasting
+            if manual:
+                announce(screen, leader, robot, source)
+            if keys is not None and keys.leads:
+                keys.leading = True
+                turn.callback(setattr, keys, "leading", False)
+            if recorded:
                 source.rewind()
             begin(screen, led, leader, source, options, publish=False)
             return led.robot.tasks.by_leader[LEADER]
 
-        keys = Keys() if asked else None
         frames = None if names == [NO_CAMERAS] else chosen_frames(led.robot, names)
-        attempts = Attempts(episodes, lead, fps, longest, pause_s, success, keys)
-        record_attempts(screen, LocalAttempts(led, frames), session, attempts)
+        local = LocalAttempts(led, frames, turn, person=not recorded)
+        record_attempts(screen, local, session, Attempts(episodes, lead, fps, longest, pause_s, success, keys))
+        count = session.episodes
+    _tell_dataset(screen, folder, count)
+
+
+def _record_served(screen: Screen, folder: Path, far: FarRobot, task: str, attempts: Attempts) -> None:
+    """Record attempts of a robot that another process serves."""
+    from strands_robots.cli.dataset_recording import record_attempts  # noqa: PLC0415 - an extra
+    from strands_robots.datasets.session import RecordingSession  # noqa: PLC0415 - as above
+
+    with (
+        RecordingSession(folder, attempts.fps, task, far.kind, lambda said: screen.say(said, "yellow")) as session,
+        halted_first(far),
+        answering(far.networks, far.name, ""),
+        far.held(),
+    ):
+        record_attempts(screen, far, session, attempts)
         count = session.episodes
     _tell_dataset(screen, folder, count)
 

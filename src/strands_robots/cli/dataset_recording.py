@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import queue
+import os
+import select
 import sys
-import threading
 import time
-from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager, ExitStack
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from enum import Enum
 from typing import TYPE_CHECKING, Any, Protocol
 
 from strands_robots.cli.led_robot import LedRobot
 from strands_robots.cli.output import POLL_S, CliError, Screen, wait_until
-from strands_robots.datasets.recorded import ATTEMPT_ENDED
+from strands_robots.datasets.recorded import ATTEMPT_ENDED, LED_BY_PERSON
 from strands_robots.recording.cameras import Frames
 from strands_robots.recording.file import Recorder, RobotRecording
 from strands_robots.safety.stopping import StopVerdict
@@ -36,34 +37,56 @@ class Said(Enum):
 
 KEYS = "Enter keeps it as a success, f Enter as a failure, r Enter redoes it, q Enter drops it and ends."
 
+KEYBOARD = "Enter keeps it as a success, x as a failure, z redoes it, c drops it and ends."
+"""The same where single keys lead the robot, which takes the others."""
+
+_KEYBOARD = {"\n": Said.SUCCESS, "x": Said.FAILURE, "z": Said.REDO, "c": Said.END}
+
 
 class Keys:
-    """Lines of the terminal, read on a thread; none where nobody sits at it."""
+    """Words of the person at the terminal, by lines, or by the keys of a leader.
 
-    def __init__(self) -> None:
-        self._lines: queue.SimpleQueue[str] = queue.SimpleQueue()
-        threading.Thread(target=self._read, name="keys", daemon=True).start()
+    Args:
+        fd: of the terminal; standard input by default.
+        leads: a keyboard leads in each attempt; then its keys come by :meth:`pressed`, and no line is read.
+    """
+
+    def __init__(self, fd: int | None = None, *, leads: bool = False) -> None:
+        self.leads = leads
+        self.leading = False
+        """True while a keyboard leads."""
+        self._fd = sys.stdin.fileno() if fd is None else fd
+        self._words: deque[Said | None] = deque()
+        self._line = b""
+
+    def pressed(self, key: str) -> None:
+        """Note a key of the leader."""
+        self._words.append(_KEYBOARD.get(key.lower()))
 
     def said(self) -> Said | None:
         """Return the next word of the person; None while there is none."""
-        try:
-            line = self._lines.get_nowait()
-        except queue.Empty:
-            return None
-        return next((each for each in Said if each.value == line.strip().lower()), None)
+        if not self.leading:
+            self._read()
+        return self._words.popleft() if self._words else None
 
     def wait(self) -> Said:
         """Wait for a word. What was typed before does not count."""
-        while self.said() is not None:
-            pass
+        self._read()
+        self._words.clear()
         while (word := self.said()) is None:
             time.sleep(POLL_S)
         return word
 
     def _read(self) -> None:
-        for line in sys.stdin:
-            self._lines.put(line)
-        self._lines.put(Said.END.value)
+        while select.select([self._fd], [], [], 0)[0]:
+            data = os.read(self._fd, 4096)
+            if not data:
+                self._words.append(Said.END)
+                return
+            *lines, self._line = (self._line + data).split(b"\n")
+            for line in lines:
+                said = line.decode("utf-8", "replace").strip().lower()
+                self._words.append(next((each for each in Said if each.value == said), None))
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,10 +143,12 @@ class LocalAttempts:
     Args:
         led: the robot, served.
         frames: takes its pictures; None for none.
+        turn: closed at the end of each attempt, with the leader that was made for it.
+        person: a person leads.
     """
 
-    def __init__(self, led: LedRobot, frames: Frames | None) -> None:
-        self._led, self._frames = led, frames
+    def __init__(self, led: LedRobot, frames: Frames | None, turn: ExitStack, *, person: bool) -> None:
+        self._led, self._frames, self._turn, self._person = led, frames, turn, person
 
     @property
     def name(self) -> str:
@@ -140,10 +165,17 @@ class LocalAttempts:
         """The reason of the stop, with its caller."""
         return self._led.stopped_by
 
-    def recorded(self, recorder: Recorder, fps: int) -> AbstractContextManager[object]:
+    @contextmanager
+    def recorded(self, recorder: Recorder, fps: int) -> Iterator[None]:
         """Record it in the block."""
+        if self._person:
+            recorder.take(self.name, LED_BY_PERSON, {})
         hz = min(fps, CAMERAS_HZ_MAX)
-        return RobotRecording(self._led.robot, recorder, self.name, frames=self._frames, cameras_hz=hz)
+        with (
+            self._turn,
+            RobotRecording(self._led.robot, recorder, self.name, frames=self._frames, cameras_hz=hz),
+        ):
+            yield
 
     def halt(self, reason: str) -> StopVerdict:
         """Halt it, and return the verdict."""
@@ -222,7 +254,7 @@ def _attempt(screen: Screen, led: AttemptRobot, session: RecordingSession, attem
         recorded.enter_context(led.recorded(recorder, attempts.fps))
         task, began = attempts.begin(), time.monotonic()
         if attempts.keys is not None:
-            screen.say(KEYS)
+            screen.say(KEYBOARD if attempts.keys.leading else KEYS)
 
         def over() -> str:
             word = None if attempts.keys is None else attempts.keys.said()

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,8 @@ from strands_robots.utils import ValidationError
 
 LEADER = "leader"
 """Name of the leader at its follower."""
+
+ELSEWHERE = "A device of Device Connect takes no frames; serve its robot on the mesh too, and name it mesh:PEER."
 
 MANUAL = ("keyboard", "gamepad")
 """Leaders that a person holds in hand, without an arm."""
@@ -84,10 +87,13 @@ def announce(screen: Screen, leader: str, follower: str, source: Any) -> None:
 
 
 @contextmanager
-def made_follower(
-    screen: Screen, follower: str, arm: dict[str, Any], record: Path | None, how: Serving
+def made_follower(  # noqa: PLR0917 - one robot, and what is done with it
+    screen: Screen, follower: str, arm: dict[str, Any], record: Path | None, how: Serving, elsewhere: str = ELSEWHERE
 ) -> Iterator[LedRobot]:
-    """Make, serve and record ``TYPE@PORT`` or a model; halt it at the end."""
+    """Make, serve and record ``TYPE@PORT`` or a model; halt it at the end.
+
+    ``elsewhere`` is said of a name that is no model, and may be that of a robot of another process.
+    """
     from strands_robots.robot import NO_SUCH_MODEL, Robot, counts_as_hardware  # noqa: PLC0415 - heavy, and needed by these commands alone
 
     kind, at, port = follower.partition("@")
@@ -97,8 +103,7 @@ def made_follower(
     except ValidationError as exc:
         if exc.code != NO_SUCH_MODEL or "/" in kind or "." in kind:
             raise
-        hint = "A device of Device Connect takes no frames; serve its robot on the mesh too, and name it mesh:PEER."
-        raise ValidationError(f"{exc} {hint}") from exc
+        raise ValidationError(f"{exc} {elsewhere}") from exc
     try:
         if not callable(getattr(robot, "attach_teleop", None)):
             raise ValidationError(f"follower must be a robot that a leader can lead; {kind} has no attach_teleop.")
@@ -114,8 +119,16 @@ def made_follower(
 
 
 @contextmanager
-def connected_leader(leader: str, robot: Any, options: dict[str, Any]) -> Iterator[Any]:
+def connected_leader(
+    leader: str, robot: Any, options: dict[str, Any], other: Callable[[str], None] = lambda key: None
+) -> Iterator[Any]:
     """Yield the leader of that name, ready to lead ``robot``.
+
+    Args:
+        leader: as the command line has it.
+        robot: that it is to lead.
+        options: of a leader arm.
+        other: gets the keys of a keyboard that move nothing.
 
     Raises:
         ConnectionError: a leader arm cannot be connected.
@@ -128,7 +141,7 @@ def connected_leader(leader: str, robot: Any, options: dict[str, Any]) -> Iterat
         body = robot.body()
         present = body.get_joints()
         start = {key: present[key] for key in body.bounds if key in present}
-        manual = KeyboardLeader if leader == "keyboard" else GamepadLeader
+        manual: Any = partial(KeyboardLeader, other=other) if leader == "keyboard" else GamepadLeader
         with manual(start, body.bounds) as source:
             yield source
         return

@@ -84,6 +84,7 @@ class DatasetHold:
         self.folder = folder
         if not (folder / INFO).is_file():
             _require_empty(folder)
+        self._new = not folder.exists()
         with _told(folder):
             folder.mkdir(parents=True, exist_ok=True)
             self._lock = _locked(folder)
@@ -94,10 +95,21 @@ class DatasetHold:
         return self._lock < 0
 
     def close(self) -> None:
-        """Let go of it. Twice is once."""
+        """Let go of it, and remove a folder that is as new as it was. Twice is once."""
         if self._lock >= 0:
+            if self._new:
+                self._remove_empty()
             os.close(self._lock)
             self._lock = -1
+
+    def _remove_empty(self) -> None:
+        with suppress(OSError):
+            if {path.name for path in self.folder.iterdir()} <= {LOCK, RUNNING}:
+                if (self.folder / RUNNING).is_dir():
+                    # Refused where something is in it.
+                    (self.folder / RUNNING).rmdir()
+                (self.folder / LOCK).unlink()
+                self.folder.rmdir()
 
 
 class Dataset:

@@ -36,6 +36,9 @@ _STOPS = {"halted": STOPPED, "locked": EMERGENCY, "emergencyStop": EMERGENCY}
 ATTEMPT_ENDED = "attemptEnded"
 """Event of a recording: the person who records has ended the attempt. What follows is none of it."""
 
+LED_BY_PERSON = "ledByPerson"
+"""Event of a recording: from here on a person leads, by an arm, a keyboard or a gamepad."""
+
 _ENDS = ("taskComplete", "policyComplete")
 _STARTS = ("taskStarted", "policyStarted")
 
@@ -45,12 +48,14 @@ class Attempt:
     """One task of a robot as it was recorded.
 
     ``steps`` are moments in seconds, observations and actions by name; ``pictures`` moments and JPEG by camera.
+    ``person`` is True where a person led.
     """
 
     instruction: str = ""
     steps: list[tuple[float, dict[str, float], dict[str, float]]] = field(default_factory=list)
     pictures: dict[str, list[tuple[float, bytes]]] = field(default_factory=dict)
     stops: list[tuple[float, int]] = field(default_factory=list)
+    person: bool = False
 
 
 def attempts_of(path: Path, robot: str | None = None) -> list[Attempt]:
@@ -102,7 +107,9 @@ def _attempts(items: Sequence[RecordedItem], robot: str, *, whole: bool) -> Iter
     for each in items:
         if not isinstance(each, RecordedEvent) or each.robot not in (robot, robot.partition("/")[0]):
             continue
-        if each.event == ATTEMPT_ENDED:
+        if each.event == LED_BY_PERSON:
+            attempt.person = True
+        elif each.event == ATTEMPT_ENDED:
             if attempt.steps:
                 yield attempt
             attempt = Attempt()
@@ -188,7 +195,7 @@ def save_attempt(dataset: Dataset, attempt: Attempt, task: str, *, success: bool
         f"{AGE}state": (moments - np.array([steps[index][0] for index in newest])) * 1000,
         SUCCESS: np.arange(count) == (count - 1 if success else -1),
         STOP: _stops(moments, attempt.stops),
-        INTERVENTION: np.zeros(count, dtype=bool),
+        INTERVENTION: np.full(count, attempt.person),
     }
     videos: dict[str, Video] = {}
     for name in dataset.info.videos:

@@ -109,7 +109,7 @@ def test_what_others_have_it_do_is_one_episode_and_a_stop_is_in_it(tmp_path: Pat
         (("--policy", "mock", "--leader", "page", "--episode-s", "1"), "either --leader or --policy"),
         (("--policy", "mock"), "--episode-s is needed without a terminal"),
         (("--policy", "mock", "--episode-s", "1", "--peer-id", "x"), "go with a served robot"),
-        (("--leader", "keyboard", "--episode-s", "1"), "--leader page"),
+        (("--leader", "gamepad", "--episode-s", "1", "--no-network"), "--leader page"),
     ],
 )
 def test_what_a_served_robot_cannot_be_recorded_with_is_refused(

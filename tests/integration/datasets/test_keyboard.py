@@ -1,0 +1,96 @@
+"""``dataset record`` at a terminal: the keyboard leads, and other keys say what an attempt was worth."""
+
+from __future__ import annotations
+
+import os
+import pty
+import select
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from fixtures.command_line import COMMAND
+
+from strands_robots.datasets import tables
+from strands_robots.datasets.check import check_dataset
+from strands_robots.datasets.layout import data_file
+
+
+class Terminal:
+    """A command at a terminal of its own."""
+
+    def __init__(self, *words: str) -> None:
+        self.fd, terminal = pty.openpty()
+        environment = {**os.environ, "TERM": "xterm", "COLUMNS": "200"}
+        self.child = subprocess.Popen(
+            [*COMMAND, *words],
+            stdin=terminal,
+            stdout=terminal,
+            stderr=terminal,
+            env=environment,
+            start_new_session=True,
+        )
+        os.close(terminal)
+        self._shown = b""
+
+    def shows(self, text: str, within: float = 60.0) -> None:
+        """Wait until a text is shown after the last one."""
+        until = time.monotonic() + within
+        while text.encode() not in self._shown:
+            assert time.monotonic() < until, self._shown.decode(errors="replace")
+            if select.select([self.fd], [], [], 0.1)[0]:
+                self._shown += os.read(self.fd, 4096)
+        self._shown = self._shown.partition(text.encode())[2]
+
+    def press(self, keys: str) -> None:
+        """Type some keys."""
+        os.write(self.fd, keys.encode())
+
+    def close(self) -> None:
+        self.child.kill()
+        self.child.wait()
+        os.close(self.fd)
+
+
+@pytest.fixture
+def terminal(tmp_path: Path) -> Iterator[Terminal]:
+    words = ["--robot", "so100", "--leader", "keyboard", "--task", "jog", "--episodes", "2", "--cameras", "none"]
+    made = Terminal("dataset", "record", str(tmp_path / "set"), *words, "--no-network")
+    yield made
+    made.close()
+
+
+def attempt(terminal: Terminal, folder: Path, keys: str, word: str) -> None:
+    """Begin an attempt, lead until it has half a second of steps, and say a word."""
+    terminal.shows("Enter begins")
+    terminal.press("\n")
+    terminal.shows("drops it and ends")
+    running = next((folder / ".running").glob("*.mcap"))
+    until = time.monotonic() + 30
+    while running.stat().st_size < 12_000:
+        assert time.monotonic() < until
+        terminal.press(keys)
+        select.select([], [], [], 0.05)
+    terminal.press(word)
+
+
+def test_keyboard_leads_each_attempt_from_where_the_robot_is(tmp_path: Path, terminal: Terminal) -> None:
+    folder = tmp_path / "set"
+    attempt(terminal, folder, "q", "x")
+    terminal.shows("no success")
+    attempt(terminal, folder, "a", "z")
+    terminal.shows("Dropped")
+    attempt(terminal, folder, "a", "\n")
+    terminal.shows("a success")
+    assert terminal.child.wait(30) == 0
+    info, found = check_dataset(folder)
+    assert (info.episodes, [each for each in found if each.wrong]) == (2, [])
+    first, second = (tables.read_frames(folder / data_file(number)) for number in (0, 1))
+    assert first["observation.state"][-1][0] > first["observation.state"][0][0] + 0.05
+    assert second["observation.state"][-1][0] < second["observation.state"][0][0] - 0.05
+    assert abs(second["action"][0][0] - second["observation.state"][0][0]) < 0.2, "no jump to where it was led before"
+    assert (first["next.success"].any(), second["next.success"][-1]) == (False, True)
+    assert first["intervention"].all()
+    assert second["intervention"].all()
