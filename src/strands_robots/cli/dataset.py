@@ -33,6 +33,7 @@ from strands_robots.utils import ValidationError, identifier, number, text, whol
 if TYPE_CHECKING:
     from strands_robots.cli.dataset_recording import Attempts
     from strands_robots.cli.far_recording import FarRobot
+    from strands_robots.datasets.fit import RobotJoints
 
 SERVED = "A robot that another process serves is recorded with --policy NAME or --leader page."
 
@@ -237,18 +238,28 @@ def from_mcap(
 
 def check(
     screen: Screen,
+    network: Network,
     *,
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="The dataset.")],
+    robot: Annotated[
+        str | None,
+        typer.Option("--robot", help="Also against a robot: a simulated one's name, or the id of one that is served."),
+    ] = None,
     oldest_ms: Annotated[
         float, typer.Option("--stale-ms", help="Age of a reading from which it is told.", metavar="MS")
     ] = 500.0,
 ) -> None:
-    """Check a dataset against itself. Exits with 1 when something is wrong."""
+    """Check a dataset, also against a robot. Exits with 1 where it is wrong."""
     from strands_robots.datasets.check import check_dataset  # noqa: PLC0415 - an extra
+    from strands_robots.datasets.fit import robot_findings  # noqa: PLC0415 - as above
 
     if not folder.is_dir():
         raise ValidationError(f"DIR must be a folder with a dataset: {folder} is none.")
-    info, found = check_dataset(folder, oldest_ms=number("--stale-ms", oldest_ms, above=0, high=60_000))
+    oldest = number("--stale-ms", oldest_ms, above=0, high=60_000)
+    joints = None if robot is None else _joints_of(network, robot)
+    info, found = check_dataset(folder, oldest_ms=oldest)
+    if joints is not None and info.episodes:
+        found += robot_findings(folder, info, joints)
     for each in found:
         screen.data({"event": "finding", **asdict(each)})
         screen.say(
@@ -261,6 +272,35 @@ def check(
     screen.say(f"Episodes: {info.episodes}, frames: {info.frames} at {info.fps} a second, {cameras}.")
     if wrong:
         raise CliError(f"{folder}: {wrong} things are wrong.")
+
+
+def _joints_of(network: Network, robot: str) -> RobotJoints:
+    """Return what a simulated robot, else one that is served, states of its joints.
+
+    Raises:
+        CliError: it is no model, and no robot of that id is in reach.
+        ValidationError: it states none.
+    """
+    from strands_robots.datasets.fit import RobotJoints  # noqa: PLC0415 - an extra
+    from strands_robots.fleet import Fleet  # noqa: PLC0415 - loaded when a network is used
+    from strands_robots.robot import NO_SUCH_MODEL, Robot  # noqa: PLC0415 - heavy
+
+    if "@" in robot:
+        raise ValidationError("--robot must be a model's name or the id of a served robot, not TYPE@PORT.")
+    try:
+        made: Any = Robot(robot, mode="sim", mesh=False)
+    except ValidationError as exc:
+        if exc.code != NO_SUCH_MODEL:
+            raise
+    else:
+        try:
+            return RobotJoints.of(robot, made.get_features())
+        finally:
+            made.cleanup()
+    peer, _, part = robot.partition("/")
+    identifier("--robot", peer)
+    with network.joined() as there, answering(there, peer, ""):
+        return RobotJoints.of(robot, Fleet(there)[peer].features(), part)
 
 
 def show(

@@ -1,0 +1,73 @@
+"""A dataset against a robot: names that differ, and values that the robot cannot have, are wrong."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from strands_robots.cli.app import build
+from strands_robots.datasets import Dataset, DatasetEpisode, DatasetInfo, Feature
+from strands_robots.datasets.fit import RobotJoints, robot_findings
+from strands_robots.utils import ValidationError
+
+JOINTS = ("pan", "lift")
+ARM: dict[str, Any] = {
+    "observation_features": {"pan": "float", "lift": "float", "top": [480, 640, 3]},
+    "action_features": {"pan": "float", "lift": "float"},
+    "ranges": {"pan": [-1.0, 1.0], "lift": [0.0, 2.0]},
+}
+
+
+def findings(
+    folder: Path, features: dict[str, Any], rows: np.ndarray[Any, Any], names: tuple[str, ...] = JOINTS
+) -> list[str]:
+    info = DatasetInfo(30, {key: Feature("float32", (2,), names) for key in ("observation.state", "action")}, "arm")
+    with Dataset(folder, info) as dataset:
+        dataset.save(DatasetEpisode("reach", {key: rows.astype(np.float32) for key in info.features}))
+        return [each.said for each in robot_findings(folder, dataset.info, RobotJoints.of("arm-1", features))]
+
+
+def test_dataset_of_the_robot_itself_fits_whatever_the_order_of_its_joints(tmp_path: Path) -> None:
+    rows = np.linspace(0, 1, 40).reshape(20, 2)
+    assert findings(tmp_path / "one", ARM, rows) == []
+    assert findings(tmp_path / "two", ARM, rows, ("lift", "pan")) == []
+
+
+def test_names_that_differ_are_said_on_both_sides(tmp_path: Path) -> None:
+    said = findings(tmp_path, ARM, np.zeros((20, 2)), ("pan", "elbow"))
+    assert said == ["it has no lift, which arm-1 has", "arm-1 has no elbow"] * 2
+
+
+def test_degrees_are_no_radians(tmp_path: Path) -> None:
+    (said, _) = findings(tmp_path, ARM, np.array([[0.0, 0.0], [45.0, 1.0]]))
+    assert said == "pan is 0 to 45, and arm-1 takes -1 to 1; is it of another unit?"
+
+
+def test_robot_of_a_world_is_named_where_there_are_several() -> None:
+    part = {
+        "joints": {"pan": [-1, 1], "lift": None},
+        "actuators": {"pan": [-1, 1]},
+        "observation_features": ["pan", "lift"],
+        "action_features": ["pan"],
+    }
+    world = {"robots": {"left": part, "right": part}}
+    assert RobotJoints.of("world", world, "left") == RobotJoints(
+        "world", ("pan", "lift"), ("pan",), {"pan": (-1.0, 1.0)}
+    )
+    for named in ("", "middle"):
+        with pytest.raises(ValidationError, match="left, right"):
+            RobotJoints.of("world", world, named)
+    for features in ({}, {"robots": {"left": 3}}, {"observation_features": 3, "action_features": None}):
+        with pytest.raises(ValidationError, match="states no joints"):
+            RobotJoints.of("arm-1", features)
+
+
+def test_command_holds_a_dataset_against_a_simulated_robot(tmp_path: Path) -> None:
+    findings(tmp_path / "set", ARM, np.zeros((20, 2)))
+    done = CliRunner().invoke(build("dataset"), ["dataset", "check", str(tmp_path / "set"), "--robot", "so100"])
+    assert done.exit_code == 1
+    assert "so100 has no pan, lift" in done.output
