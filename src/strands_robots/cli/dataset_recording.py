@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import select
 import sys
+import termios
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
@@ -69,10 +70,15 @@ class Keys:
             self._read()
         return self._words.popleft() if self._words else None
 
-    def wait(self) -> Said:
-        """Wait for a word. What was typed before does not count."""
-        self._read()
+    def forget(self) -> None:
+        """Forget what was typed until now, also without an Enter."""
+        if os.isatty(self._fd):
+            termios.tcflush(self._fd, termios.TCIFLUSH)
         self._words.clear()
+        self._line = b""
+
+    def wait(self) -> Said:
+        """Wait for a word."""
         while (word := self.said()) is None:
             time.sleep(POLL_S)
         return word
@@ -238,6 +244,7 @@ class _Ended:
 def _ready(screen: Screen, attempts: Attempts, saved: int) -> bool:
     """Wait until the next attempt may begin; False where none shall."""
     if attempts.keys is not None:
+        attempts.keys.forget()
         screen.say(f"Attempt {saved + 1} of {attempts.count}: Enter begins, q Enter ends.", "bold")
         return attempts.keys.wait() is not Said.END
     if saved:

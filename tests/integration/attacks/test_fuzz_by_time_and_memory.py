@@ -40,6 +40,7 @@ PARSERS = {
     "dashboard/pictures.py": OWN_FILE,
     "dashboard/server.py": "WebSocket messages of 64 KiB at most, and the audit of this machine",
     "datasets/episodes.py": BOUNDED,
+    "datasets/fit.py": BOUNDED,
     "datasets/layout.py": BOUNDED,
     "device_connect/backends/config.py": OWN_FILE,
     "device_connect/backends/dial.py": BOUNDED,
