@@ -62,7 +62,8 @@ def test_policy_that_a_served_robot_runs_is_recorded_attempt_by_attempt(
 ) -> None:
     folder, at = tmp_path / "set", ("--port", str(free_port()), *network)
     with arm(*at):
-        rows = told(recording(folder, "--policy", "mock", "--episodes", "2", "--episode-s", "1", "--pause-s", "0", *at))
+        line = ("--policy", "mock", "--cameras", "none", "--episodes", "2", "--episode-s", "1", "--pause-s", "0")
+        rows = told(recording(folder, *line, *at))
     assert [each["event"] for each in rows] == ["saved", "saved", "dataset"]
     info, found = check_dataset(folder)
     assert (info.episodes, [each for each in found if each.wrong]) == (2, [])
@@ -71,8 +72,20 @@ def test_policy_that_a_served_robot_runs_is_recorded_attempt_by_attempt(
         assert len(frames["index"]) > 3
         assert set(frames["stop"].tolist()) == {0}, "the end of an attempt is no stop"
         assert frames["action"].std(axis=0).max() > 0, "it moves"
-    if not network:
-        assert [name.rpartition(".")[2] for name in info.videos] == ["wrist"]
+
+
+@pytest.mark.system
+def test_pictures_of_a_served_robot_are_recorded_with_their_ages(tmp_path: Path) -> None:
+    folder, at = tmp_path / "set", ("--port", str(free_port()))
+    with arm(*at):
+        told(recording(folder, "--policy", "mock", "--episodes", "1", "--episode-s", "2", *at))
+    info, found = check_dataset(folder)
+    assert ([name.rpartition(".")[2] for name in info.videos], [each for each in found if each.wrong]) == (
+        ["wrist"],
+        [],
+    )
+    ages = next(values for name, values in tables.read_frames(folder / data_file(0)).items() if "age_ms.so100" in name)
+    assert ages.min() >= 0
 
 
 def test_what_others_have_it_do_is_one_episode_and_a_stop_is_in_it(tmp_path: Path) -> None:
