@@ -101,3 +101,8 @@ def test_command_writes_the_page_beside_the_dataset(folder: Path) -> None:
     assert (folder.parent / "set.html").read_text().startswith("<!doctype html>")
     missing = CliRunner().invoke(build("dataset"), ["dataset", "show", str(folder / "none"), "--json"])
     assert (missing.exit_code != 0, "DIR must be a folder" in missing.output) == (True, True)
+
+
+def test_page_of_a_folder_without_a_name_needs_a_file() -> None:
+    done = CliRunner().invoke(build("dataset"), ["dataset", "show", "/", "--json"])
+    assert (done.exit_code, "--out must be given" in done.output) == (2, True)

@@ -317,10 +317,13 @@ def show(
 
     if not folder.is_dir():
         raise ValidationError(f"DIR must be a folder with a dataset: {folder} is none.")
-    file = folder.resolve().with_name(f"{folder.resolve().name}.html") if out is None else out
-    page = dataset_page(folder, episode)
+    name = folder.resolve().name
+    if out is None and not name:
+        raise ValidationError(f"--out must be given: {folder} has no name.")
+    file = folder.resolve().with_name(f"{name}.html") if out is None else out
+    page = dataset_page(folder, episode).encode("utf-8", "replace")
     try:
-        file.write_text(page, encoding="utf-8")
+        file.write_bytes(page)
     except OSError as problem:
         raise CliError(f"{file} cannot be written: {problem.strerror}.") from problem
     screen.data({"event": "shown", "file": str(file), "bytes": len(page)})

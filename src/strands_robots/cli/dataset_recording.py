@@ -57,12 +57,13 @@ class Keys:
         self.leading = False
         """True while a keyboard leads."""
         self._fd = sys.stdin.fileno() if fd is None else fd
-        self._words: deque[Said | None] = deque()
+        self._words: deque[Said] = deque()
         self._line = b""
 
     def pressed(self, key: str) -> None:
         """Note a key of the leader."""
-        self._words.append(_KEYBOARD.get(key.lower()))
+        if (word := _KEYBOARD.get(key.lower())) is not None:
+            self._words.append(word)
 
     def said(self) -> Said | None:
         """Return the next word of the person; None while there is none."""
@@ -92,7 +93,7 @@ class Keys:
             *lines, self._line = (self._line + data).split(b"\n")
             for line in lines:
                 said = line.decode("utf-8", "replace").strip().lower()
-                self._words.append(next((each for each in Said if each.value == said), None))
+                self._words.extend(each for each in Said if each.value == said)
 
 
 @dataclass(frozen=True, slots=True)
@@ -270,7 +271,9 @@ def _attempt(screen: Screen, led: AttemptRobot, session: RecordingSession, attem
                 return "said"
             if attempts.seconds is not None and time.monotonic() - began >= attempts.seconds:
                 return "time"
-            return "" if task.running and not task.voided else "ended"
+            if task.voided:
+                return "voided"
+            return "" if task.running else "ended"
 
         def end() -> None:
             if led.stopped:

@@ -7,7 +7,6 @@ an agent) are in the recording as well. Readings count from their arrival here.
 from __future__ import annotations
 
 import base64
-import binascii
 import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -35,6 +34,12 @@ SILENT_S = 3.0
 PICTURE_S = 2.0
 """Longest wait for one picture."""
 
+JPEG = b"\xff\xd8"
+"""Beginning of every JPEG."""
+
+CAMERAS_MAX = 16
+"""Most cameras that are recorded of one robot."""
+
 LEASE_S = 2.0
 """Time of the lease on a robot whose policy was started from here."""
 
@@ -51,13 +56,17 @@ class FarTask:
 
     Attributes:
         error: why it failed; empty while it has not.
-        voided: the robot was stopped or locked meanwhile.
+        voided: the robot was stopped or locked meanwhile, or nobody knows how its policy ended.
+        halted: it was stopped by others, as an event told.
+        stopped_by: the reason of that stop, once it is known.
+        halting: it is halted from here.
     """
 
     def __init__(self) -> None:
-        self.error = ""
-        self.voided = False
-        self._over = threading.Event()
+        self.error = self.stopped_by = ""
+        self.voided = self.halting = False
+        self.halted = threading.Event()
+        self._over, self._ending = threading.Event(), threading.Lock()
 
     @property
     def running(self) -> bool:
@@ -66,9 +75,10 @@ class FarTask:
 
     def end(self, error: str = "", *, voided: bool = False) -> None:
         """Note the end; the first one counts."""
-        if self.running:
-            self.error, self.voided = error, voided
-            self._over.set()
+        with self._ending:
+            if self.running:
+                self.error, self.voided = error, voided
+                self._over.set()
 
 
 class FarRobot:
@@ -97,8 +107,6 @@ class FarRobot:
         self.remote = robots[part] if part else world
         self.networks, self._part, self._policy, self._task = networks, part, policy, task
         self._cameras = _cameras_of(world, part, cameras)
-        self._stopped_by = ""
-        self._halting, self._halted = False, threading.Event()
         self._attempt: FarTask | None = None
         self._recorder: Recorder | None = None
 
@@ -120,12 +128,14 @@ class FarRobot:
     @property
     def stopped(self) -> bool:
         """True where others stopped or locked it in this attempt."""
-        return bool(self._stopped_by)
+        task = self._attempt
+        return task is not None and (bool(task.stopped_by) or task.halted.is_set())
 
     @property
     def stopped_by(self) -> str:
         """The reason of the stop; empty while there was none."""
-        return self._stopped_by
+        task = self._attempt
+        return "" if task is None or not self.stopped else task.stopped_by or f"{self.name} was stopped."
 
     def begin(self, seconds: float | None) -> FarTask:
         """Begin an attempt, and start the policy where it has one.
@@ -133,8 +143,10 @@ class FarRobot:
         Raises:
             CliError: the robot refused it.
         """
-        self._stopped_by, self._halting = "", False
-        self._halted.clear()
+        if self._policy and seconds is None and not self.remote.has_lease:
+            raise CliError(
+                f"--episode-s is needed: {self.name} has no control lease, and would not halt where this is killed."
+            )
         task = self._attempt = FarTask()
         if self._policy:
             duration = min(seconds or DURATION_MAX_S, DURATION_MAX_S)
@@ -143,25 +155,27 @@ class FarRobot:
                     self._starts(), instruction=self._task, policy_provider=self._policy, duration=duration
                 )
             except RefusalError as refused:
-                task.end(said(refused))
+                why = said(refused)
+                task.end(why)
                 if isinstance(refused, NoAnswerError | UnreachableError):
                     # It may have begun all the same.
-                    self.remote.halt("its start was not answered")
-                raise CliError(said(refused)) from refused
+                    verdict = self.remote.halt("its start was not answered")
+                    why += "" if verdict.stopped else f" {self.name} did not confirm its stop and may move."
+                raise CliError(why) from refused
         threading.Thread(target=self._watch, args=(task,), name=f"attempt {self.name}", daemon=True).start()
         return task
 
     def halt(self, reason: str) -> StopVerdict:
         """Halt it at the end of an attempt."""
-        self._halting = True
         if self._attempt is not None:
+            self._attempt.halting = True
             self._attempt.end()
         return self.remote.halt(reason)
 
     def hold(self, screen: Screen) -> None:
         """Tell who stopped it; its own process keeps it on the network."""
-        screen.say(f"Stopped: {self._stopped_by}", "bold red")
-        screen.data({"event": "held", "peer_id": self.name, "stopped_by": self._stopped_by})
+        screen.say(f"Stopped: {self.stopped_by}", "bold red")
+        screen.data({"event": "held", "peer_id": self.name, "stopped_by": self.stopped_by})
 
     @contextmanager
     def held(self) -> Iterator[None]:
@@ -203,31 +217,40 @@ class FarRobot:
         named = event.payload.get(ROBOT_NAME)
         if self._part and named not in (None, "", self._part):
             return
-        if event.name in _ENDS and self._attempt is not None and not self._halting:
-            self._ended(self._attempt, event.payload)
+        task = self._attempt
+        if event.name in _ENDS and task is not None and not task.halting:
+            self._ended(task, event.payload)
         recorder.take(self.name, event.name, event.payload)
 
     def _ended(self, task: FarTask, payload: Mapping[str, Any]) -> None:
         """Note the end of a motion of the robot."""
-        if payload.get("state") == "stopped":
+        state = payload.get("state")
+        if state == "stopped":
             # Whether it is locked as well is asked on another thread: this one is the network's.
-            self._halted.set()
+            task.halted.set()
         elif self._policy:
-            task.end(str(payload.get("error") or ""))
+            failed = "" if state in (None, "", "completed") else f"its policy ended as {shown(state)}"
+            task.end(str(payload.get("error") or failed))
 
     def _stopped(self, task: FarTask, status: Mapping[str, Any]) -> None:
         """End an attempt at a robot that others stopped."""
         locked = status.get("locked") is True
-        self._stopped_by = f"{self.name} is locked by an emergency stop." if locked else f"{self.name} was stopped."
+        task.stopped_by = f"{self.name} is locked by an emergency stop." if locked else f"{self.name} was stopped."
         if locked and self._recorder is not None:
-            self._recorder.take(self.name, "locked", {"reason": self._stopped_by})
+            self._recorder.take(self.name, "locked", {"reason": task.stopped_by})
         task.end(voided=True)
 
     def _watch(self, task: FarTask) -> None:
-        """Look at the robot until the attempt is over."""
+        """Look at the robot until the attempt is over; what goes wrong here ends it."""
+        try:
+            self._look(task)
+        except Exception as exc:  # noqa: BLE001 - the status is a stranger's; unwatched, a stop would go unseen
+            task.end(f"{self.name} can be watched no more: {type(exc).__name__}: {exc}")
+
+    def _look(self, task: FarTask) -> None:
         answered, ran = time.monotonic(), False
         while True:
-            halted = self._halted.wait(LOOK_S)
+            halted = task.halted.wait(LOOK_S)
             if not task.running:
                 return
             try:
@@ -238,12 +261,14 @@ class FarRobot:
                 elif time.monotonic() - answered > SILENT_S:
                     task.end(f"{self.name} is out of reach: {said(silent)}")
                 continue
+            if task.halting or task is not self._attempt:
+                return
             answered, now = time.monotonic(), runs(status, self._part)
             if halted or status.get("locked") is True:
                 self._stopped(task, status)
-            elif self._policy and ran and not now and not self._halted.wait(LOOK_S):
-                # A network that tells no ends of tasks.
-                task.end()
+            elif self._policy and ran and not now and not task.halted.wait(LOOK_S):
+                # A network that tells no ends of tasks: nobody knows whether it is a good one.
+                task.end(voided=True)
             ran = ran or now
 
     def _take_pictures(self, recorder: Recorder, camera: str, fps: int, over: threading.Event) -> None:
@@ -256,8 +281,8 @@ class FarRobot:
                 answer = self.remote.call(
                     "getPicture", camera=camera, width=PICTURE_WIDTH, height=PICTURE_HEIGHT, timeout=PICTURE_S
                 )
-                jpeg = base64.b64decode(str(answer.get("jpeg", "")), validate=True)
-            except (RefusalError, binascii.Error) as failed:
+                jpeg = _jpeg_of(answer)
+            except (RefusalError, ValueError) as failed:
                 recorder.take(self.name, "notRecorded", {"what": f"pictures of {camera}", "error": str(failed)[:200]})
                 over.wait(LOOK_S)
             else:
@@ -267,6 +292,14 @@ class FarRobot:
     def _starts(self) -> str:
         verbs = self.remote.verbs
         return next((verb for verb in ("start", "execute") if verb in verbs), "execute")
+
+
+def _jpeg_of(answer: Mapping[str, Any]) -> bytes:
+    """Return the picture of an answer; raise ValueError where it is none."""
+    jpeg = base64.b64decode(str(answer.get("jpeg", "")), validate=True)
+    if not jpeg.startswith(JPEG):
+        raise ValueError("its answer is no JPEG")
+    return jpeg
 
 
 def _cameras_of(remote: RemoteRobot, part: str, names: Sequence[str] | None) -> tuple[str, ...]:
@@ -283,7 +316,9 @@ def _cameras_of(remote: RemoteRobot, part: str, names: Sequence[str] | None) -> 
         raise RobotError("Its list of cameras cannot be read", robot=remote.id, verb="listCameras")
     if names is None:
         own = [name for name in listed if (name.startswith(f"{part}/") if part else "/" in name)]
-        return tuple(own or ([OVERVIEW] if OVERVIEW in listed else listed))
+        return tuple((own or ([OVERVIEW] if OVERVIEW in listed else listed))[:CAMERAS_MAX])
+    if not 0 < len({name.replace("/", ".") for name in names}) == len(names) <= CAMERAS_MAX:
+        raise ValidationError(f"--cameras must name 1 to {CAMERAS_MAX} different cameras, or be {NO_CAMERAS}.")
     if unknown := [name for name in names if name not in listed]:
         raise ValidationError(f"--cameras must be of {', '.join(listed) or 'none'}, not {', '.join(unknown)}.")
     return tuple(names)
