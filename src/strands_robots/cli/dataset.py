@@ -98,6 +98,7 @@ def record(
     asked = screen.live and sys.stdin.isatty()
     if not asked and longest is None:
         raise ValidationError("--episode-s is needed without a terminal: nobody says when an attempt is over.")
+    keys = Keys() if asked else None
     names = None if cameras is None else [name for name in cameras.split(",") if name]
     if leader is None or leader == PAGE:
         given = (follower_id, calibration, leader_id, leader_calibration, peer_id)
@@ -105,11 +106,9 @@ def record(
             raise ValidationError(
                 f"--policy and --leader {PAGE} go with a served robot, and without options of an arm."
             )
-        made = partial(Attempts, episodes, fps=fps, seconds=longest, pause_s=pause_s, success=success)
         with served_robot(screen, network, robot, policy or "", task, names) as far:
-            _record_served(
-                screen, folder, far, task, made(begin=partial(far.begin, longest), keys=Keys() if asked else None)
-            )
+            attempts = Attempts(episodes, partial(far.begin, longest), fps, longest, pause_s, success, keys)
+            _record_served(screen, folder, far, task, attempts)
         return
     if leader.startswith(MESH_PREFIX) or robot.startswith(MESH_PREFIX):
         raise ValidationError(
@@ -120,7 +119,7 @@ def record(
     manual, arm = leader in MANUAL, arm_options("", follower_id, calibration)
     options = TeleopOptions(leader if manual else "arm")
     kind, of_leader = robot.partition("@")[0], arm_options("", leader_id, leader_calibration)
-    keys, turn = Keys(leads=leader == "keyboard") if asked else None, ExitStack()
+    turn = ExitStack()
 
     def connected() -> AbstractContextManager[Any]:
         return connected_leader(leader, led.robot, of_leader, (lambda key: None) if keys is None else keys.pressed)
@@ -141,7 +140,7 @@ def record(
             source: Any = turn.enter_context(connected()) if manual else lasting
             if manual:
                 announce(screen, leader, robot, source)
-            if keys is not None and keys.leads:
+            if keys is not None and leader == "keyboard":
                 keys.leading = True
                 turn.callback(setattr, keys, "leading", False)
             if recorded:
@@ -190,14 +189,19 @@ def served_robot(  # noqa: PLR0917 - one robot, and what is asked of it
     from strands_robots.cli.far_recording import FarRobot  # noqa: PLC0415 - loaded when a network is used
     from strands_robots.fleet import Fleet  # noqa: PLC0415 - as above
 
-    peer, _, part = robot.partition("/")
-    identifier("--robot", peer)
+    peer, part = _served_name(robot)
     with network.joined(stays=True) as there:
         there.settled()
         say_missing(screen, there)
         with answering(there, peer, ""):
             far = FarRobot(Fleet(there)[peer], there, part, policy, task, cameras)
         yield far
+
+
+def _served_name(robot: str) -> tuple[str, str]:
+    """Split ``ID`` or ``WORLD/ROBOT``."""
+    peer, _, part = robot.partition("/")
+    return identifier("--robot", peer), part
 
 
 def from_mcap(
@@ -297,8 +301,7 @@ def _joints_of(network: Network, robot: str) -> RobotJoints:
             return RobotJoints.of(robot, made.get_features())
         finally:
             made.cleanup()
-    peer, _, part = robot.partition("/")
-    identifier("--robot", peer)
+    peer, part = _served_name(robot)
     with network.joined() as there, answering(there, peer, ""):
         return RobotJoints.of(robot, Fleet(there)[peer].features(), part)
 

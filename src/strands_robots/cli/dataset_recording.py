@@ -49,13 +49,11 @@ class Keys:
 
     Args:
         fd: of the terminal; standard input by default.
-        leads: a keyboard leads in each attempt; then its keys come by :meth:`pressed`, and no line is read.
     """
 
-    def __init__(self, fd: int | None = None, *, leads: bool = False) -> None:
-        self.leads = leads
+    def __init__(self, fd: int | None = None) -> None:
         self.leading = False
-        """True while a keyboard leads."""
+        """True while a keyboard leads: its keys come by :meth:`pressed`, and no line is read."""
         self._fd = sys.stdin.fileno() if fd is None else fd
         self._words: deque[Said] = deque()
         self._line = b""

@@ -21,7 +21,7 @@ from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.remote_robot import ROBOT_NAME, RemoteRobot
 from strands_robots.fleet.reports import runs, said
 from strands_robots.recording.cameras import OVERVIEW
-from strands_robots.recording.file import STEP, Recorder
+from strands_robots.recording.file import STEP, Recorder, beats
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.utils import DURATION_MAX_S, ValidationError, shown
 
@@ -121,11 +121,6 @@ class FarRobot:
         return self.remote.model or self.remote.type or "unknown"
 
     @property
-    def cameras(self) -> tuple[str, ...]:
-        """The cameras whose pictures are taken."""
-        return self._cameras
-
-    @property
     def stopped(self) -> bool:
         """True where others stopped or locked it in this attempt."""
         task = self._attempt
@@ -151,9 +146,9 @@ class FarRobot:
         if self._policy:
             duration = min(seconds or DURATION_MAX_S, DURATION_MAX_S)
             try:
-                self.remote.call(
-                    self._starts(), instruction=self._task, policy_provider=self._policy, duration=duration
-                )
+                # By its name on the network that motions go to.
+                starts = self.networks.of(self.name, moves=True).starts
+                self.remote.call(starts, instruction=self._task, policy_provider=self._policy, duration=duration)
             except RefusalError as refused:
                 why = said(refused)
                 task.end(why)
@@ -273,8 +268,7 @@ class FarRobot:
 
     def _take_pictures(self, recorder: Recorder, camera: str, fps: int, over: threading.Event) -> None:
         """Ask for a picture at each beat; the ages tell of a gap."""
-        began, beat = time.monotonic(), 0
-        while not over.wait(max(0.0, began + beat / fps - time.monotonic())):
+        for _ in beats(fps, over):
             # The picture is no older than its request.
             asked = time.time()
             try:
@@ -287,11 +281,6 @@ class FarRobot:
                 over.wait(LOOK_S)
             else:
                 recorder.take_picture(self.name, camera.replace("/", "."), jpeg, asked)
-            beat = max(beat + 1, int((time.monotonic() - began) * fps))
-
-    def _starts(self) -> str:
-        verbs = self.remote.verbs
-        return next((verb for verb in ("start", "execute") if verb in verbs), "execute")
 
 
 def _jpeg_of(answer: Mapping[str, Any]) -> bytes:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from strands_robots.datasets import tables
 from strands_robots.datasets.check import DatasetFinding, check_dataset
 from strands_robots.datasets.layout import DatasetError, DatasetInfo, data_file, episodes_file, video_file
-from strands_robots.datasets.recorded import ACTION, AGE, INTERVENTION, STATE, STOP, SUCCESS
+from strands_robots.datasets.recorded import ACTION, AGE, EMERGENCY, INTERVENTION, STATE, STOP, STOPPED, SUCCESS
 from strands_robots.datasets.video import pictures_of
 from strands_robots.utils import ValidationError, optional_module, whole
 
@@ -43,7 +43,7 @@ PICTURE_WIDTH = 160
 
 _WIDTH, _HEIGHT = 320, 84
 
-STOPS = {1: "stopped", 2: "emergency stop", 3: "refused while locked"}
+STOPS = {STOPPED: "stopped", EMERGENCY: "emergency stop", 3: "refused while locked"}
 """Values of the feature ``stop`` in words."""
 
 _STYLE = """
@@ -53,7 +53,7 @@ _STYLE = """
 --action:#f0a070;--stop:#ff6b74;--led:#b78ae655}}
 body{margin:0 auto;max-width:72rem;padding:1rem;background:var(--back);color:var(--text);
 font:15px/1.45 system-ui,sans-serif}
-h1{font-size:1.3rem}h2{font-size:1.05rem;margin-top:1.6rem}p,li{color:var(--soft)}
+h1{font-size:1.3rem}p,li{color:var(--soft)}
 .wide{overflow-x:auto}table{border-collapse:collapse;width:100%}th,td{text-align:left;padding:.25rem .6rem;
 border-bottom:1px solid var(--line);font-variant-numeric:tabular-nums;vertical-align:top}
 .plots{display:grid;grid-template-columns:repeat(auto-fill,minmax(15rem,1fr));gap:.8rem}
@@ -102,12 +102,13 @@ def dataset_page(folder: Path, episodes: Sequence[int] | None = None) -> str:
     info, found = check_dataset(folder)
     drawn = _chosen(info, episodes)
     listed = [_read(folder, number) for number in range(min(info.episodes, LISTED_MAX))]
+    read = [listed[number] if number < len(listed) else _read(folder, number) for number in drawn]
     facts = f"Episodes: {info.episodes}, frames: {info.frames} at {info.fps} a second. Robot: {info.robot_type}."
     parts = [
         f"<h1>{escape(folder.name)}</h1><p>{escape(facts)}</p>",
         *_findings(found),
         *_list(info, listed),
-        *(part for number in drawn for part in _drawn(folder, info, _read(folder, number))),
+        *(part for each in read for part in _drawn(folder, info, each)),
     ]
     policy = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
     return (
@@ -177,7 +178,7 @@ def _drawn(folder: Path, info: DatasetInfo, episode: _Episode) -> Iterator[str]:
         return
     title = f"Episode {episode.number}: {episode.task}, {episode.count / info.fps:.1f} s"
     yield f"<details{' open' if episode.number == 0 else ''}><summary><strong>{escape(title)}</strong></summary>"
-    yield '<p><span class="legend">Line: state. Dashed: action. Red: a stop. Shaded: led by a person.</span></p>'
+    yield "<p>Line: state. Dashed: action. Red: a stop. Shaded: led by a person.</p>"
     yield '<div class="plots">'
     for name in info.features[STATE].names if STATE in info.features else ():
         state, action = (_joint(info, episode, key, name) for key in (STATE, ACTION))

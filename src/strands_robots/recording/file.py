@@ -431,6 +431,17 @@ def _mcap() -> Any:
     return optional_module("mcap.writer", what="Recording", extra="record")
 
 
+def beats(hz: float, over: threading.Event, missed: Callable[[int], None] = lambda count: None) -> Iterator[None]:
+    """Yield at each beat until ``over`` is set; tell how many were missed meanwhile."""
+    started, tick = time.monotonic(), 0
+    while not over.wait(max(0.0, started + tick / hz - time.monotonic())):
+        yield
+        due = max(tick + 1, int((time.monotonic() - started) * hz))
+        if due > tick + 1:
+            missed(due - tick - 1)
+        tick = due
+
+
 class RobotRecording:
     """Samples a robot into ``recorder`` while it is entered as a context.
 
@@ -503,13 +514,8 @@ class RobotRecording:
         self._recorder.take(self._device, event, payload)
 
     def _paced(self, source: str, hz: float, sample: Callable[[], None]) -> None:
-        started, tick = time.monotonic(), 0
-        while not self._stopping.wait(max(0.0, started + tick / hz - time.monotonic())):
+        for _ in beats(hz, self._stopping, lambda count: self.skipped.update({source: count})):
             self._attempt(source, sample)
-            due = max(tick + 1, int((time.monotonic() - started) * hz))
-            if due > tick + 1:
-                self.skipped[source] += due - tick - 1
-            tick = due
 
     def _attempt(self, source: str, sample: Callable[[], None]) -> None:
         try:
