@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from strands_robots.bounded_json import json_object
 from strands_robots.datasets import statistics, tables
 from strands_robots.datasets.layout import (
+    CAMERAS,
     DATA_PATH,
     EPISODES_PATH,
     INFO,
@@ -338,8 +339,10 @@ class Dataset:
         yield from (self.folder / "meta").glob(".*.part")
 
     def _unsaved(self) -> Iterator[Path]:
-        """Yield what is half made of an episode, without its recording."""
-        return (path for path in tables.files_in(self.running) if path.suffix != RECORDING)
+        """Yield what is half made of an episode, without its recording and cameras."""
+        for path in tables.files_in(self.running):
+            if path.suffix != RECORDING and path.parent.suffix != CAMERAS:
+                yield path
 
     def _remove(self, paths: Iterator[Path], *, told: bool = False) -> None:
         for path in paths:

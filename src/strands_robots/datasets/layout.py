@@ -28,6 +28,9 @@ DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 EPISODES_PATH = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 
+CAMERAS = ".cameras"
+"""Suffix of the folder with the videos of a running attempt, beside its recording."""
+
 DTYPES = ("float32", "float64", "int64", "bool", "video")
 FEATURES_MAX, WIDTH_MAX = 500, 10_000
 """Most features, and most numbers of one."""

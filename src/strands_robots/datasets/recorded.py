@@ -6,7 +6,6 @@ put on the grid of the dataset: a frame has what was newest at its moment, and h
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -16,9 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from strands_robots.datasets.encoded import EncodedVideo, common_moments
 from strands_robots.datasets.episodes import FRAMES_MAX, Dataset, DatasetEpisode
-from strands_robots.datasets.layout import DatasetError, DatasetInfo, Feature
-from strands_robots.datasets.video import Video, VideoWriter
+from strands_robots.datasets.layout import DatasetInfo, Feature
+from strands_robots.datasets.video import Video, VideoWriter, decoded
 from strands_robots.policies.base import numbers
 from strands_robots.recording.file import STEP, RecordedEvent, RecordedItem, RecordedPicture, read_items
 from strands_robots.utils import ValidationError, shown
@@ -48,7 +48,7 @@ class Attempt:
     """One task of a robot as it was recorded.
 
     ``steps`` are moments in seconds, observations and actions by name; ``pictures`` moments and JPEG by camera.
-    ``person`` is True where a person led.
+    ``person`` is True where a person led; ``videos`` are by camera, where its pictures were encoded as they came.
     """
 
     instruction: str = ""
@@ -56,6 +56,7 @@ class Attempt:
     pictures: dict[str, list[tuple[float, bytes]]] = field(default_factory=dict)
     stops: list[tuple[float, int]] = field(default_factory=list)
     person: bool = False
+    videos: Mapping[str, EncodedVideo] = field(default_factory=dict)
 
 
 def attempts_of(path: Path, robot: str | None = None) -> list[Attempt]:
@@ -154,10 +155,12 @@ def info_of(attempts: Sequence[Attempt], fps: int, robot_type: str) -> DatasetIn
         STOP: Feature("int64"),
         INTERVENTION: Feature("bool"),
     }
-    for camera in sorted(first.pictures):
-        if any(not each.pictures.get(camera) for each in attempts):
+    for camera in sorted({*first.pictures, *first.videos}):
+        if any(camera not in each.videos and not each.pictures.get(camera) for each in attempts):
             raise ValidationError(f"camera {camera} has no picture of one of the attempts.")
-        features[f"{IMAGES}{camera}"] = Feature("video", decoded(first.pictures[camera][0][1]).shape)
+        video = first.videos.get(camera)
+        shape = (video.height, video.width, 3) if video else decoded(first.pictures[camera][0][1]).shape
+        features[f"{IMAGES}{camera}"] = Feature("video", shape)
         features[f"{AGE}{camera}"] = Feature("float32")
         features[f"{SAME}{camera}"] = Feature("bool")
     return DatasetInfo(fps, features, robot_type)
@@ -180,12 +183,8 @@ def save_attempt(dataset: Dataset, attempt: Attempt, task: str, *, success: bool
         DatasetError: it cannot be written.
     """
     steps, fps = attempt.steps, dataset.info.fps
-    began = steps[0][0]
-    # Times are kept in nanoseconds, and a step belongs to the frame that it comes with.
-    count = int((steps[-1][0] - began) * fps + 1e-3) + 1
-    if count > FRAMES_MAX:
-        raise ValidationError(f"an episode must have 1 to {FRAMES_MAX:,} frames, not {count:,}.")
-    moments = began + np.arange(count) / fps
+    moments = moments_of(attempt, fps)
+    count = len(moments)
     newest = _newest(moments, [at for at, _, _ in steps])
     state, action = (dataset.info.features[name].names for name in (STATE, ACTION))
     told = _told(steps)
@@ -200,23 +199,32 @@ def save_attempt(dataset: Dataset, attempt: Attempt, task: str, *, success: bool
     videos: dict[str, Video] = {}
     for name in dataset.info.videos:
         camera = name.removeprefix(IMAGES)
+        if (encoded := attempt.videos.get(camera)) is not None:
+            videos[name], rows = encoded.cut(dataset.running / f"{camera}.mp4", moments, fps)
+            columns[f"{AGE}{camera}"] = np.maximum(moments - rows["at"], 0) * 1000
+            columns[f"{SAME}{camera}"] = (rows["same"] > 0) & (np.arange(count) > 0)
+            continue
         videos[name] = _encoded(dataset, attempt.pictures.get(camera, []), camera, moments, columns)
     return dataset.save(DatasetEpisode(task or attempt.instruction or "unnamed", columns, videos))
 
 
-def decoded(jpeg: bytes) -> NDArray[np.uint8]:
-    """Return the pixels of a JPEG, RGB in ``(height, width, 3)``.
+def moments_of(attempt: Attempt, fps: int) -> NDArray[np.float64]:
+    """Return the moments of an attempt's frames, in seconds since the epoch.
+
+    Where its cameras were encoded as they came, those of which each has a picture; there may be none.
 
     Raises:
-        DatasetError: it is none, or larger than a camera's.
+        ValidationError: they are too many.
     """
-    from PIL import Image, UnidentifiedImageError  # noqa: PLC0415 - an extra
-
-    try:
-        with Image.open(io.BytesIO(jpeg), formats=["JPEG"]) as image:
-            return np.asarray(image.convert("RGB"))
-    except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as exc:
-        raise DatasetError(f"a picture cannot be decoded: {exc}") from exc
+    first, last = attempt.steps[0][0], attempt.steps[-1][0]
+    if attempt.videos:
+        moments = common_moments(attempt.videos, first, last, fps)
+    else:
+        # Times are kept in nanoseconds, and a step belongs to the frame that it comes with.
+        moments = first + np.arange(min(int((last - first) * fps + 1e-3), FRAMES_MAX) + 1) / fps
+    if len(moments) > FRAMES_MAX:
+        raise ValidationError(f"an episode must have 1 to {FRAMES_MAX:,} frames.")
+    return moments
 
 
 def _encoded(

@@ -1,19 +1,29 @@
 """Attempts of one robot, recorded into a dataset one after another.
 
-The running attempt is a recording (MCAP) inside the dataset's folder, whole to its last second whenever the process
-ends. It becomes an episode when it is kept; one that a killed process left becomes one when the next session begins.
+The running attempt is a recording (MCAP) and the videos of its cameras inside the dataset's folder, whole to their last
+second whenever the process ends. It becomes an episode when it is kept; one that a killed process left becomes one when
+the next session begins.
 """
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Self
 
+from strands_robots.datasets.encoded import cameras_folder, encoded_videos
 from strands_robots.datasets.episodes import RECORDING, RUNNING, Dataset, DatasetHold
-from strands_robots.datasets.layout import INFO, DatasetInfo, read_info
-from strands_robots.datasets.recorded import Attempt, attempts_in, info_of, save_attempt
+from strands_robots.datasets.layout import CAMERAS, INFO, DatasetError, DatasetInfo, read_info
+from strands_robots.datasets.recorded import IMAGES, Attempt, attempts_in, info_of, moments_of, save_attempt
 from strands_robots.utils import ValidationError, text, whole
+
+ATTEMPT, ASIDE = "attempt", "aside"
+"""Names of a running attempt, and of one that is no episode and was moved aside."""
+
+
+class NoPictureError(DatasetError):
+    """An attempt that lacks the pictures of a camera; its recording was moved aside."""
 
 
 class RecordingSession:
@@ -72,24 +82,45 @@ class RecordingSession:
             Its index, and the number of its frames; None for an attempt without a step, which is removed.
 
         Raises:
+            NoPictureError: a camera of the dataset has no picture of it; its recording was moved aside.
             ValidationError: it is of another kind than the dataset; its recording is still there.
             DatasetError: it cannot be written; its recording is still there.
         """
         recording = self.recording
         attempts = attempts_in(recording, whole=True) if recording.exists() else []
         if not attempts:
-            recording.unlink(missing_ok=True)
+            _remove(recording)
             return None
         attempt = max(attempts, key=lambda each: len(each.steps))
+        attempt.videos = encoded_videos(recording, self._fps)
+        if lacking := self._lacking(attempt):
+            aside = self._move_aside(recording)
+            raise NoPictureError(f"the attempt has no picture of {lacking}: it is no episode, and was moved to {aside}")
         dataset = self._dataset_for(attempt)
         before = dataset.info.frames
         index = save_attempt(dataset, attempt, self._task, success=success)
-        recording.unlink()
+        _remove(recording)
         return index, dataset.info.frames - before
 
     def discard(self) -> None:
         """Remove the recorded attempt."""
-        self.recording.unlink(missing_ok=True)
+        _remove(self.recording)
+
+    def _lacking(self, attempt: Attempt) -> str:
+        """Return the cameras without a picture of an attempt; empty for none."""
+        known = () if self._dataset is None else self._dataset.info.videos
+        cameras = [name.removeprefix(IMAGES) for name in known]
+        lacking = [each for each in cameras if each not in attempt.videos and not attempt.pictures.get(each)]
+        return ", ".join(lacking) or ("" if len(moments_of(attempt, self._fps)) else "all cameras at one moment")
+
+    def _move_aside(self, recording: Path) -> Path:
+        number = 0
+        while (aside := recording.with_name(f"{ASIDE}-{number:06d}{RECORDING}")).exists():
+            number += 1
+        if (videos := cameras_folder(recording)).is_dir():
+            videos.replace(cameras_folder(aside))
+        recording.replace(aside)
+        return aside
 
     def _open(self) -> None:
         if not (self.folder / INFO).is_file():
@@ -101,19 +132,26 @@ class RecordingSession:
     def _recording(self, episode: int) -> Path:
         running = self.folder / RUNNING
         running.mkdir(exist_ok=True)
-        return running / f"attempt-{episode:06d}{RECORDING}"
+        return running / f"{ATTEMPT}-{episode:06d}{RECORDING}"
 
     def _mend(self) -> None:
         """Make an episode of the attempt that a killed process left."""
         current = self.recording
-        for left in sorted(current.parent.glob(f"*{RECORDING}")):
+        for left in sorted(current.parent.glob(f"{ATTEMPT}-*{RECORDING}")):
             if left != current:
                 # Its episode was saved; the process was killed before it removed this.
-                left.unlink()
+                _remove(left)
                 self._tell(f"{left.name} is of an episode that was saved, and is removed.")
+        for videos in current.parent.glob(f"{ATTEMPT}-*{CAMERAS}"):
+            if not videos.with_suffix(RECORDING).exists():
+                shutil.rmtree(videos)
         if not current.exists():
             return
-        kept = self.keep(success=False)
+        try:
+            kept = self.keep(success=False)
+        except NoPictureError as lacking:
+            self._tell(f"{lacking}.")
+            return
         if kept is None:
             self._tell("The attempt that was running has no whole second, and is removed.")
         else:
@@ -138,3 +176,9 @@ class RecordingSession:
         self._dataset = dataset
         for said in dataset.mended:
             self._tell(f"{said}.")
+
+
+def _remove(recording: Path) -> None:
+    """Remove a recording, and then the videos beside it: without it they are nothing."""
+    recording.unlink(missing_ok=True)
+    shutil.rmtree(cameras_folder(recording), ignore_errors=True)

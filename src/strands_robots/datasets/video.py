@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 from typing import Any, Self, cast
 
@@ -22,6 +25,12 @@ CODECS = {
 
 FIRST, EACH = 100, 10
 """Pictures that all count in the statistics; of the later ones, each so many."""
+
+GROUP = 2
+"""Pictures from one key picture to the next, from which one that is asked for by its time is decoded."""
+
+_LIVE = {"movflags": "frag_keyframe+empty_moov+default_base_moof", "flush_packets": "1"}
+"""Options of a file that is readable up to its last group whenever its writer ends."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,13 +55,17 @@ class VideoWriter:
         width: in pixels; even.
         height: in pixels; even.
         codec: of :data:`CODECS`.
+        live: readable up to its last groups whenever the process ends, with a key picture at each even one; encoded
+            on one thread.
 
     Raises:
         MissingExtraError: the [dataset] extra is not installed.
         ValidationError: a value outside its domain.
     """
 
-    def __init__(self, path: Path, fps: int, width: int, height: int, codec: str = "h264") -> None:
+    def __init__(
+        self, path: Path, fps: int, width: int, height: int, codec: str = "h264", *, live: bool = False
+    ) -> None:
         av = _pyav()
         for name, side in (("width", width), ("height", height)):
             if whole(name, side, low=2, high=16_384) % 2:
@@ -61,10 +74,15 @@ class VideoWriter:
         self.path, self._shape, self._codec, self._fps = path, (height, width, 3), codec, fps
         path.parent.mkdir(parents=True, exist_ok=True)
         self._statistics, self._count, self._av = PictureStatistics(), 0, av
-        self._file = av.open(str(path), "w", format="mp4")
-        # A picture that is asked for by its time is decoded from its nearest key picture: each second one is.
-        self._stream = cast("Any", self._file.add_stream(encoder, rate=fps, options={**options, "g": "2", "bf": "0"}))
+        self._frame: Any = None
+        self._file = av.open(str(path), "w", format="mp4", options=_LIVE if live else {})
+        options = {**options, "g": str(GROUP), "bf": "0"}
+        if live and encoder == "libx264":
+            options["sc_threshold"] = "0"  # a change of scene would begin a group at an odd picture
+        self._stream = cast("Any", self._file.add_stream(encoder, rate=fps, options=options))
         self._stream.width, self._stream.height, self._stream.pix_fmt = width, height, "yuv420p"
+        if live:
+            self._stream.codec_context.thread_count = 1
 
     def __enter__(self) -> Self:
         return self
@@ -83,10 +101,18 @@ class VideoWriter:
             raise ValidationError(f"picture must be uint8 of {self._shape}, not {picture.dtype} of {picture.shape}.")
         if self._count < FIRST or self._count % EACH == 0:
             self._statistics.add(picture)
-        frame = self._av.VideoFrame.from_ndarray(picture, format="rgb24")
-        frame.pts = self._count
-        self._mux(frame)
-        self._count += 1
+        self._frame = self._av.VideoFrame.from_ndarray(picture, format="rgb24")
+        self._encode()
+
+    def repeat(self) -> None:
+        """Encode the picture before once more, which costs less than a new one.
+
+        Raises:
+            DatasetError: there is none, or it cannot be written.
+        """
+        if self._frame is None:
+            raise DatasetError(f"{self.path.name} has no picture")
+        self._encode()
 
     def finish(self) -> Video:
         """Write what is still encoded, and return the video once it is on the disk.
@@ -102,17 +128,8 @@ class VideoWriter:
             sync(self.path)
         except (OSError, self._av.FFmpegError) as exc:
             raise DatasetError(f"{self.path} cannot be written: {exc}") from exc
-        height, width, channels = self._shape
-        about = {
-            "video.height": height,
-            "video.width": width,
-            "video.codec": self._codec,
-            "video.pix_fmt": "yuv420p",
-            "video.is_depth_map": False,
-            "video.fps": self._fps,
-            "video.channels": channels,
-            "has_audio": False,
-        }
+        height, width, _ = self._shape
+        about = about_video(width, height, self._fps, self._codec)
         return Video(self.path, self._count, self._statistics.result(), about)
 
     def discard(self) -> None:
@@ -121,6 +138,11 @@ class VideoWriter:
             self._file.close()
         except (OSError, self._av.FFmpegError, ValueError):
             return
+
+    def _encode(self) -> None:
+        self._frame.pts = self._count
+        self._mux(self._frame)
+        self._count += 1
 
     def _mux(self, frame: Any) -> None:
         try:
@@ -144,6 +166,89 @@ def pictures_of(path: Path) -> Iterator[NDArray[np.uint8]]:
                 yield np.asarray(frame.to_ndarray(format="rgb24"), dtype=np.uint8)
     except (OSError, av.FFmpegError, IndexError) as exc:
         raise DatasetError(f"{shown(str(path))} cannot be read: {exc}") from exc
+
+
+def about_video(width: int, height: int, fps: int, codec: str = "h264") -> dict[str, Any]:
+    """Return what LeRobot states of a video in ``info.json``."""
+    return {
+        "video.height": height,
+        "video.width": width,
+        "video.codec": codec,
+        "video.pix_fmt": "yuv420p",
+        "video.is_depth_map": False,
+        "video.fps": fps,
+        "video.channels": 3,
+        "has_audio": False,
+    }
+
+
+@dataclass(frozen=True, slots=True)
+class EncodedPictures:
+    """Encoded pictures of a video; a copy may begin with one of ``keys``."""
+
+    width: int
+    height: int
+    keys: list[bool]
+
+
+def encoded_pictures(path: Path) -> EncodedPictures | None:
+    """Return the encoded pictures of a video; None where it has none.
+
+    A cut file has those before the cut, the last of them damaged.
+
+    Raises:
+        MissingExtraError: the [dataset] extra is not installed.
+    """
+    av = _pyav()
+    keys: list[bool] = []
+    with suppress(OSError, av.FFmpegError, IndexError), av.open(str(path)) as file:
+        context = file.streams.video[0].codec_context
+        width, height = context.width, context.height
+        keys.extend(bool(packet.is_keyframe) for packet in file.demux(video=0) if packet.size)
+    return EncodedPictures(width, height, keys) if keys else None
+
+
+def copy_pictures(path: Path, target: Path, first: int, count: int, fps: int) -> None:
+    """Copy ``count`` pictures of a video without encoding them anew.
+
+    ``first`` is a key picture.
+
+    Raises:
+        DatasetError: it has fewer, or the copy cannot be written.
+        MissingExtraError: the [dataset] extra is not installed.
+    """
+    av, copied = _pyav(), 0
+    try:
+        with av.open(str(path)) as file, av.open(str(target), "w", format="mp4") as out:
+            stream = out.add_stream_from_template(file.streams.video[0])
+            for number, packet in enumerate(file.demux(video=0)):
+                if copied == count or not packet.size:
+                    break
+                if number >= first:
+                    packet.stream, packet.time_base = stream, Fraction(1, fps)
+                    packet.pts = packet.dts = copied
+                    packet.duration = 1
+                    out.mux(packet)
+                    copied += 1
+    except (OSError, av.FFmpegError, IndexError) as exc:
+        raise DatasetError(f"{target} cannot be written: {exc}") from exc
+    if copied != count:
+        raise DatasetError(f"{path} has {copied} pictures from {first} on, not {count}")
+
+
+def decoded(jpeg: bytes) -> NDArray[np.uint8]:
+    """Return the pixels of a JPEG, RGB in ``(height, width, 3)``.
+
+    Raises:
+        DatasetError: it is none, or larger than a camera's.
+    """
+    from PIL import Image, UnidentifiedImageError  # noqa: PLC0415 - an extra
+
+    try:
+        with Image.open(io.BytesIO(jpeg), formats=["JPEG"]) as image:
+            return np.asarray(image.convert("RGB"))
+    except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as exc:
+        raise DatasetError(f"a picture cannot be decoded: {exc}") from exc
 
 
 def _pyav() -> Any:

@@ -1,0 +1,184 @@
+"""Cameras encoded in a process of their own: what is offered is stored or counted, and a kill costs no attempt."""
+
+from __future__ import annotations
+
+import io
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fixtures.waiting import eventually
+from numpy.typing import NDArray
+from PIL import Image
+
+from strands_robots.datasets import tables
+from strands_robots.datasets.check import check_dataset
+from strands_robots.datasets.encoded import cameras_folder, encoded_videos
+from strands_robots.datasets.encoder import CameraEncoder
+from strands_robots.datasets.layout import data_file, video_file
+from strands_robots.datasets.session import NoPictureError, RecordingSession
+from strands_robots.datasets.video import pictures_of
+from strands_robots.recording.file import Recorder
+from strands_robots.utils import ValidationError
+
+FPS = 50
+TOP, WRIST = "top", "arm.wrist"
+
+
+@pytest.fixture(scope="module")
+def encoder() -> Iterator[CameraEncoder]:
+    with CameraEncoder(FPS) as made:
+        yield made
+
+
+def picture(number: int, width: int = 64) -> NDArray[np.uint8]:
+    return np.full((48, width, 3), number * 5 % 256, dtype=np.uint8)
+
+
+def session(folder: Path, said: list[str] | None = None) -> RecordingSession:
+    return RecordingSession(folder, FPS, "wave", "so100", ([] if said is None else said).append)
+
+
+def lead(encoder: CameraEncoder, path: Path, *cameras: str, frames: int = 20) -> int:
+    """Record an attempt of steps and pictures at the rate of the dataset; return how many of each there are."""
+    beat = threading.Event()
+    with Recorder(path) as recorder, encoder.attempt(path):
+        began = time.time()
+        for number in range(frames):
+            recorder.take("arm-1", "streamStep", {"observation": {"pan": number}, "action": {"pan": number}})
+            for camera in cameras:
+                encoder.offer(camera, picture(number))
+            beat.wait(max(0.0, began + (number + 1) / FPS - time.time()))
+    return frames
+
+
+def wrong(folder: Path) -> list[str]:
+    return [each.said for each in check_dataset(folder)[1] if each.wrong]
+
+
+def test_episode_has_the_pictures_of_each_camera_at_its_moments(encoder: CameraEncoder, tmp_path: Path) -> None:
+    with session(tmp_path) as recording:
+        led = lead(encoder, recording.recording, TOP, WRIST)
+        kept = recording.keep(success=True)
+        assert list((tmp_path / ".running").iterdir()) == []
+    assert kept is not None
+    assert 5 < kept[1] <= led
+    assert wrong(tmp_path) == []
+    frames = tables.read_frames(tmp_path / data_file(0))
+    for camera in (TOP, WRIST):
+        shades = [float(each.mean()) for each in pictures_of(tmp_path / video_file(f"observation.images.{camera}", 0))]
+        told = frames["observation.state"] * 5
+        assert np.abs(np.array(shades) - told).max() <= 5 * 1.0 + 4, "the picture is that of the newest step, or before"
+        changed = np.abs(np.diff(shades)) > 2
+        assert (frames[f"observation.same.{camera}"][1:] == ~changed).all()
+
+
+def test_picture_is_stored_or_counted_while_the_encoder_stands_still(encoder: CameraEncoder, tmp_path: Path) -> None:
+    path, offered, slowest = tmp_path / "attempt-000000.mcap", 0, 0.0
+    with encoder.attempt(path):
+        assert encoder.pid is not None
+        encoder.offer(TOP, picture(0))
+        os.kill(encoder.pid, signal.SIGSTOP)
+        for number in range(1, 30):
+            began = time.perf_counter()
+            encoder.offer(TOP, picture(number))
+            slowest, offered = max(slowest, time.perf_counter() - began), number + 1
+        assert encoder.dropped[TOP] > 15
+        os.kill(encoder.pid, signal.SIGCONT)
+        eventually(lambda: rows(path))
+    assert slowest < 0.05
+    assert encoder.failed == ""
+    stored = int((encoded_videos(path, FPS)[TOP].rows["same"] == 0).sum())
+    assert stored >= 1
+    assert stored + encoder.dropped[TOP] == offered
+
+
+def rows(recording: Path) -> bytes:
+    path = cameras_folder(recording) / f"{TOP}.rows"
+    return path.read_bytes() if path.exists() else b""
+
+
+def test_killed_encoder_ends_the_attempt_by_name_and_the_next_one_is_whole(
+    encoder: CameraEncoder, tmp_path: Path
+) -> None:
+    with session(tmp_path) as recording:
+        with Recorder(recording.recording) as recorder, encoder.attempt(recording.recording):
+            number = 0
+            while encoder.failed == "":
+                recorder.take("arm-1", "streamStep", {"observation": {"pan": number}, "action": {"pan": number}})
+                encoder.offer(TOP, picture(number))
+                if len(rows(recording.recording)) > 24 * 20 and encoder.pid is not None:
+                    os.kill(encoder.pid, signal.SIGKILL)
+                number += 1
+                threading.Event().wait(1 / FPS)
+            assert encoder.failed == "the process that encodes the cameras has ended"
+        kept = recording.keep(success=False)
+        assert kept is not None
+        assert kept[1] > 5
+        lead(encoder, recording.recording, TOP)
+        assert recording.keep(success=True) is not None
+        assert encoder.failed == ""
+    assert wrong(tmp_path) == []
+
+
+def test_video_that_was_cut_at_any_byte_is_an_episode_up_to_there(encoder: CameraEncoder, tmp_path: Path) -> None:
+    with session(tmp_path) as recording:
+        path = recording.recording
+        lead(encoder, path, TOP)
+    (cameras_folder(path) / f"{TOP}.json").unlink()
+    video = cameras_folder(path) / f"{TOP}.mp4"
+    whole, content, of_each, left = path.read_bytes(), video.read_bytes(), rows(path), [0]
+    for episode, size in enumerate((len(content) * 2 // 3, len(content) * 2 // 3 + 40, len(content) - 9)):
+        recording_of = path.with_name(f"attempt-{episode:06d}.mcap")
+        folder = cameras_folder(recording_of)
+        folder.mkdir(exist_ok=True)
+        recording_of.write_bytes(whole)
+        (folder / f"{TOP}.mp4").write_bytes(content[:size])
+        (folder / f"{TOP}.rows").write_bytes(of_each)
+        said: list[str] = []
+        with session(tmp_path, said) as again:
+            assert again.episodes == episode + 1, said
+        left.append(len(tables.read_frames(tmp_path / data_file(episode))["index"]))
+    assert 0 < left[1] <= left[2] < left[3]
+    assert wrong(tmp_path) == []
+
+
+def test_attempt_without_a_camera_of_the_dataset_is_moved_aside(encoder: CameraEncoder, tmp_path: Path) -> None:
+    with session(tmp_path) as recording:
+        lead(encoder, recording.recording, TOP, WRIST)
+        recording.keep(success=True)
+        lead(encoder, recording.recording, TOP)
+        with pytest.raises(NoPictureError, match=r"has no picture of arm\.wrist: .* was moved to .*aside-000000\.mcap"):
+            recording.keep(success=True)
+    aside = tmp_path / ".running" / "aside-000000.mcap"
+    with session(tmp_path) as again:
+        assert again.episodes == 1
+        assert aside.exists()
+        assert (cameras_folder(aside) / f"{TOP}.mp4").exists()
+
+
+def test_picture_that_cannot_be_encoded_is_told_by_its_camera(encoder: CameraEncoder, tmp_path: Path) -> None:
+    with encoder.attempt(tmp_path / "attempt-000000.mcap"):
+        encoder.offer(TOP, picture(0, width=63))
+        eventually(lambda: encoder.failed == "camera top: width must be even, not 63: a video halves its colours.")
+        with pytest.raises(ValidationError, match=r"pictures of top must be \(63, 48\) as its first"):
+            encoder.offer(TOP, picture(0))
+        with pytest.raises(ValidationError, match="must be height x width x 3 of uint8"):
+            encoder.offer(WRIST, np.zeros((48, 64, 3)))  # type: ignore[arg-type]
+    assert encoder.offer(TOP, picture(0)) is False, "no attempt runs"
+
+
+def test_jpeg_is_decoded_in_the_process(encoder: CameraEncoder, tmp_path: Path) -> None:
+    file, path = io.BytesIO(), tmp_path / "attempt-000000.mcap"
+    Image.fromarray(picture(20)).save(file, "JPEG")
+    with encoder.attempt(path):
+        encoder.offer(TOP, file.getvalue())
+        eventually(lambda: len(rows(path)) > 24)
+    video = encoded_videos(path, FPS)[TOP]
+    assert (video.width, video.height) == (64, 48)
+    assert next(pictures_of(video.path)).mean() == pytest.approx(100, abs=3)
