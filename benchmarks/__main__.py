@@ -38,6 +38,7 @@ PARTS = {
     "mesh": "The native mesh beside bare Zenoh",
     "mcp": "Robots for MCP clients",
     "recording": "Recording where robots are served",
+    "dataset": "Recording of datasets",
     "dashboard": "The operator's page in Chromium",
     "ros": "Robots on ROS graphs",
     "arm": "A real arm (in the environment of `make real-arm`)",

@@ -1,0 +1,65 @@
+"""Arithmetic of the table of datasets: what is a miss, and what is measured of a kill."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from benchmarks.dataset import beat_row, kills_row, stops_row, writer_rows
+from fixtures.killed_recorders import Kill, missing_s
+from fixtures.replayed_cameras import ReplayedCamera, stamp, stamped
+
+EACH = [Kill("recorder", 0.2, ""), Kill("encoder", None, ""), Kill("robot", 0.9, "")]
+
+
+@pytest.mark.parametrize(
+    ("kills", "lost", "kept"),
+    [
+        (EACH, [], True),
+        (EACH, ["episode 3"], False),
+        ([*EACH, Kill("recorder", 1.1, "")], [], False),
+        (EACH[:1] * 3, [], False),
+    ],
+    ids=["all is well", "one is lost", "cut too short", "a part was never killed"],
+)
+def test_kills_keep_their_bound_where_nothing_is_lost(kills: list[Kill], lost: list[str], kept: bool) -> None:
+    assert kills_row(kills, 5, lost).ok is kept
+
+
+@pytest.mark.parametrize(
+    ("recorded_ms", "different", "same", "kept"),
+    [(21.0, 950, 50, True), (21.1, 950, 50, False), (20.5, 949, 51, False), (20.5, 950, 49, False)],
+    ids=["at its bounds", "too late", "too few pictures", "one picture is not counted"],
+)
+def test_recording_keeps_the_beat_and_counts_each_picture(
+    recorded_ms: float, different: int, same: int, kept: bool
+) -> None:
+    stored = {"frames": 1000, "different": different, "same": same}
+    assert beat_row("arms", [20.0] * 100, [recorded_ms] * 100, 1000, stored, 1.0).ok is kept
+
+
+def test_a_writer_is_compared_by_the_medians_of_its_turns() -> None:
+    rows = writer_rows({"ours": [6.0, 5.0, 99.0], "default": [10.0, 10.0, 1.0], "streaming": [5.0, 5.0, 5.0]}, 20.0)
+    assert [(row.ratio, row.ok) for row in rows] == [(pytest.approx(0.6), True), (pytest.approx(1.2), False)]
+
+
+def test_stops_count_where_something_was_recorded_meanwhile() -> None:
+    assert stops_row([3.0] * 100, [2.0] * 100, {"frames": 50}).ok
+    assert not stops_row([3.0] * 98 + [20.5] * 2, [2.0] * 100, {"frames": 50}).ok
+    assert not stops_row([3.0] * 100, [2.0] * 100, {"frames": 0}).ok
+
+
+def test_cut_of_an_attempt_is_what_its_episode_lacks_of_the_actions() -> None:
+    actions = [100 + beat / 50 for beat in range(101)]
+    assert missing_s(actions, began=100.0, ended=102.0, frames=61) == pytest.approx(0.0)
+    assert missing_s(actions, began=100.0, ended=102.0, frames=31) == pytest.approx(1.0)
+    assert missing_s(actions, began=100.0, ended=101.0, frames=31) == pytest.approx(0.0)
+    assert missing_s(actions, began=100.0, ended=102.0, frames=0) == pytest.approx(2.0, abs=0.05)
+    assert missing_s(actions, began=103.0, ended=104.0, frames=0) == 0.0
+
+
+def test_each_picture_carries_its_number() -> None:
+    camera = ReplayedCamera()
+    assert [stamped(camera.read_latest()) for _ in range(3)] == [1, 2, 3]
+    noisy = stamp(np.full((240, 320, 3), 128, dtype=np.uint8), 54_321).astype(int)
+    noise = np.random.default_rng(1).integers(-40, 40, noisy.shape)
+    assert stamped(np.clip(noisy + noise, 0, 255).astype(np.uint8)) == 54_321
