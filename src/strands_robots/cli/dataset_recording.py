@@ -9,8 +9,8 @@ import termios
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, ExitStack, contextmanager
-from dataclasses import dataclass
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -18,10 +18,11 @@ from strands_robots.cli.led_robot import LedRobot
 from strands_robots.cli.output import POLL_S, CliError, Screen, wait_until
 from strands_robots.datasets.recorded import ATTEMPT_ENDED, LED_BY_PERSON
 from strands_robots.recording.cameras import Frames
-from strands_robots.recording.file import Recorder, RobotRecording
+from strands_robots.recording.file import Pictures, Recorder, RobotRecording
 from strands_robots.safety.stopping import StopVerdict
 
 if TYPE_CHECKING:
+    from strands_robots.datasets.encoder import CameraEncoder
     from strands_robots.datasets.session import RecordingSession
 
 CAMERAS_HZ_MAX = 60
@@ -132,8 +133,12 @@ class AttemptRobot(Protocol):
     def stopped_by(self) -> str:
         """The reason of the stop, with its caller."""
 
-    def recorded(self, recorder: Recorder, fps: int) -> AbstractContextManager[object]:
-        """Record it in the block."""
+    @property
+    def has_cameras(self) -> bool:
+        """True where pictures are recorded."""
+
+    def recorded(self, recorder: Recorder, fps: int, pictures: Pictures | None) -> AbstractContextManager[object]:
+        """Record it in the block, and hand the pictures of its cameras over."""
 
     def halt(self, reason: str) -> StopVerdict:
         """Halt it, and return the verdict."""
@@ -170,16 +175,18 @@ class LocalAttempts:
         """The reason of the stop, with its caller."""
         return self._led.stopped_by
 
+    @property
+    def has_cameras(self) -> bool:
+        """True where pictures are recorded."""
+        return self._frames is not None
+
     @contextmanager
-    def recorded(self, recorder: Recorder, fps: int) -> Iterator[None]:
-        """Record it in the block."""
+    def recorded(self, recorder: Recorder, fps: int, pictures: Pictures | None) -> Iterator[None]:
+        """Record it in the block, and hand the pictures of its cameras over."""
         if self._person:
             recorder.take(self.name, LED_BY_PERSON, {})
-        hz = min(fps, CAMERAS_HZ_MAX)
-        with (
-            self._turn,
-            RobotRecording(self._led.robot, recorder, self.name, frames=self._frames, cameras_hz=hz),
-        ):
+        cameras: dict[str, Any] = {"frames": self._frames, "cameras_hz": min(fps, CAMERAS_HZ_MAX), "pictures": pictures}
+        with self._turn, RobotRecording(self._led.robot, recorder, self.name, **cameras):
             yield
 
     def halt(self, reason: str) -> StopVerdict:
@@ -204,11 +211,20 @@ def record_attempts(screen: Screen, led: AttemptRobot, session: RecordingSession
     Raises:
         CliError: the robot was stopped by others, its leader failed, or its stop was not confirmed.
     """
+    from strands_robots.datasets.encoder import CameraEncoder  # noqa: PLC0415 - an extra
+
+    with CameraEncoder(attempts.fps) if led.has_cameras else nullcontext() as encoder:
+        _record(screen, led, session, attempts, encoder)
+
+
+def _record(
+    screen: Screen, led: AttemptRobot, session: RecordingSession, attempts: Attempts, encoder: CameraEncoder | None
+) -> None:
     saved = 0
     while saved < attempts.count:
         if not _ready(screen, attempts, saved):
             return
-        ended = _attempt(screen, led, session, attempts)
+        ended = _attempt(screen, led, session, attempts, encoder)
         if ended.stopped_by:
             _save(screen, session, success=False)
             led.hold(screen)
@@ -219,10 +235,10 @@ def record_attempts(screen: Screen, led: AttemptRobot, session: RecordingSession
             session.discard()
             screen.say("Dropped.", "yellow")
         else:
-            kept = _save(screen, session, success=ended.said is Said.SUCCESS)
-            if not kept and attempts.keys is None:
-                raise CliError("The leader did not move the robot; nothing more is recorded.")
-            saved += kept
+            lacking = _save(screen, session, success=ended.said is Said.SUCCESS)
+            if lacking and attempts.keys is None:
+                raise CliError(f"{ended.failed or lacking} Nothing more is recorded.")
+            saved += not lacking
         if ended.failed:
             raise CliError(f"The attempt failed: {ended.failed}")
         if ended.said is Said.END or ended.interrupted:
@@ -252,12 +268,16 @@ def _ready(screen: Screen, attempts: Attempts, saved: int) -> bool:
     return True
 
 
-def _attempt(screen: Screen, led: AttemptRobot, session: RecordingSession, attempts: Attempts) -> _Ended:
+def _attempt(
+    screen: Screen, led: AttemptRobot, session: RecordingSession, attempts: Attempts, encoder: CameraEncoder | None
+) -> _Ended:
     """Lead and record one attempt, and halt the robot."""
     said, ends = list[Said](), list[tuple[str, StopVerdict | None]]()
     with ExitStack() as recorded:
         recorder = recorded.enter_context(Recorder(session.recording, joints_of_events=False))
-        recorded.enter_context(led.recorded(recorder, attempts.fps))
+        if encoder is not None:
+            recorded.enter_context(encoder.attempt(recorder.path))
+        recorded.enter_context(led.recorded(recorder, attempts.fps, None if encoder is None else encoder.offer))
         task, began = attempts.begin(), time.monotonic()
         if attempts.keys is not None:
             screen.say(KEYBOARD if attempts.keys.leading else KEYS)
@@ -271,6 +291,8 @@ def _attempt(screen: Screen, led: AttemptRobot, session: RecordingSession, attem
                 return "time"
             if task.voided:
                 return "voided"
+            if encoder is not None and encoder.failed:
+                return "failed"
             return "" if task.running else "ended"
 
         def end() -> None:
@@ -285,16 +307,38 @@ def _attempt(screen: Screen, led: AttemptRobot, session: RecordingSession, attem
     stopped_by, verdict = ends[0]
     done = attempts.success and why in ("time", "ended") and not task.error
     word = said[0] if said else Said.SUCCESS if done else Said.FAILURE
-    return _Ended(word, stopped_by, task.error, why == "Ctrl-C.", verdict)
+    ended = _Ended(word, stopped_by, task.error, why == "Ctrl-C.", verdict)
+    return ended if encoder is None else _with_pictures(screen, encoder, ended)
 
 
-def _save(screen: Screen, session: RecordingSession, *, success: bool) -> bool:
-    kept = session.keep(success=success)
+def _with_pictures(screen: Screen, encoder: CameraEncoder, ended: _Ended) -> _Ended:
+    """Tell which pictures an attempt lacks, and return its end."""
+    for camera, count in sorted(encoder.dropped.items()):
+        screen.data({"event": "dropped", "camera": camera, "pictures": count})
+        screen.say(f"Camera {camera}: {count} pictures were dropped.", "yellow")
+    if not encoder.failed:
+        return ended
+    # Its end is not in it.
+    word = Said.FAILURE if ended.said is Said.SUCCESS else ended.said
+    return replace(ended, said=word, failed=ended.failed or encoder.failed)
+
+
+def _save(screen: Screen, session: RecordingSession, *, success: bool) -> str:
+    """Save the attempt; return why it is none, else nothing."""
+    from strands_robots.datasets.session import NoPictureError  # noqa: PLC0415 - an extra
+
+    try:
+        kept = session.keep(success=success)
+    except NoPictureError as problem:
+        lacking = f"{problem}."
+        lacking = lacking[0].upper() + lacking[1:]
+    else:
+        lacking = "The robot made no step: there is nothing to save."
     if kept is None:
-        screen.say("The robot made no step: there is nothing to save.", "yellow")
-        return False
+        screen.say(lacking, "yellow")
+        return lacking
     index, frames = kept
     row: Mapping[str, Any] = {"event": "saved", "episode": index, "frames": frames, "success": success}
     screen.data(dict(row))
     screen.say(f"episode {index} is saved: {frames} frames, {'a success' if success else 'no success'}.", "green")
-    return True
+    return ""

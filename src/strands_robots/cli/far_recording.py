@@ -21,7 +21,7 @@ from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.remote_robot import ROBOT_NAME, RemoteRobot
 from strands_robots.fleet.reports import runs, said
 from strands_robots.recording.cameras import OVERVIEW
-from strands_robots.recording.file import STEP, Recorder, beats
+from strands_robots.recording.file import STEP, Pictures, Recorder, beats
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.utils import DURATION_MAX_S, ValidationError, shown
 
@@ -121,6 +121,11 @@ class FarRobot:
         return self.remote.model or self.remote.type or "unknown"
 
     @property
+    def has_cameras(self) -> bool:
+        """True where pictures are recorded."""
+        return bool(self._cameras)
+
+    @property
     def stopped(self) -> bool:
         """True where others stopped or locked it in this attempt."""
         task = self._attempt
@@ -188,12 +193,14 @@ class FarRobot:
             yield
 
     @contextmanager
-    def recorded(self, recorder: Recorder, fps: int) -> Iterator[None]:
-        """Record its events and the pictures of its cameras in the block."""
+    def recorded(self, recorder: Recorder, fps: int, pictures: Pictures | None) -> Iterator[None]:
+        """Record its events in the block, and hand the pictures of its cameras over."""
         self._recorder, over = recorder, threading.Event()
         threads = [
-            threading.Thread(target=self._take_pictures, args=(recorder, camera, fps, over), name=f"pictures {camera}")
-            for camera in self._cameras
+            threading.Thread(
+                target=self._take_pictures, args=(recorder, each, pictures, fps, over), name=f"pictures {each}"
+            )
+            for each in (() if pictures is None else self._cameras)
         ]
         end = self.networks.subscribe(self.name, lambda event: self._take(recorder, event), Detail.ALL)
         try:
@@ -266,7 +273,9 @@ class FarRobot:
                 task.end(voided=True)
             ran = ran or now
 
-    def _take_pictures(self, recorder: Recorder, camera: str, fps: int, over: threading.Event) -> None:
+    def _take_pictures(
+        self, recorder: Recorder, camera: str, pictures: Pictures, fps: int, over: threading.Event
+    ) -> None:
         """Ask for a picture at each beat; the ages tell of a gap."""
         for _ in beats(fps, over):
             # The picture is no older than its request.
@@ -275,12 +284,10 @@ class FarRobot:
                 answer = self.remote.call(
                     "getPicture", camera=camera, width=PICTURE_WIDTH, height=PICTURE_HEIGHT, timeout=PICTURE_S
                 )
-                jpeg = _jpeg_of(answer)
+                pictures(camera.replace("/", "."), _jpeg_of(answer), asked)
             except (RefusalError, ValueError) as failed:
                 recorder.take(self.name, "notRecorded", {"what": f"pictures of {camera}", "error": str(failed)[:200]})
                 over.wait(LOOK_S)
-            else:
-                recorder.take_picture(self.name, camera.replace("/", "."), jpeg, asked)
 
 
 def _jpeg_of(answer: Mapping[str, Any]) -> bytes:

@@ -61,6 +61,9 @@ JOINTS, CAMERA, LOG = "joint_states", "camera", "log"
 JOINTS_HZ, CAMERAS_HZ, GATE_HZ = 50.0, 15.0, 20.0
 """Rates at which joints are read, pictures are taken, and the gate is checked for halts and locks."""
 
+Pictures = Callable[[str, Any, float | None], object]
+"""Takes a camera's name, its picture, and when that had arrived, in seconds since the epoch; None for now."""
+
 PATIENCE_S = 0.5
 """A source that fails for this long is reported; a busy bus costs a sample, it is not a fault."""
 
@@ -456,6 +459,7 @@ class RobotRecording:
         frames: takes its pictures; None for none.
         joints_hz: 1 to 200.
         cameras_hz: 0.1 to 60.
+        pictures: takes the pictures in place of the recording; None where they are in it.
 
     Raises:
         ValidationError: a rate outside its domain, or an object that is no robot.
@@ -470,8 +474,10 @@ class RobotRecording:
         frames: Frames | None = None,
         joints_hz: float = JOINTS_HZ,
         cameras_hz: float = CAMERAS_HZ,
+        pictures: Pictures | None = None,
     ) -> None:
         self._robot = behind_contract(robot)
+        self._pictures = pictures
         self._recorder = recorder
         self._device = device
         self._frames = frames
@@ -550,7 +556,10 @@ class RobotRecording:
             self._attempt(f"pictures of {camera}", partial(self._take_picture, frames, camera))
 
     def _take_picture(self, frames: Mapping[str, Any], camera: str) -> None:
-        self._recorder.take_picture(self._device, camera, jpeg(camera, frames[camera]))
+        if self._pictures is not None:
+            self._pictures(camera, frames[camera], None)
+        else:
+            self._recorder.take_picture(self._device, camera, jpeg(camera, frames[camera]))
 
     def _check_gate(self) -> None:
         gate = self._robot.gate

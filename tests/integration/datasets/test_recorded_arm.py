@@ -7,6 +7,7 @@ import signal
 import subprocess
 from pathlib import Path
 
+import psutil
 import pytest
 from fixtures.command_line import COMMAND
 from fixtures.waiting import eventually, free_port
@@ -31,7 +32,7 @@ def leader(tmp_path: Path) -> Path:
 
 def recording(folder: Path, leader: Path, *more: str) -> subprocess.Popen[str]:
     line = ["dataset", "record", str(folder), "--robot", "so100", "--leader", str(leader), "--task", "sweep"]
-    line += ["--cameras", "none", "--json", *more]
+    line += ["--json", *more, *([] if "--cameras" in more else ["--cameras", "none"])]
     return subprocess.Popen([*COMMAND, *line], stdout=subprocess.PIPE, text=True)
 
 
@@ -57,6 +58,27 @@ def test_attempt_that_was_running_when_it_was_killed_is_saved(tmp_path: Path, le
     assert len(killed["index"]) > len(kept["index"]) > 5
     assert (killed["next.success"].any(), kept["next.success"][-1]) == (False, True)
     assert kept["stop"].tolist() == [0] * len(kept["index"]), "the end of an attempt is no stop"
+
+
+@pytest.mark.system
+def test_killed_encoder_ends_the_recording_by_name_and_costs_no_step(tmp_path: Path, leader: Path) -> None:
+    folder = tmp_path / "set"
+    child = recording(folder, leader, "--no-network", "--episode-s", "60", "--cameras", "so100/wrist")
+    try:
+        rows = folder / ".running" / "attempt-000000.cameras" / "so100.wrist.rows"
+        eventually(lambda: rows.exists() and rows.stat().st_size > 24 * 30, within=60)
+        psutil.Process(child.pid).children()[0].kill()
+        told = events(child)
+    finally:
+        child.kill()
+        child.communicate()
+    assert [each.get("event", each.get("status")) for each in told if each.get("event") != "dropped"] == [
+        "saved",
+        "error",
+    ]
+    assert "The attempt failed: the process that encodes the cameras has ended" in str(told[-1]["reason"])
+    info, found = check_dataset(folder)
+    assert ([*info.videos], [each for each in found if each.wrong]) == (["observation.images.so100.wrist"], [])
 
 
 def test_stop_from_the_network_ends_the_recording_and_is_in_it(tmp_path: Path, leader: Path) -> None:

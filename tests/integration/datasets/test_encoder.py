@@ -5,6 +5,8 @@ from __future__ import annotations
 import io
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -96,6 +98,41 @@ def test_picture_is_stored_or_counted_while_the_encoder_stands_still(encoder: Ca
     stored = int((encoded_videos(path, FPS)[TOP].rows["same"] == 0).sum())
     assert stored >= 1
     assert stored + encoder.dropped[TOP] == offered
+
+
+RECORDER = """
+import sys, threading, time
+from pathlib import Path
+import numpy as np
+from strands_robots.datasets.encoder import CameraEncoder
+from strands_robots.datasets.session import RecordingSession
+from strands_robots.recording.file import Recorder
+
+with RecordingSession(Path(sys.argv[1]), 50, "wave", "so100", print) as session, CameraEncoder(50) as encoder:
+    with Recorder(session.recording) as recorder, encoder.attempt(session.recording):
+        for number in range(100_000):
+            recorder.take("arm-1", "streamStep", {"observation": {"pan": number}, "action": {"pan": number}})
+            encoder.offer("top", np.full((48, 64, 3), number * 5 % 256, dtype=np.uint8))
+            print(time.time(), flush=True)
+            threading.Event().wait(0.02)
+"""
+
+
+def test_attempt_of_a_killed_recorder_is_an_episode_up_to_its_last_second(tmp_path: Path) -> None:
+    child = subprocess.Popen([sys.executable, "-c", RECORDER, str(tmp_path)], stdout=subprocess.PIPE, text=True)
+    assert child.stdout is not None
+    began = float(child.stdout.readline())
+    while float(child.stdout.readline()) < began + 2:
+        pass
+    child.kill()
+    said, _ = child.communicate()
+    killed = float(said.split()[-1]) if said.split() else began + 2
+    left: list[str] = []
+    with session(tmp_path, left) as again:
+        assert again.episodes == 1, left
+    frames = tables.read_frames(tmp_path / data_file(0))
+    assert len(frames["index"]) / FPS > killed - began - 1.1
+    assert wrong(tmp_path) == []
 
 
 def rows(recording: Path) -> bytes:
