@@ -9,9 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fixtures.episodes import CAMERA, FPS, INFO, JOINTS, episode
+from fixtures.episodes import CAMERA, FPS, HEIGHT, INFO, JOINTS, WIDTH, episode
 
 from strands_robots.datasets import Dataset, DatasetEpisode
+from strands_robots.datasets.video import Video, VideoWriter, about_video, copy_pictures
 
 if importlib.util.find_spec("torch") is None or importlib.util.find_spec("lerobot") is None:
     pytest.skip("LeRobot with torch is not installed; `make lerobot` runs this", allow_module_level=True)
@@ -31,6 +32,23 @@ def without_videos(tmp_path: Path) -> Path:
         for number in range(EPISODES):
             made = episode(dataset, FRAMES, f"task {number % 2}")
             dataset.save(DatasetEpisode(made.task, made.columns))
+    return folder
+
+
+@pytest.fixture
+def copied_from_live(tmp_path: Path) -> Path:
+    """A dataset whose video was written live, and copied from its fifth picture on."""
+    folder = tmp_path / "live"
+    with Dataset(folder, INFO) as dataset:
+        made = episode(dataset, FRAMES)
+        live, copy = tmp_path / "live.mp4", dataset.running / "copy.mp4"
+        with VideoWriter(live, FPS, WIDTH, HEIGHT, live=True) as video:
+            for number in range(FRAMES + 9):
+                video.write(np.full((HEIGHT, WIDTH, 3), max(0, number - 4) * 5, dtype=np.uint8))
+            statistics = video.finish().statistics
+        copy_pictures(live, copy, 4, FRAMES, FPS)
+        top = Video(copy, FRAMES, statistics, about_video(WIDTH, HEIGHT, FPS))
+        dataset.save(DatasetEpisode(made.task, made.columns, {CAMERA: top}))
     return folder
 
 
@@ -66,10 +84,22 @@ def test_lerobot_reads_ahead_and_shuffles(without_videos: Path) -> None:
     assert sorted(seen) == list(range(EPISODES * FRAMES))
 
 
-def test_lerobot_decodes_the_picture_of_each_frame(with_videos: Path) -> None:
-    dataset = LeRobotDataset("local/pictures", root=with_videos)
+def requires_decoder() -> None:
     if version("lerobot").startswith("0.4.") and importlib.util.find_spec("torchcodec") is None:
         pytest.skip("LeRobot 0.4 decodes videos by torchcodec alone, which is not installed; 0.6.1 decodes by PyAV")
+
+
+def test_lerobot_decodes_the_picture_of_each_frame(with_videos: Path) -> None:
+    requires_decoder()
+    dataset = LeRobotDataset("local/pictures", root=with_videos)
     for number in (0, 7, FRAMES + 11, EPISODES * FRAMES - 1):
         shade = float(dataset[number][CAMERA].mean()) * 255
         assert shade == pytest.approx((number % FRAMES) * 5, abs=4), number
+
+
+def test_lerobot_decodes_pictures_that_were_copied_from_a_live_video(copied_from_live: Path) -> None:
+    requires_decoder()
+    dataset = LeRobotDataset("local/live", root=copied_from_live, delta_timestamps={CAMERA: [0.0, 1 / FPS]})
+    for number in range(FRAMES - 1):
+        shades = (dataset[number][CAMERA].mean(dim=(1, 2, 3)) * 255).tolist()
+        assert shades == pytest.approx([number * 5, number * 5 + 5], abs=4), number
