@@ -48,6 +48,7 @@ FLOORS: list[set[str]] = [
         "leader_thread",
         "policies",
         "recording",
+        "lead_mixin",
         "teleop_mixin",
         "teleoperators",
     },

@@ -51,7 +51,7 @@ class RolloutEvent:
     ``clamped_steps`` counts the actions that the robot's speed limit held back.
     ``observation`` and ``action`` hold numbers only, by joint name, in the robot's own units. ``follows_instruction``
     is False for a policy that moves by itself, whatever it was told, as ``mock`` does. ``loop`` of a finished one has
-    the figures of its control loop.
+    the figures of its control loop. ``led_by`` of a step is the leader whose action it was, empty for a policy's.
     """
 
     kind: Literal["started", "step", "finished"]
@@ -67,6 +67,7 @@ class RolloutEvent:
     action: Mapping[str, float] = field(default_factory=dict)
     follows_instruction: bool = True
     loop: Mapping[str, float] = field(default_factory=dict)
+    led_by: str = ""
 
 
 Observer = Callable[[RolloutEvent], None]

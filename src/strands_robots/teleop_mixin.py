@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import time
-from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 from strands_robots.envelope import Envelope, error, success
+from strands_robots.lead_mixin import LeadMixin
 from strands_robots.leader_thread import LeaderThread
 from strands_robots.moved import of_module
 from strands_robots.policies.rollout import STOP_JOIN_S, Body, Rollout
-from strands_robots.policies.task_engine import NewTask, TaskEngine
+from strands_robots.policies.task_engine import NewTask
 from strands_robots.safety.gate import Permit, answered
 from strands_robots.teleoperators import FULL_RANGES_PER_S, GIVE_UP_S, InputSink, LeaderPolicy
 from strands_robots.utils import ValidationError, choice, flag, identifier, number, teleoperator_contract_error
@@ -24,19 +24,14 @@ if not TYPE_CHECKING:
 METHODS = ("arm", "gamepad", "keyboard", "phone")
 
 
-class TeleopMixin:
+class TeleopMixin(LeadMixin):
     """Verbs of teleoperation for a host that has the members declared here.
 
     One source drives a body at a time; a session is a task of the host's engine, and ends with its halts.
     """
 
-    tasks: TaskEngine
     input_sink: InputSink | None = None
     """Receiver of published frames; a network that carries input streams sets it."""
-
-    @abstractmethod
-    def body(self, robot_name: str | None = None) -> Body:
-        """Return the body of that name, or the first; raises :class:`ValidationError`."""
 
     def occupied(self, robot: str) -> str:
         """Name the task that drives the body of that name, for a refusal; empty for none."""
@@ -143,10 +138,6 @@ class TeleopMixin:
 
     @cached_property
     def _teleop_leaders(self) -> dict[str, tuple[str, Callable[..., LeaderPolicy]]]:
-        return {}
-
-    @cached_property
-    def _teleop_policies(self) -> dict[str, LeaderPolicy]:
         return {}
 
     def _lead(self, name: str, seconds: float | None, rate: float, sink: InputSink | None) -> Rollout:

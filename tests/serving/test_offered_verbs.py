@@ -23,6 +23,7 @@ from strands_robots.drivers.ros.mobile_base import MobileBaseRobot
 from strands_robots.hardware import HardwareRobot
 from strands_robots.serving.arm_verbs import ARM_MOTION_VERBS, PICTURE_VERBS
 from strands_robots.serving.control_leases import CONTROL_VERBS
+from strands_robots.serving.lead_verbs import LEAD_VERBS
 from strands_robots.serving.offered_verbs import offered
 from strands_robots.serving.peer_verbs import KINDS, PEER_VERBS, kind_of
 from strands_robots.serving.reachy_verbs import REACHY_VERBS
@@ -71,7 +72,7 @@ def test_simulated_arm_offers_all_that_it_can_do(world: Simulation) -> None:
 
 def test_simulated_rover_offers_no_verb_of_an_arm(world: Simulation) -> None:
     world.add_robot("rover")
-    assert set(offered(world, WORLD_VERBS)) == {*OF_WORLDS, "execute"}
+    assert set(offered(world, WORLD_VERBS)) == {*OF_WORLDS, *LEAD_VERBS, "execute"}
     world.add_robot("so100")
     assert set(offered(world, WORLD_VERBS)) == set(WORLD_VERBS), "one of its robots can"
     world.remove_robot("so100")
@@ -114,7 +115,7 @@ def test_moving_world_is_not_waited_for(world: Simulation) -> None:
     ],
 )
 def test_real_robot_offers_what_its_device_has(robot: Callable[[], Any], more: set[str]) -> None:
-    assert set(offered(robot(), TASK_VERBS)) == OF_TASKS | more
+    assert set(offered(robot(), TASK_VERBS)) - {*LEAD_VERBS} == OF_TASKS | more
 
 
 def test_camera_and_detector_of_a_real_arm_are_offered() -> None:
@@ -138,7 +139,7 @@ def test_arm_of_another_model_file_offers_its_jaws_when_it_states_them(tmp_path:
 def test_model_that_is_loaded_decides() -> None:
     robot = real(ArmDevice())
     assert robot.arm().jaw is not None
-    assert set(offered(robot, TASK_VERBS)) == OF_TASKS | {*ARM_MOTION_VERBS} - {"getObjects"}
+    assert set(offered(robot, TASK_VERBS)) == OF_TASKS | {*LEAD_VERBS} | {*ARM_MOTION_VERBS} - {"getObjects"}
 
 
 @pytest.mark.parametrize("method", ["pick", "release_torque", "camera_frames", "arm_pose"])
@@ -184,7 +185,7 @@ def test_peers_verbs_are_offered_by_the_same_rules(world: Simulation) -> None:
     of_peers = {"status", "stop", "features", "state", "resume", "ping", "describe", *CONTROL_VERBS}
     assert set(offered(adapt(Foreign()), PEER_VERBS)) == {*of_peers, "execute", "start"}
     streams = {"teleop_status", "teleop_receive", "teleop_stop"}
-    pan_tilt = {*of_peers, "execute", "start", *streams, "moveJoints", "wait"}
+    pan_tilt = {*of_peers, "execute", "start", *streams, *LEAD_VERBS, "moveJoints", "wait"}
     assert set(offered(real(PanTilt()), PEER_VERBS)) == pan_tilt
     world.add_robot("so100")
     world.add_robot("rover")
@@ -223,6 +224,7 @@ WITHOUT_LIBRARIES = """
 import sys
 from fixtures.pan_tilt import ArmDevice
 from strands_robots.hardware import HardwareRobot
+from strands_robots.serving.lead_verbs import LEAD_VERBS
 from strands_robots.serving.offered_verbs import offered
 from strands_robots.serving.robot_verbs import TASK_VERBS
 verbs = offered(HardwareRobot(ArmDevice(), "arm"), TASK_VERBS)

@@ -76,6 +76,7 @@ def test_the_mesh_knows_the_documented_actions() -> None:
         *("teleop_status", "teleop_receive", "teleop_stop", "releaseTorque", "resume", "ping", "describe"),
         *ARM_MOTION_VERBS,
         *PICTURE_VERBS,
+        *("lead", "leadTo"),
         *CONTROL_VERBS,
         *("drive", "navigateTo"),
         *REACHY_MOTIONS,
@@ -83,7 +84,7 @@ def test_the_mesh_knows_the_documented_actions() -> None:
     }
     moving = {name for name, verb in PEER_VERBS.items() if verb.kind is Kind.MOTION}
     arm = {"moveJoints", "moveTo", "moveBy", "setGripper", "goTo", "savePlace", "pick", "place"}
-    world = {"execute", "start", "step", "reset", "teleop_receive", "releaseTorque", "acquireControl"}
+    world = {"execute", "start", "step", "reset", "teleop_receive", "lead", "releaseTorque", "acquireControl"}
     assert moving == world | arm | {"drive", "navigateTo"} | REACHY_MOTIONS
 
 

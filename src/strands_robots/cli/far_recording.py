@@ -1,4 +1,4 @@
-"""Recording of a robot that another process serves: its events, its pictures, its stops.
+"""Recording of a robot that another process serves, as it is seen from here.
 
 Nothing of it is led from here but a policy that it runs itself. The tasks and motions that others give it (the page,
 an agent) are in the recording as well. Readings count from their arrival here.

@@ -48,7 +48,8 @@ class Attempt:
     """One task of a robot as it was recorded.
 
     ``steps`` are moments in seconds, observations and actions by name; ``pictures`` moments and JPEG by camera.
-    ``person`` is True where a person led; ``videos`` are by camera, where its pictures were encoded as they came.
+    ``person`` is True where a person led all of it, and ``led`` of the steps in which a leader had its turn; ``videos``
+    are by camera, where its pictures were encoded as they came.
     """
 
     instruction: str = ""
@@ -57,6 +58,7 @@ class Attempt:
     stops: list[tuple[float, int]] = field(default_factory=list)
     person: bool = False
     videos: Mapping[str, EncodedVideo] = field(default_factory=dict)
+    led: list[bool] = field(default_factory=list)
 
 
 def attempts_of(path: Path, robot: str | None = None) -> list[Attempt]:
@@ -127,6 +129,7 @@ def _attempts(items: Sequence[RecordedItem], robot: str, *, whole: bool) -> Iter
         elif each.event == STEP and each.robot == robot:
             observation, action = (_numbers(each.payload.get(name)) for name in ("observation", "action"))
             attempt.steps.append((each.at, observation, action))
+            attempt.led.append(attempt.person or bool(each.payload.get("led_by")))
         elif (code := _STOPS.get(each.event)) is not None:
             attempt.stops.append((each.at, code))
     if attempt.steps:
@@ -194,7 +197,7 @@ def save_attempt(dataset: Dataset, attempt: Attempt, task: str, *, success: bool
         f"{AGE}state": (moments - np.array([steps[index][0] for index in newest])) * 1000,
         SUCCESS: np.arange(count) == (count - 1 if success else -1),
         STOP: _stops(moments, attempt.stops),
-        INTERVENTION: np.full(count, attempt.person),
+        INTERVENTION: np.array([attempt.person or attempt.led[index] for index in newest]),
     }
     videos: dict[str, Video] = {}
     for name in dataset.info.videos:

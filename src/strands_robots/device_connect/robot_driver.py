@@ -80,13 +80,16 @@ class RobotDeviceDriver(RobotDriver):
         """
 
     @emit(labels={"modality": "motion"})
-    async def streamStep(self, step: int, observation: dict[str, Any], action: dict[str, Any]) -> None:
+    async def streamStep(
+        self, step: int, observation: dict[str, Any], action: dict[str, Any], led_by: str = ""
+    ) -> None:
         """One step of the running task.
 
         Args:
             step: Number of the step
             observation: Joint positions by name, numbers only
-            action: What the policy told the joints, by name
+            action: What the joints were told, by name
+            led_by: The leader whose action it was, empty for a policy's
         """
 
     @emit()

@@ -126,15 +126,22 @@ class SimulationDeviceDriver(RobotDriver):
 
     @emit(labels={"modality": "motion"})
     async def streamStep(
-        self, step: int, observation: dict[str, Any], action: dict[str, Any], robot_name: str = ""
+        self,
+        step: int,
+        observation: dict[str, Any],
+        action: dict[str, Any],
+        robot_name: str = "",
+        *,
+        led_by: str = "",
     ) -> None:
         """One step of a running policy.
 
         Args:
             step: Number of the step
             observation: Joint positions by name, numbers only
-            action: What the policy told the joints, by name
+            action: What the joints were told, by name
             robot_name: The simulated robot
+            led_by: The leader whose action it was, empty for a policy's
         """
 
     def glance(self) -> Activity:

@@ -252,7 +252,7 @@ def rollout_fields(event: RolloutEvent) -> dict[str, Any]:
         }
     if event.kind == "step":
         observation, action = plain_numbers(event.observation), plain_numbers(event.action)
-        return {"step": event.step, "observation": observation, "action": action}
+        return {"step": event.step, "observation": observation, "action": action, "led_by": event.led_by}
     return {
         "instruction": event.instruction,
         "steps": event.step,

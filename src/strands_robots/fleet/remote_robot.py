@@ -28,6 +28,7 @@ from strands_robots.errors import (
     UnknownVerbError,
 )
 from strands_robots.fleet.adapter import STOP_S, FoundRobot, NetworkAdapter
+from strands_robots.fleet.far_lead import FarLead
 from strands_robots.fleet.networks import STILL, Networks
 from strands_robots.fleet.reports import EventFeed, refusal_of
 from strands_robots.safety.stopping import StopVerdict
@@ -385,6 +386,20 @@ class RemoteRobot:
         seconds = number("ttl_s", ttl_s, above=0)
         with self._lease.block(lambda: self._acquired(seconds)):
             yield self
+
+    def lead(self, leader: str = "leader", **options: Any) -> FarLead:
+        """Lead the robot from here; a context manager, at whose end it holds.
+
+        Args:
+            leader: name of the leader, as others see it.
+            options: of the verb ``lead``: ``guide`` (positions or differences), ``policy_provider``, ``instruction``,
+                ``duration`` (s), ``max_speed`` (ranges a second), ``stale_ms``.
+
+        Raises:
+            RefusalError: the robot refused it; another leader is named.
+        """
+        opened = self._call("lead", {"leader": leader, **options}, None)
+        return FarLead(self.id, self._call, opened, policy=bool(options.get("policy_provider")))
 
     @property
     def robots(self) -> Mapping[str, RobotOfWorld]:

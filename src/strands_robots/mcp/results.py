@@ -34,6 +34,7 @@ INSTEAD = {
     "acquireControl": "use acquire_control",
     "releaseControl": "use release_control",
     "renewControl": "the server renews what acquire_control gave",
+    **dict.fromkeys(("lead", "leadTo"), "a leader's program sends its commands many times a second"),
     "takeControl": "only a human takes control from another client",
     "resume": "only a human operator resumes a robot",
     "wait": "use wait_for",

@@ -265,7 +265,7 @@ class CommandReceiver:
             self._refuse(request, verb.name, _wire_text(refusal), reason, event, facts)
             return
         self._reply(request.sender_id, request.turn_id, result=answer.result)
-        if verb.kind is not Kind.READ or verb.name == "teleop_stop":
+        if (verb.kind is not Kind.READ and not verb.streamed) or verb.name == "teleop_stop":
             event = "command_refused" if is_error(answer.result) else "command_executed"
             audit(event, request.sender_id, action=verb.name, turn_id=request.turn_id)
 

@@ -502,7 +502,9 @@ class StepPublisher:
                 prefix = f"{event.robot}/" if len(robots_in(self._robot)) > 1 else ""
                 observation = {prefix + key: value for key, value in event.observation.items()}
                 action = {prefix + key: value for key, value in event.action.items()}
-                self._put(stamp, event.step, observation, action, instruction=event.instruction, policy=event.policy)
+                about = {"instruction": event.instruction, "policy": event.policy}
+                led = {"led_by": event.led_by} if event.led_by else {}
+                self._put(stamp, event.step, observation, action, **about, **led)
 
             self._executor.submit(publish)
 
@@ -519,17 +521,14 @@ class StepPublisher:
         step: int,
         observation: Mapping[str, Any],
         action: Mapping[str, Any],
-        *,
-        instruction: str,
-        policy: str,
+        **about: str,
     ) -> None:
         peer = self._context.peer_id
         body = {
             "peer_id": peer,
             "step": step,
             "t": now,
-            "instruction": instruction,
-            "policy": policy,
+            **about,
             "observation": numbers(observation),
             "action": numbers(action),
         }

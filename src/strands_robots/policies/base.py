@@ -33,11 +33,12 @@ class PolicyError(StrandsRobotsError, RuntimeError):
 class Policy(Protocol):
     """Source of a robot's actions; one object serves one rollout, on its thread.
 
-    ``uses_cameras`` is False for a policy that looks at numbers alone: it then works while a camera fails. A policy
-    that does not do what the instruction says has ``follows_instruction = False`` besides.
+    A policy that does not do what the instruction says has ``follows_instruction = False`` besides.
     """
 
-    uses_cameras: bool
+    @property
+    def uses_cameras(self) -> bool:
+        """False for a policy of numbers alone, which works while a camera fails."""
 
     def reset(self, instruction: str, ranges: Ranges) -> None:
         """Prepare for a task: load, connect, seed. Raises when that is impossible."""
@@ -60,8 +61,9 @@ class Policy(Protocol):
 class Paced(Protocol):
     """Policy that plays chunks in time with the control loop."""
 
-    preparing: bool
-    """True until it has its first action: the duration of the task has not begun yet."""
+    @property
+    def preparing(self) -> bool:
+        """True until it has its first action: the duration of the task has not begun yet."""
 
     def miss(self, ticks: int) -> None:
         """Skip the actions of control steps that came too late to be made."""
@@ -73,6 +75,30 @@ class Counted(Protocol):
 
     def counts(self) -> Mapping[str, float]:
         """Return the figures by name, as events, status and recordings have them."""
+
+
+@runtime_checkable
+class Restartable(Protocol):
+    """Policy that can forget what it has planned, without a wait."""
+
+    def restart(self) -> None:
+        """Drop the plan and each answer under way; begin from the next observation."""
+
+
+@runtime_checkable
+class Led(Protocol):
+    """Policy whose actions may be a leader's."""
+
+    led_by: str
+    """The leader whose action was the last one; empty where it was none."""
+
+
+@runtime_checkable
+class Noting(Protocol):
+    """Policy that is told what came of its actions."""
+
+    def wrote(self, action: Mapping[str, float]) -> None:
+        """Note what was really written, on the control thread."""
 
 
 def checked_action(action: object, ranges: Ranges) -> Action:

@@ -88,9 +88,14 @@ class LeRobotPolicy:
     def reset(self, instruction: str, ranges: Ranges) -> None:
         """Take the loaded checkpoint, or load it."""
         self._loaded = _MODELS.take(self._key, self._load)
-        for each in self._loaded:
+        self.restart()
+        self._instruction = instruction
+
+    def restart(self) -> None:
+        """Forget the observations and the chunk so far."""
+        for each in self._loaded or ():
             each.reset()
-        self._instruction, self._answered = instruction, None
+        self._answered = None
 
     def act(self, observation: Mapping[str, Any]) -> list[Action]:
         if self._loaded is None:

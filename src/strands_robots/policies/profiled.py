@@ -23,6 +23,7 @@ from strands_robots.policies.base import (
     Policy,
     PolicyError,
     Ranges,
+    Restartable,
     is_velocity,
     limited,
     numbers,
@@ -403,6 +404,7 @@ class ProfiledPolicy:
         self._missed = 0
         self._dry = False
         self._done = False
+        self._anew = self._outdated = False
         self._interrupted = threading.Event()
 
     def compute_inline(self, now: Callable[[], float] = time.monotonic, latency_s: float = 0.0) -> None:
@@ -490,6 +492,14 @@ class ProfiledPolicy:
         self._counts.aged(player.age_s(now))
         return self._limited(action)
 
+    def restart(self) -> None:
+        """Drop the chunk, and the answer under way."""
+        self._player.clear()
+        self._last = {}
+        self._anew = True
+        self._outdated = self._inference.waited_s is not None
+        self.uses_cameras = bool(self.profile.cameras)
+
     def miss(self, ticks: int) -> None:
         """Skip the actions of control steps that came too late to be made."""
         self._missed += ticks
@@ -518,14 +528,18 @@ class ProfiledPolicy:
         seen: dict[str, Any] = {key: present[key] * self._scale[key] for key in (*profile.state, *profile.environment)}
         pictures = {camera: observation.get(camera.camera) for camera in profile.cameras}
         self._asked = (self._player.position, now)
-        self._inference.ask((seen, pictures, self._player.played, self._player.delay))
+        anew, self._anew = self._anew, False
+        self._inference.ask((seen, pictures, self._player.played, self._player.delay, anew))
 
-    def _infer(self, request: tuple[dict[str, Any], dict[CameraMap, object], int, int]) -> list[Action] | None:
+    def _infer(self, request: tuple[dict[str, Any], dict[CameraMap, object], int, int, bool]) -> list[Action] | None:
         """Return the chunk for a request, in the robot's units."""
-        seen, pictures, played, delay = request
+        seen, pictures, played, delay, anew = request
+        if anew and isinstance(self._inner, Restartable):
+            # On the thread that computes: nothing else of the model runs now.
+            self._inner.restart()
         for camera, given in pictures.items():
             seen[camera.short_key] = picture(camera, given)
-        if isinstance(self._inner, RealTimeChunking) and self._inner.continues:
+        if isinstance(self._inner, RealTimeChunking) and self._inner.continues and not anew:
             answer: object = self._inner.act_on(seen, played=played, delay=delay)
         else:
             answer = self._inner.act(seen)
@@ -548,6 +562,9 @@ class ProfiledPolicy:
         if answer.failure is not None:
             raise answer.failure
         self._counts.answered(answer.latency_s)
+        outdated, self._outdated = self._outdated, False
+        if outdated:
+            return
         self.preparing = False
         if answer.value is None:
             self._done = True

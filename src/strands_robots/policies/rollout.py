@@ -20,6 +20,8 @@ from strands_robots.envelope import Envelope, error, success
 from strands_robots.policies.base import (
     Action,
     Counted,
+    Led,
+    Noting,
     Paced,
     Policy,
     PolicyError,
@@ -199,6 +201,8 @@ class Rollout:
         self._stop_requested = threading.Event()
         self._begun = threading.Event()
         self._paced = policy if isinstance(policy, Paced) else None
+        self._noting = policy if isinstance(policy, Noting) else None
+        self._led = policy if isinstance(policy, Led) else None
         self.follows_instruction = getattr(policy, "follows_instruction", True) is not False
         """False for a policy that moves by itself, whatever it was told."""
         self._started_at: float | None = None
@@ -366,7 +370,11 @@ class Rollout:
                 self._moving = any(is_velocity(key) and value for key, value in sent.items())
                 self.step_count += 1
                 self.clamped_steps += bool(self._held_back)
-                self._notify("step", observation=numbers(observation), action=numbers(sent))
+                told = numbers(sent)
+                if self._noting is not None:
+                    self._noting.wrote(told)
+                led_by = "" if self._led is None else self._led.led_by
+                self._notify("step", observation=numbers(observation), action=told, led_by=led_by)
             elif self._held_back:
                 # The policy waits for the end of an action that the speed limit has not let through yet.
                 self._body.send_action(self._limited(self._held_back, observation), self._permit)

@@ -89,7 +89,14 @@ class TaskEngine:
         self._moved: dict[str, None] = {}
         self._halting: dict[str, None] = {}
 
-    def of_policy(self, instruction: str, provider: str, duration: float, options: dict[str, Any]) -> NewTask:
+    def of_policy(
+        self,
+        instruction: str,
+        provider: str,
+        duration: float,
+        options: dict[str, Any],
+        driver: Callable[[Policy], Policy] | None = None,
+    ) -> NewTask:
         """Check a task by a policy, for :meth:`start`.
 
         Args:
@@ -97,6 +104,7 @@ class TaskEngine:
             provider: a registered policy, or the operator's profile of one.
             duration: seconds, above 0.
             options: of the policy and of its loop, which :func:`rollout_options` takes out.
+            driver: makes what drives the robot of the policy; it drives itself by default.
 
         Raises:
             ValidationError: an argument outside its domain.
@@ -110,7 +118,8 @@ class TaskEngine:
         def make(body: Body, permit: Permit, policy: Policy) -> Rollout:
             if isinstance(policy, ProfiledPolicy):
                 policy.fit(self._facts(body.name))
-            return Rollout(body, policy, permit=permit, policy_name=provider, observers=self.observers, **chosen)
+            driving = policy if driver is None else driver(policy)
+            return Rollout(body, driving, permit=permit, policy_name=provider, observers=self.observers, **chosen)
 
         return NewTask(make, partial(create_policy, provider, **options))
 

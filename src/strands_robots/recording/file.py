@@ -579,7 +579,8 @@ class RobotRecording:
         kind = "policy" if world else "task"
         if event.kind == "step":
             step = {"step": event.step, "observation": dict(event.observation), "action": dict(event.action)}
-            self._take(STEP, {**step, **robot})
+            led = {"led_by": event.led_by} if event.led_by else {}
+            self._take(STEP, {**step, **led, **robot})
         elif event.kind == "started":
             self._take(f"{kind}Started", {"instruction": event.instruction, "policy_provider": event.policy, **robot})
         else:

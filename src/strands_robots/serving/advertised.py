@@ -35,8 +35,8 @@ READS = frozenset(
 
 STOPS = frozenset({"stop", "stopMotion"})
 
-RESUMES = frozenset({"resume", "renewControl", "releaseControl", "takeControl"})
-"""Verbs that free a robot and move nothing."""
+RESUMES = frozenset({"resume", "renewControl", "releaseControl", "takeControl", "leadTo"})
+"""Verbs that need the secret of what was begun before, or a signature, and begin nothing."""
 
 QUICK = READS | STOPS | RESUMES
 """Verbs that are answered at once and start no motion."""
@@ -46,8 +46,20 @@ WAITING = frozenset({"goTo", "moveBy", "moveJoints", "moveTo", "pick", "place", 
 
 STARTING = frozenset(
     {
-        *("acquireControl", "antennas", "body", "disableMotors", "drive", "enableMotors", "execute", "happy", "look"),
-        *("navigateTo", "nod", "playMove", "releaseTorque", "reset", "savePlace", "shake", "sleep", "start", "step"),
+        *("acquireControl", "antennas", "body", "disableMotors", "drive", "enableMotors", "execute", "happy", "lead"),
+        *(
+            "look",
+            "navigateTo",
+            "nod",
+            "playMove",
+            "releaseTorque",
+            "reset",
+            "savePlace",
+            "shake",
+            "sleep",
+            "start",
+            "step",
+        ),
         *("teleop_receive", "wakeUp"),
     }
 )
@@ -57,7 +69,8 @@ VERBS = QUICK | WAITING | STARTING
 
 TEXTS = frozenset(
     {
-        *("camera", "device_name", "direction", "frame_id", "instruction", "kind", "lease_id", "library", "motor_ids"),
+        *("camera", "device_name", "direction", "frame_id", "guide", "instruction", "kind", "lead_id"),
+        *("leader", "lease_id", "library", "motor_ids"),
         *("move_name", "nonce", "object", "on", "picture", "place", "policy_host", "policy_provider"),
         *("pretrained_name_or_path", "reason", "robot_name", "source_peer_id", "task_id"),
     }

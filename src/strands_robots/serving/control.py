@@ -82,6 +82,11 @@ class NotHolderError(StrandsRobotsError, RuntimeError):
         super().__init__(text)
         self.envelope: Envelope = error(text, code=code, **facts)
 
+    def naming(self, leader: str) -> NotHolderError:
+        """Return it with the leader that drives the robot."""
+        facts = {name: value for name, value in self.envelope.items() if name not in ("status", "content", "reason")}
+        return NotHolderError(f"{self} {leader} leads it.", **facts, leader=leader)
+
 
 @dataclass(frozen=True, slots=True)
 class Lease:
@@ -361,7 +366,7 @@ class ControlLease:
                 raise self._not_holder("acquireControl", lease)
             if leader:
                 # Whoever sits at the robot must not be halted by a lease that ends.
-                text = f"acquireControl is refused: {leader} ({HUMAN}) leads it at its own machine."
+                text = f"acquireControl is refused: {leader} ({HUMAN}) leads it."
                 raise NotHolderError(text, "not_holder", holder=leader, kind=HUMAN)
             given = self._give(holder, kind, ttl_s)
             answer = self._answer(given, self.epoch)

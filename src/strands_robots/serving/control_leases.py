@@ -20,6 +20,7 @@ from strands_robots.serving.control import (
     ControlChange,
     ControlLease,
     FirstEpoch,
+    NotHolderError,
     OnChange,
     doubts,
 )
@@ -126,10 +127,13 @@ class ControlLeases:
         Raises:
             NotHolderError: another holds the robot, or the lease is over.
         """
-        if self._only is not None:
-            return self._only.admit(command, caller, lease_id, ttl_s, **how)
-        if name is not None or not holds_robots(self._robot()):
-            return self.of(name or "").admit(command, caller, lease_id, ttl_s, **how)
+        if name is not None or self._only is not None or not holds_robots(self._robot()):
+            lease = self._only or self.of(name or "")
+            try:
+                return lease.admit(command, caller, lease_id, ttl_s, **how)
+            except NotHolderError as exc:
+                leader = self._led_by(name or "")
+                raise (exc.naming(leader) if leader else exc) from None
         for each in tuple(self._by_name.values()):
             each.refuse_others(command, caller, lease_id)
         return Leave()

@@ -137,8 +137,19 @@ STOPS = frozenset({"stop", "halt", "estop", "emergencyStop", "stopMotion", "stop
 
 MEMBERS = frozenset(
     {
-        *("call", "verbs", "status", "state", "features", "events", "picture", "control", "id", "type", "model"),
-        *("network", "address", "robots", "rediscovered", "describe", "hasStop", "hasLockout", "hasLease", "leftOut"),
+        *("call", "verbs", "status", "state", "features", "events", "picture", "control", "lead", "id", "type"),
+        *(
+            "model",
+            "network",
+            "address",
+            "robots",
+            "rediscovered",
+            "describe",
+            "hasStop",
+            "hasLockout",
+            "hasLease",
+            "leftOut",
+        ),
         *("close", "tags", "where", "invoke"),
         *("functions", "identity", "labels", "capabilities", "connect", "disconnect", "requestRegistration"),
     }

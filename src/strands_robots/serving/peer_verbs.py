@@ -31,6 +31,7 @@ from strands_robots.safety.gate import MotionRequest
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.arm_verbs import ARM_MOTION_VERBS, PICTURE_VERBS, for_robot
 from strands_robots.serving.control_leases import CONTROL_VERBS
+from strands_robots.serving.lead_verbs import LEAD_VERBS
 from strands_robots.serving.offered_verbs import offered
 from strands_robots.serving.policy_arguments import known_provider, policy_host, repository, vector
 from strands_robots.serving.reachy_verbs import REACHY_VERBS
@@ -281,7 +282,7 @@ PEER_VERBS = table(
         _peer_verb("describe", Kind.READ, "Describe the verbs of the robot, with parameters.", returns="functions"),
         *(
             for_robot(verb, _PEER_ROBOT, leaves_out=True)
-            for verb in (*ARM_MOTION_VERBS.values(), *CONTROL_VERBS.values())
+            for verb in (*ARM_MOTION_VERBS.values(), *LEAD_VERBS.values(), *CONTROL_VERBS.values())
         ),
         *(replace(verb, leaves_out=True) for verb in (*PICTURE_VERBS.values(), DRIVE, NAVIGATE_TO)),
         *_REACHY,
@@ -294,10 +295,10 @@ TELEOP_VERBS = tuple(name for name in PEER_VERBS if name.startswith("teleop_"))
 _OF_ALL = ("status", "stop", "features", "state", "resume", "ping", "describe", *CONTROL_VERBS)
 _OF_NO_ROBOT = ("ping", "describe")
 _OF_TASKS = ("execute", "start", *(name for name in PEER_VERBS if name.startswith("teleop_")))
-_OF_ARMS = (*_OF_TASKS, "releaseTorque", *ARM_MOTION_VERBS, *PICTURE_VERBS)
+_OF_ARMS = (*_OF_TASKS, "releaseTorque", *ARM_MOTION_VERBS, *LEAD_VERBS, *PICTURE_VERBS)
 
 KINDS: Mapping[str, tuple[str, ...]] = {
-    "world": (*_OF_ALL, "execute", "start", "step", "reset", *ARM_MOTION_VERBS, *PICTURE_VERBS),
+    "world": (*_OF_ALL, "execute", "start", "step", "reset", *ARM_MOTION_VERBS, *LEAD_VERBS, *PICTURE_VERBS),
     "robot": (*_OF_ALL, *_OF_ARMS),
     "mobile_base": (*_OF_ALL, "drive"),
     "navigating_base": (*_OF_ALL, "drive", "navigateTo"),

@@ -17,6 +17,7 @@ from strands_robots.safety.gate import MotionRequest
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.arm_verbs import ARM_MOTION_VERBS, PICTURE_VERBS, WORLD_MOTION_VERBS, for_robot
 from strands_robots.serving.control_leases import CONTROL_VERBS
+from strands_robots.serving.lead_verbs import LEAD_VERBS
 from strands_robots.serving.verbs import (
     DURATION,
     INSTRUCTION,
@@ -175,6 +176,7 @@ TASK_VERBS = table(
         GET_STATE,
         *ARM_MOTION_VERBS.values(),
         *PICTURE_VERBS.values(),
+        *LEAD_VERBS.values(),
         *CONTROL_VERBS.values(),
     ]
 )
@@ -230,7 +232,7 @@ WORLD_VERBS = table(
         ),
         *WORLD_MOTION_VERBS.values(),
         *PICTURE_VERBS.values(),
-        *(for_robot(verb, ROBOT_NAME) for verb in CONTROL_VERBS.values()),
+        *(for_robot(verb, ROBOT_NAME) for verb in (*LEAD_VERBS.values(), *CONTROL_VERBS.values())),
     ]
 )
 

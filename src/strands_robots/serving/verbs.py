@@ -152,6 +152,7 @@ class Verb:
         on_lease: a verb of the control lease; its ``run`` gets ``caller``, ``robot`` and ``leases`` besides.
         note: what callers have to know besides, the second paragraph of its description.
         own: a verb that its robot declares (:func:`~strands_robots.verb_declaration.verb`).
+        streamed: it is sent many times a second, and is in no audit record; what began it is.
         lasts_s: seconds that it may take to return, besides those that each verb of its kind has.
     """
 
@@ -174,6 +175,7 @@ class Verb:
     of_world: bool = False
     note: str = ""
     own: bool = False
+    streamed: bool = False
     lasts_s: float = 0.0
     by_name: Mapping[str, Parameter] = field(init=False, repr=False, compare=False)
     _defaults: Mapping[str, Any] = field(init=False, repr=False, compare=False)
