@@ -22,7 +22,7 @@ EACH = [Kill("recorder", 0.2, ""), Kill("encoder", None, ""), Kill("robot", 0.9,
     ids=["all is well", "one is lost", "cut too short", "a part was never killed"],
 )
 def test_kills_keep_their_bound_where_nothing_is_lost(kills: list[Kill], lost: list[str], kept: bool) -> None:
-    assert kills_row(kills, 5, lost).ok is kept
+    assert kills_row(kills, 5, lost, 5).ok is kept
 
 
 @pytest.mark.parametrize(
