@@ -39,11 +39,14 @@ PARTS = {
     "mcp": "Robots for MCP clients",
     "recording": "Recording where robots are served",
     "dataset": "Recording of datasets",
+    "dataset-train": "Training on a recorded dataset",
     "dashboard": "The operator's page in Chromium",
     "ros": "Robots on ROS graphs",
     "arm": "A real arm (in the environment of `make real-arm`)",
 }
 
+HOURS = {"dataset-train"}
+"""Parts that are measured only when they are asked for by name."""
 
 INTRODUCTION = """# Benchmarks
 
@@ -87,11 +90,18 @@ def write(page: Path, measured: Mapping[str, str]) -> None:
     page.write_text("\n".join([introduction, *tables]), encoding="utf-8")
 
 
+def module_of(part: str) -> str:
+    """Return the module of a part."""
+    return part.replace("-", "_")
+
+
 def main() -> int:
     here = Path(__file__).parent
-    available = [name for name in PARTS if (here / f"{name}.py").exists()]
+    available = [name for name in PARTS if (here / f"{module_of(name)}.py").exists()]
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
-    parser.add_argument("parts", nargs="*", metavar="PART", help=f"what to measure: {', '.join(available)} (all)")
+    parser.add_argument(
+        "parts", nargs="*", metavar="PART", help=f"what to measure: {', '.join(available)} (all but those of hours)"
+    )
     parser.add_argument("--quick", action="store_true", help="fewer repeats: a look, not a figure to quote")
     parser.add_argument("--markdown", type=Path, metavar="FILE", help="also write the tables there")
     options = parser.parse_args()
@@ -100,9 +110,9 @@ def main() -> int:
 
     console, kept = Console(), True
     pages: dict[str, str] = {}
-    for name in options.parts or available:
+    for name in options.parts or [each for each in available if each not in HOURS]:
         started = time.monotonic()
-        rows: list[Row] = importlib.import_module(f"benchmarks.{name}").run(quick=options.quick)
+        rows: list[Row] = importlib.import_module(f"benchmarks.{module_of(name)}").run(quick=options.quick)
         kept = kept and all(row.ok for row in rows)
         console.print(shown(PARTS[name], rows))
         console.print(f"[dim]{time.monotonic() - started:.0f} s, Python {platform.python_version()}[/]\n")

@@ -13,7 +13,7 @@ import sys
 import time
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from fixtures.devices import RecordingDevice
@@ -23,6 +23,7 @@ from benchmarks.dataset_children import FPS, TASK, RecordedArm, cpu_seconds
 from strands_robots.datasets.layout import read_info
 from strands_robots.hardware import HardwareRobot
 
+LEROBOT = ("lerobot.configs", "lerobot.datasets.lerobot_dataset")
 CAMERAS = ("front", "wrist")
 JOINTS = tuple(f"joint_{number}.pos" for number in range(6))
 IDLE_SHARE = 0.5
@@ -62,6 +63,8 @@ def ours(seconds: float, folder: Path) -> tuple[float, int]:
 
 def theirs(seconds: float, folder: Path, *, streaming: bool) -> tuple[float, int]:
     """Record an episode with LeRobot's own writer; return CPU seconds and frames."""
+    for module in LEROBOT:
+        import_module(module)
     began = cpu_seconds()
     loop(seconds * IDLE_SHARE, None)
     idle = (cpu_seconds() - began) / IDLE_SHARE
@@ -75,8 +78,7 @@ def theirs(seconds: float, folder: Path, *, streaming: bool) -> tuple[float, int
 
 def lerobots(folder: Path, *, streaming: bool) -> Any:
     """Return a new dataset of LeRobot's, as ``lerobot-record`` makes it, with our codec and its settings."""
-    configs: Any = import_module("lerobot.configs")
-    datasets: Any = import_module("lerobot.datasets.lerobot_dataset")
+    configs, datasets = (cast("Any", import_module(module)) for module in LEROBOT)
     vector = {"dtype": "float32", "shape": (len(JOINTS),), "names": list(JOINTS)}
     picture = {"dtype": "video", "shape": (HEIGHT, WIDTH, 3), "names": ["height", "width", "channels"]}
     cameras = {f"observation.images.{name}": picture for name in CAMERAS}
@@ -118,7 +120,7 @@ def save_until_killed(seconds: float, folder: Path) -> None:
 
 def readable(folder: Path) -> int:
     """Return how many episodes LeRobot reads of a dataset."""
-    datasets: Any = import_module("lerobot.datasets.lerobot_dataset")
+    datasets: Any = import_module(LEROBOT[1])
     try:
         dataset = datasets.LeRobotDataset("bench/set", root=folder / "set")
         return len({int(dataset[number]["episode_index"]) for number in range(dataset.num_frames)})

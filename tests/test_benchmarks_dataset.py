@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from benchmarks.dataset import beat_row, kills_row, stops_row, writer_rows
+from benchmarks.dataset_train import paired_interval, train_row
 from fixtures.killed_recorders import Kill, missing_s
 from fixtures.replayed_cameras import ReplayedCamera, stamp, stamped
 
@@ -63,3 +64,13 @@ def test_each_picture_carries_its_number() -> None:
     noisy = stamp(np.full((240, 320, 3), 128, dtype=np.uint8), 54_321).astype(int)
     noise = np.random.default_rng(1).integers(-40, 40, noisy.shape)
     assert stamped(np.clip(noisy + noise, 0, 255).astype(np.uint8)) == 54_321
+
+
+def test_two_policies_are_compared_seed_by_seed() -> None:
+    better = [True] * 90 + [False] * 10
+    assert paired_interval(better, better) == (0.0, 0.0, 0.0)
+    mean, low, high = paired_interval([False] * 5 + better[5:], better)
+    assert (mean, low) == (pytest.approx(-0.05), pytest.approx(-0.0929, abs=1e-3))
+    assert high < 0
+    assert train_row(better, better, 100, 2500).ok
+    assert not train_row([False] * 8 + better[8:], better, 100, 2500).ok
