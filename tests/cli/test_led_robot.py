@@ -14,6 +14,7 @@ from fixtures.leaders import ScriptedLeader
 from fixtures.waiting import eventually
 
 from strands_robots.cli import output, teleop
+from strands_robots.cli.leading import begin_policy
 from strands_robots.cli.led_robot import LedRobot, Serving, halted_first
 from strands_robots.cli.output import CliError, Screen, wait_until
 from strands_robots.hardware import HardwareRobot
@@ -51,6 +52,23 @@ def test_leader_holds_the_robot_by_name_until_it_leads_no_more(arm: HardwareRobo
         leases.of().acquire("alice", "human", 10.0)
     arm.stop_teleoperate()
     assert leases.facts()["held"] is False
+
+
+def test_policy_that_the_command_runs_holds_the_robot_by_name_and_ends_with_a_stop(
+    arm: HardwareRobot, leases: ControlLeases
+) -> None:
+    led = LedRobot(arm, "arm-1")
+    task = begin_policy(Screen(), led, "mock", "wave", 30.0)
+    eventually(lambda: task.step_count > 0, within=5)
+    with pytest.raises(NotHolderError, match=r"mock \(agent\) holds control"):
+        leases.admit("moveJoints", "alice", "", "")
+    assert stop_executor().submit(arm, "arm-1", "stopped by alice").result().stopped
+    assert (led.stopped, led.stopped_by, task.voided) == (True, "stopped by alice.", True)
+    latch = LockoutLatch("arm-1")
+    latch.engage("0" * 32, "bob", "smoke")
+    arm.gate.attach(latch)
+    with pytest.raises(CliError, match="locked by the emergency stop of bob"):
+        begin_policy(Screen(), LedRobot(arm), "mock", "wave", 30.0)
 
 
 def test_robot_that_another_holds_is_not_led(arm: HardwareRobot, leases: ControlLeases) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -12,22 +12,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from strands_robots.cli.leading import (
-    LEADER,
-    MANUAL,
-    TeleopOptions,
-    announce,
-    arm_options,
-    begin,
-    check_keys,
-    connected_leader,
-    made_follower,
-)
+from strands_robots import settings
+from strands_robots.cli.leading import arm_options, is_own, made_follower
 from strands_robots.cli.led_robot import Serving, halted_first
 from strands_robots.cli.network import Network, answering, say_missing
 from strands_robots.cli.output import CliError, Screen
+from strands_robots.cli.policy import PoliciesFile
 from strands_robots.cli.record import NO_CAMERAS
 from strands_robots.cli.teleop import MESH_PREFIX, Calibration, FollowerId, NoNetwork, PeerId
+from strands_robots.policies import resolve_provider
 from strands_robots.utils import ValidationError, identifier, number, text, whole
 
 if TYPE_CHECKING:
@@ -61,8 +54,14 @@ def record(
         ),
     ] = None,
     policy: Annotated[
-        str | None, typer.Option("--policy", help="In its place: a policy that a served robot runs.", metavar="NAME")
+        str | None,
+        typer.Option(
+            "--policy",
+            help="In its place: a policy or a profile of one, which this command runs, or else the served robot.",
+            metavar="NAME",
+        ),
     ] = None,
+    policies: PoliciesFile = None,
     episodes: Annotated[int, typer.Option("--episodes", help="How many to save.")] = 50,
     fps: Annotated[int, typer.Option("--fps", help="Frames a second.")] = 30,
     episode_s: Annotated[
@@ -85,10 +84,10 @@ def record(
     no_network: NoNetwork = False,
 ) -> None:
     """Record episodes of a robot that is led. What is saved outlives a kill."""
-    from strands_robots.cli.dataset_recording import Attempts, Keys, LocalAttempts, record_attempts  # noqa: PLC0415 - an extra
+    from strands_robots.cli.dataset_recording import Attempts, Keys, record_attempts  # noqa: PLC0415 - an extra
+    from strands_robots.cli.local_recording import LocalAttempts, leader_drives, policy_drives  # noqa: PLC0415 - as above
     from strands_robots.datasets.session import RecordingSession  # noqa: PLC0415 - as above
     from strands_robots.recording.cameras import chosen_frames  # noqa: PLC0415 - as above
-    from strands_robots.teleoperators import RecordedLeader  # noqa: PLC0415 - as above
 
     whole("--episodes", episodes, low=1, high=10_000)
     number("--pause-s", pause_s, low=0, high=3600)
@@ -100,57 +99,46 @@ def record(
         raise ValidationError("--episode-s is needed without a terminal: nobody says when an attempt is over.")
     keys = Keys() if asked else None
     names = None if cameras is None else [name for name in cameras.split(",") if name]
-    if leader is None or leader == PAGE:
+    of_leader = arm_options("", leader_id, leader_calibration)
+    if policies is not None and not (policy and is_own(robot)):
+        raise ValidationError("--policies goes with --policy and a robot of this command; a served one has its own.")
+    if policy is not None and of_leader:
+        raise ValidationError("--leader-id and --leader-calibration go with a leader arm, not with --policy.")
+    if leader == PAGE or (policy is not None and not is_own(robot)):
         given = (follower_id, calibration, leader_id, leader_calibration, peer_id)
         if no_network or any(each is not None for each in given):
             raise ValidationError(
-                f"--policy and --leader {PAGE} go with a served robot, and without options of an arm."
+                f"--policy and --leader {PAGE} go with a served robot, such as {robot}, without options of an arm."
             )
         with served_robot(screen, network, robot, policy or "", task, names) as far:
             attempts = Attempts(episodes, partial(far.begin, longest), fps, longest, pause_s, success, keys)
             _record_served(screen, folder, far, task, attempts)
         return
-    if leader.startswith(MESH_PREFIX) or robot.startswith(MESH_PREFIX):
+    if (leader or "").startswith(MESH_PREFIX) or robot.startswith(MESH_PREFIX):
         raise ValidationError(
             "--leader must be of this machine, and --robot one of this command; "
             f"--leader {PAGE} and --policy NAME record a served robot."
         )
     how = Serving.of(network, peer_id, None, alone=no_network)
-    manual, arm = leader in MANUAL, arm_options("", follower_id, calibration)
-    options = TeleopOptions(leader if manual else "arm")
-    kind, of_leader = robot.partition("@")[0], arm_options("", leader_id, leader_calibration)
-    turn = ExitStack()
-
-    def connected() -> AbstractContextManager[Any]:
-        return connected_leader(leader, led.robot, of_leader, (lambda key: None) if keys is None else keys.pressed)
-
+    if policies is not None:
+        settings.put("STRANDS_POLICIES", str(policies))
+    if policy is not None:
+        resolve_provider(policy)
+    kind, arm = robot.partition("@")[0], arm_options("", follower_id, calibration)
+    drives = (
+        partial(policy_drives, screen, policy, task, longest)
+        if policy
+        else partial(leader_drives, screen, leader or "", robot, of_leader, keys)
+    )
     with (
         RecordingSession(folder, fps, task, kind, lambda said: screen.say(said, "yellow")) as session,
         made_follower(screen, robot, arm, None, how, SERVED) as led,
-        # What a hand moves begins each attempt where the robot then is.
-        nullcontext() if manual else connected() as lasting,
+        drives(led) as driver,
         halted_first(led.robot),
     ):
-        recorded = isinstance(lasting, RecordedLeader)
-        if not manual:
-            check_keys(robot, lasting, led.robot.body().bounds)
-            announce(screen, leader, robot, lasting)
-
-        def lead() -> Any:
-            source: Any = turn.enter_context(connected()) if manual else lasting
-            if manual:
-                announce(screen, leader, robot, source)
-            if keys is not None and leader == "keyboard":
-                keys.leading = True
-                turn.callback(setattr, keys, "leading", False)
-            if recorded:
-                source.rewind()
-            begin(screen, led, leader, source, options, publish=False)
-            return led.robot.tasks.by_leader[LEADER]
-
         frames = None if names == [NO_CAMERAS] else chosen_frames(led.robot, names)
-        local = LocalAttempts(led, frames, turn, person=not recorded)
-        record_attempts(screen, local, session, Attempts(episodes, lead, fps, longest, pause_s, success, keys))
+        local = LocalAttempts(led, frames, driver)
+        record_attempts(screen, local, session, Attempts(episodes, driver.begin, fps, longest, pause_s, success, keys))
         count = session.episodes
     _tell_dataset(screen, folder, count)
 

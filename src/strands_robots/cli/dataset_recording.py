@@ -8,24 +8,20 @@ import sys
 import termios
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass, replace
 from enum import Enum
 from typing import TYPE_CHECKING, Any, Protocol
 
-from strands_robots.cli.led_robot import LedRobot
 from strands_robots.cli.output import POLL_S, CliError, Screen, wait_until
-from strands_robots.datasets.recorded import ATTEMPT_ENDED, LED_BY_PERSON
-from strands_robots.recording.cameras import Frames
-from strands_robots.recording.file import Pictures, Recorder, RobotRecording
+from strands_robots.datasets.recorded import ATTEMPT_ENDED
+from strands_robots.recording.file import Pictures, Recorder
 from strands_robots.safety.stopping import StopVerdict
 
 if TYPE_CHECKING:
     from strands_robots.datasets.encoder import CameraEncoder
     from strands_robots.datasets.session import RecordingSession
-
-CAMERAS_HZ_MAX = 60
 
 
 class Said(Enum):
@@ -145,58 +141,6 @@ class AttemptRobot(Protocol):
 
     def hold(self, screen: Screen) -> object:
         """Tell who stopped it, and keep it on the network."""
-
-
-class LocalAttempts:
-    """A led robot of this process, as :func:`record_attempts` takes it.
-
-    Args:
-        led: the robot, served.
-        frames: takes its pictures; None for none.
-        turn: closed at the end of each attempt, with the leader that was made for it.
-        person: a person leads.
-    """
-
-    def __init__(self, led: LedRobot, frames: Frames | None, turn: ExitStack, *, person: bool) -> None:
-        self._led, self._frames, self._turn, self._person = led, frames, turn, person
-
-    @property
-    def name(self) -> str:
-        """Its name in the recording."""
-        return str(self._led.robot.tool_name_str)
-
-    @property
-    def stopped(self) -> bool:
-        """True where others stopped it in this attempt."""
-        return self._led.stopped
-
-    @property
-    def stopped_by(self) -> str:
-        """The reason of the stop, with its caller."""
-        return self._led.stopped_by
-
-    @property
-    def has_cameras(self) -> bool:
-        """True where pictures are recorded."""
-        return self._frames is not None
-
-    @contextmanager
-    def recorded(self, recorder: Recorder, fps: int, pictures: Pictures | None) -> Iterator[None]:
-        """Record it in the block, and hand the pictures of its cameras over."""
-        if self._person:
-            recorder.take(self.name, LED_BY_PERSON, {})
-        cameras: dict[str, Any] = {"frames": self._frames, "cameras_hz": min(fps, CAMERAS_HZ_MAX), "pictures": pictures}
-        with self._turn, RobotRecording(self._led.robot, recorder, self.name, **cameras):
-            yield
-
-    def halt(self, reason: str) -> StopVerdict:
-        """Halt it, and return the verdict."""
-        verdict: StopVerdict = self._led.robot.halt(reason)
-        return verdict
-
-    def hold(self, screen: Screen) -> object:
-        """Tell who stopped it, and stay on the network until Ctrl-C."""
-        return self._led.hold(screen)
 
 
 def record_attempts(screen: Screen, led: AttemptRobot, session: RecordingSession, attempts: Attempts) -> None:

@@ -11,15 +11,22 @@ from pathlib import Path
 from typing import Any
 
 from strands_robots.cli.led_robot import LedRobot, Serving, served
-from strands_robots.cli.output import CliError, Screen
+from strands_robots.cli.output import POLL_S, CliError, Screen
 from strands_robots.cli.record import record_robot
 from strands_robots.envelope import is_error, text_of
+from strands_robots.policies import create_policy
 from strands_robots.policies.base import Ranges
+from strands_robots.policies.preload import Warmable
+from strands_robots.policies.rollout import Rollout
+from strands_robots.safety.gate import REFUSALS, refusal_envelope
 from strands_robots.teleoperators import FULL_RANGES_PER_S, PLUG_INS
-from strands_robots.utils import ValidationError
+from strands_robots.utils import DURATION_MAX_S, ValidationError
 
 LEADER = "leader"
 """Name of the leader at its follower."""
+
+EXECUTE = "execute"
+"""The motion of a policy, as callers ask for it."""
 
 ELSEWHERE = "A device of Device Connect takes no frames; serve its robot on the mesh too, and name it mesh:PEER."
 
@@ -67,9 +74,64 @@ def begin(screen: Screen, led: LedRobot, leader: str, source: Any, options: Tele
             robot.teleoperate(LEADER, duration=options.seconds, hz=options.hz, publish=publish),
         ):
             if is_error(answer):
-                if led.peer_id and led.locked:
-                    led.hold(screen)
-                raise CliError(text_of(answer))
+                raise _refused(screen, led, text_of(answer))
+
+
+def begin_policy(screen: Screen, led: LedRobot, policy: str, task: str, seconds: float | None) -> Rollout:
+    """Have a policy drive the robot; return its run.
+
+    Args:
+        screen: where a resume is told.
+        led: the robot.
+        policy: its name, or that of a profile.
+        task: in words.
+        seconds: its longest time; None for as long as one may take.
+
+    Raises:
+        CliError: it was refused. A locked robot stays on the network before, so that its resume reaches it.
+    """
+    tasks = led.robot.tasks
+    with led.held_by(policy, lambda: bool(tasks.running()), EXECUTE):
+        try:
+            new = tasks.of_policy(task, policy, min(seconds or DURATION_MAX_S, DURATION_MAX_S), {})
+            started: Rollout = tasks.start("start_task", "", new)
+        except REFUSALS as refused:
+            raise _refused(screen, led, text_of(refusal_envelope("start_task", refused))) from refused
+    return started
+
+
+def load_policy(screen: Screen, policy: str) -> None:
+    """Wait until a policy is loaded, which may take a large one minutes.
+
+    Raises:
+        ValidationError: there is no such policy.
+        CliError: it cannot be loaded.
+    """
+    made, told = create_policy(policy), False
+    while isinstance(made, Warmable) and (problem := made.warm()) is not None:
+        if problem:
+            raise CliError(f"The policy {policy} could not be loaded: {problem}.")
+        if not told:
+            screen.say(f"The policy {policy} is loading.")
+            told = True
+        time.sleep(POLL_S)
+
+
+def _refused(screen: Screen, led: LedRobot, why: str) -> CliError:
+    """Return the refusal to begin, once a locked robot was resumed."""
+    if led.peer_id and led.locked:
+        led.hold(screen)
+    return CliError(why)
+
+
+def is_own(robot: str) -> bool:
+    """Return True for a robot that a command itself makes.
+
+    It is TYPE@PORT, a model's file, or a name of this or another package; any other name is that of a served robot.
+    """
+    from strands_robots.robot import PLUG_INS as ROBOTS  # noqa: PLC0415 - heavy, and needed by these commands alone
+
+    return "@" in robot or "." in robot or robot in ROBOTS.built_in or ROBOTS.get(robot) is not None
 
 
 def check_keys(follower: str, leader: Any, bounds: Ranges) -> None:

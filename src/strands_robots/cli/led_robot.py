@@ -127,7 +127,7 @@ class LedRobot:
         return self.locked or ("" if stop is None else f"{stop.reason}.")
 
     @contextmanager
-    def held_by(self, leader: str, leads: Callable[[], bool]) -> Iterator[None]:
+    def held_by(self, leader: str, leads: Callable[[], bool], verb: str = FOLLOW) -> Iterator[None]:
         """Begin to lead in the block; hold the control lease while the leader leads.
 
         A stop that comes meanwhile ends that.
@@ -135,6 +135,7 @@ class LedRobot:
         Args:
             leader: the holder's name, as other callers are told.
             leads: returns whether it leads already.
+            verb: of the motion; that of a person by default.
 
         Raises:
             CliError: another holds the robot.
@@ -144,7 +145,7 @@ class LedRobot:
             yield
             return
         try:
-            leave = leases_of(self.robot, hardware=False).admit(FOLLOW, leader, "", "", begun=leads)
+            leave = leases_of(self.robot, hardware=False).admit(verb, leader, "", "", begun=leads)
         except NotHolderError as held:
             raise CliError(text_of(held.envelope)) from held
         try:

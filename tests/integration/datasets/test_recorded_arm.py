@@ -7,9 +7,11 @@ import signal
 import subprocess
 from pathlib import Path
 
+import numpy as np
 import psutil
 import pytest
 from fixtures.command_line import COMMAND
+from fixtures.openpi_server import OpenPiServer
 from fixtures.waiting import eventually, free_port
 from typer.testing import CliRunner
 
@@ -103,6 +105,25 @@ def test_stop_from_the_network_ends_the_recording_and_is_in_it(tmp_path: Path, l
     frames = tables.read_frames(folder / data_file(0))
     assert frames["stop"].max() == 1
     assert not frames["next.success"].any()
+
+
+def test_profile_of_a_policy_drives_a_robot_of_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STRANDS_POLICIES", "")  # which the command sets
+    folder, keys = tmp_path / "set", json.dumps(JOINTS)
+    told = [0.1, -1.9, 1.9, 0.9, 0.0, 0.3]
+    with OpenPiServer(lambda observation: {"actions": np.full((10, 6), told, np.float32)}) as server:
+        file = tmp_path / "policies.toml"
+        entries = f'url = "{server.url}"\nstate = {keys}\naction = {keys}\nunits = "radians"\nrate = 30\n'
+        file.write_text(f'[pi]\nprovider = "openpi"\n{entries}')
+        line = ["--policy", "pi", "--policies", str(file), "--task", "reach", "--episodes", "2", "--episode-s", "0.7"]
+        words = ["dataset", "record", str(folder), "--robot", "so100", *line, "--pause-s", "0", "--no-network"]
+        done = CliRunner().invoke(build("dataset"), [*words, "--cameras", "none"])
+    assert done.exit_code == 0, done.output
+    info, found = check_dataset(folder)
+    assert (info.episodes, [each for each in found if each.wrong]) == (2, [])
+    frames = tables.read_frames(folder / data_file(1))
+    assert np.allclose(frames["action"][-1], told, atol=0.02)
+    assert (frames["stop"].any(), frames["intervention"].any()) == (False, False)
 
 
 def test_recording_refuses_what_it_cannot_do(tmp_path: Path, leader: Path) -> None:

@@ -1,0 +1,161 @@
+"""Recording of a robot of this command: its driver, and its readings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from dataclasses import dataclass
+from typing import Any
+
+from strands_robots.cli.dataset_recording import Keys
+from strands_robots.cli.leading import (
+    LEADER,
+    MANUAL,
+    TeleopOptions,
+    announce,
+    begin,
+    begin_policy,
+    check_keys,
+    connected_leader,
+    load_policy,
+)
+from strands_robots.cli.led_robot import LedRobot
+from strands_robots.cli.output import Screen
+from strands_robots.datasets.recorded import LED_BY_PERSON
+from strands_robots.recording.cameras import Frames
+from strands_robots.recording.file import Pictures, Recorder, RobotRecording
+from strands_robots.safety.stopping import StopVerdict
+from strands_robots.teleoperators import RecordedLeader
+
+CAMERAS_HZ_MAX = 60
+
+
+@dataclass(frozen=True, slots=True)
+class Driver:
+    """Driver of a robot in its attempts.
+
+    Args:
+        begin: begins one; returns its task.
+        turn: closed at the end of each attempt.
+        person: a person leads.
+    """
+
+    begin: Callable[[], Any]
+    turn: ExitStack
+    person: bool = False
+
+
+@contextmanager
+def policy_drives(screen: Screen, policy: str, task: str, seconds: float | None, led: LedRobot) -> Iterator[Driver]:
+    """Have a policy drive the robot in each attempt of the block.
+
+    Raises:
+        ValidationError: there is no such policy.
+        CliError: it cannot be loaded.
+    """
+
+    def started() -> Any:
+        # Loaded already but after a failure: the next attempt waits for it, not the caller.
+        load_policy(screen, policy)
+        return begin_policy(screen, led, policy, task, seconds)
+
+    load_policy(screen, policy)
+    screen.say(f"The policy {policy} drives {led.robot.tool_name_str}. Ctrl-C stops the robot.")
+    yield Driver(started, ExitStack())
+
+
+@contextmanager
+def leader_drives(  # noqa: PLR0917 - one leader, and what is done with it
+    screen: Screen, leader: str, robot: str, options: dict[str, Any], keys: Keys | None, led: LedRobot
+) -> Iterator[Driver]:
+    """Have a leader lead the robot in each attempt of the block.
+
+    Args:
+        screen: where its keys are told.
+        leader: as the command line has it.
+        robot: as the command line has it.
+        options: of a leader arm.
+        keys: of the person; None for nobody.
+        led: the robot.
+
+    Raises:
+        ConnectionError: a leader arm cannot be connected.
+        ValidationError: it leads joints that the robot lacks.
+    """
+    manual, turn = leader in MANUAL, ExitStack()
+    how = TeleopOptions(leader if manual else "arm")
+
+    def connected() -> AbstractContextManager[Any]:
+        return connected_leader(leader, led.robot, options, (lambda key: None) if keys is None else keys.pressed)
+
+    # What a hand moves begins each attempt where the robot then is.
+    with nullcontext() if manual else connected() as lasting:
+        recorded = isinstance(lasting, RecordedLeader)
+        if not manual:
+            check_keys(robot, lasting, led.robot.body().bounds)
+            announce(screen, leader, robot, lasting)
+
+        def lead() -> Any:
+            source: Any = turn.enter_context(connected()) if manual else lasting
+            if manual:
+                announce(screen, leader, robot, source)
+            if keys is not None and leader == "keyboard":
+                keys.leading = True
+                turn.callback(setattr, keys, "leading", False)
+            if recorded:
+                source.rewind()
+            begin(screen, led, leader, source, how, publish=False)
+            return led.robot.tasks.by_leader[LEADER]
+
+        yield Driver(lead, turn, person=not recorded)
+
+
+class LocalAttempts:
+    """A robot of this process, as :func:`record_attempts` takes it.
+
+    Args:
+        led: the robot, served.
+        frames: takes its pictures; None for none.
+        driver: of its attempts.
+    """
+
+    def __init__(self, led: LedRobot, frames: Frames | None, driver: Driver) -> None:
+        self._led, self._frames, self._driver = led, frames, driver
+
+    @property
+    def name(self) -> str:
+        """Its name in the recording."""
+        return str(self._led.robot.tool_name_str)
+
+    @property
+    def stopped(self) -> bool:
+        """True where others stopped it in this attempt."""
+        return self._led.stopped
+
+    @property
+    def stopped_by(self) -> str:
+        """The reason of the stop, with its caller."""
+        return self._led.stopped_by
+
+    @property
+    def has_cameras(self) -> bool:
+        """True where pictures are recorded."""
+        return self._frames is not None
+
+    @contextmanager
+    def recorded(self, recorder: Recorder, fps: int, pictures: Pictures | None) -> Iterator[None]:
+        """Record it in the block, and hand the pictures of its cameras over."""
+        if self._driver.person:
+            recorder.take(self.name, LED_BY_PERSON, {})
+        cameras: dict[str, Any] = {"frames": self._frames, "cameras_hz": min(fps, CAMERAS_HZ_MAX), "pictures": pictures}
+        with self._driver.turn, RobotRecording(self._led.robot, recorder, self.name, **cameras):
+            yield
+
+    def halt(self, reason: str) -> StopVerdict:
+        """Halt it, and return the verdict."""
+        verdict: StopVerdict = self._led.robot.halt(reason)
+        return verdict
+
+    def hold(self, screen: Screen) -> object:
+        """Tell who stopped it, and stay on the network until Ctrl-C."""
+        return self._led.hold(screen)
