@@ -147,8 +147,9 @@ class LocalAttempts:
         """Record it in the block, and hand the pictures of its cameras over."""
         if self._driver.person:
             recorder.take(self.name, LED_BY_PERSON, {})
-        cameras: dict[str, Any] = {"frames": self._frames, "cameras_hz": min(fps, CAMERAS_HZ_MAX), "pictures": pictures}
-        with self._driver.turn, RobotRecording(self._led.robot, recorder, self.name, **cameras):
+        how: dict[str, Any] = {"frames": self._frames, "cameras_hz": min(fps, CAMERAS_HZ_MAX), "pictures": pictures}
+        # An episode has the joints of its steps.
+        with self._driver.turn, RobotRecording(self._led.robot, recorder, self.name, joints_hz=1, **how):
             yield
 
     def halt(self, reason: str) -> StopVerdict:

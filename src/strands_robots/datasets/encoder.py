@@ -12,7 +12,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -22,13 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from strands_robots.datasets.encoded import cameras_folder
+from strands_robots.datasets.encoder_process import FREE, SLOTS, USED, memory_bytes
 from strands_robots.datasets.layout import FPS_MAX, DatasetError, checked_feature_name
-from strands_robots.utils import ValidationError, optional_module, shown, whole
+from strands_robots.utils import ValidationError, optional_module, whole
 
 PROGRAM = (sys.executable, "-m", "strands_robots.datasets.encoder_process")
-
-SLOTS = 8
-"""Pictures of a camera that may wait for the encoder."""
 
 PICTURE_BYTES = 2**26
 """Largest picture as pixels."""
@@ -131,15 +129,13 @@ class CameraEncoder:
         with self._lock:
             if not self._running:
                 return False
-            self._hear()
             known = self._cameras.get(camera) or self._made(camera, sides)
             if sides != known.sides:
                 raise ValidationError(f"pictures of {camera} must be {known.sides} as its first one, not {sides}.")
-            if self._failed or not known.free:
+            slot = -1 if self._failed else known.put(pixels)
+            if slot < 0:
                 self.dropped[camera] += 1
                 return False
-            slot, start = known.free[0], known.free.popleft() * known.size
-            np.copyto(known.bytes[start : start + pixels.size].reshape(pixels.shape), pixels)
             self._send({"picture": camera, "slot": slot, "length": pixels.size, "at": moment})
             return not self._failed
 
@@ -185,9 +181,9 @@ class CameraEncoder:
             )
 
     def _made(self, camera: str, sides: tuple[int, int] | None) -> _Camera:
-        made = self._cameras[camera] = _Camera(sides)
+        made = self._cameras[checked_feature_name(camera)] = _Camera(sides)
         try:
-            order = {"camera": camera, "slots": SLOTS, "size": made.size, "sides": sides}
+            order = {"camera": camera, "size": made.size, "sides": sides}
             self._send(order, made.descriptor)
         finally:
             os.close(made.descriptor)
@@ -202,7 +198,10 @@ class CameraEncoder:
         data = json.dumps(order).encode() + b"\n"
         sent = 0
         with suppress(OSError):
-            sent = socket.send_fds(self._socket, [data], descriptors, socket.MSG_DONTWAIT)
+            if descriptors:
+                sent = socket.send_fds(self._socket, [data], descriptors, socket.MSG_DONTWAIT)
+            else:
+                sent = self._socket.send(data, socket.MSG_DONTWAIT)
         if sent != len(data):
             self._gone()
 
@@ -213,7 +212,7 @@ class CameraEncoder:
         """Take what the process says, without waiting."""
         while True:
             try:
-                data = self._socket.recv(65_536, socket.MSG_DONTWAIT)
+                data = self._socket.recv(4096, socket.MSG_DONTWAIT)
             except BlockingIOError:
                 return
             except OSError:
@@ -226,11 +225,7 @@ class CameraEncoder:
                 self._take(json.loads(line))
 
     def _take(self, said: dict[str, Any]) -> None:
-        if "free" in said:
-            name, slot = said["free"]
-            if name in self._cameras:
-                self._cameras[name].free.append(slot)
-        elif "failed" in said:
+        if "failed" in said:
             self._failed = self._failed or said["failed"]
         elif "ended" in said:
             # Those that were replaced were taken here, and not counted.
@@ -259,9 +254,20 @@ class _Camera:
 
     def __init__(self, sides: tuple[int, int] | None) -> None:
         self.sides, self.size = sides, JPEG_BYTES if sides is None else sides[0] * sides[1] * 3
-        self.free = deque(range(SLOTS))
-        self.descriptor = _shared(SLOTS * self.size)
-        self.bytes = np.frombuffer(mmap.mmap(self.descriptor, SLOTS * self.size), np.uint8)
+        self.descriptor = _shared(memory_bytes(self.size))
+        self._memory = mmap.mmap(self.descriptor, memory_bytes(self.size))
+        self._bytes = np.frombuffer(self._memory, np.uint8)
+
+    def put(self, pixels: NDArray[np.uint8]) -> int:
+        """Copy a picture in, and return its slot; -1 where none is free."""
+        used = SLOTS * self.size
+        place = self._memory.find(FREE, used)
+        if place < 0:
+            return -1
+        start = (place - used) * self.size
+        np.copyto(self._bytes[start : start + pixels.size].reshape(pixels.shape), pixels)
+        self._memory[place] = USED
+        return place - used
 
 
 def _sides(camera: str, picture: object) -> tuple[int, int] | None:
@@ -270,18 +276,18 @@ def _sides(camera: str, picture: object) -> tuple[int, int] | None:
     Raises:
         ValidationError: it is no picture that can be encoded.
     """
-    checked_feature_name(camera)
     if isinstance(picture, bytes):
         if not picture.startswith(b"\xff\xd8") or len(picture) > JPEG_BYTES:
             raise ValidationError(f"a picture of {camera} must be a JPEG of up to {JPEG_BYTES:,} bytes.")
         return None
-    shape, kind = tuple(getattr(picture, "shape", ())), str(getattr(picture, "dtype", ""))
-    if len(shape) != 3 or shape[2] != 3 or kind != "uint8" or not 0 < shape[0] * shape[1] * 3 <= PICTURE_BYTES:
-        raise ValidationError(
-            f"a picture of {camera} must be height x width x 3 of uint8 of up to {PICTURE_BYTES:,} bytes, "
-            f"not {shown(shape)} of {kind or type(picture).__name__}."
-        )
-    return shape[1], shape[0]
+    if isinstance(picture, np.ndarray) and picture.dtype == np.uint8:
+        shape = picture.shape
+        if len(shape) == 3 and shape[2] == 3 and 0 < picture.size <= PICTURE_BYTES:
+            return shape[1], shape[0]
+    found = f"{picture.dtype} of {picture.shape}" if isinstance(picture, np.ndarray) else type(picture).__name__
+    raise ValidationError(
+        f"a picture of {camera} must be height x width x 3 of uint8 of up to {PICTURE_BYTES:,} bytes, not {found}."
+    )
 
 
 def _shared(size: int) -> int:

@@ -16,6 +16,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,15 +27,26 @@ from strands_robots.datasets.encoded import ROW, ROWS, VIDEO, write_statistics
 from strands_robots.datasets.video import GROUP, VideoWriter, decoded
 from strands_robots.errors import StrandsRobotsError
 
-NICENESS = 5
+NICENESS = 19
 
 MARGIN_S = 0.005
 """Time after a moment for which a picture of that moment may still be copied."""
 
-BEHIND_S = 10.0
+BEHIND_S = 30.0
 """It gives the attempt up where it is so far behind the clock."""
 
 SOON_S = 1e-5
+
+SLOTS = 8
+"""Pictures of a camera that may wait here."""
+
+FREE, USED = b"\0", 1
+"""Byte of a slot, behind all slots: the recorder sets it before its order, and this process once it has the picture."""
+
+
+def memory_bytes(size: int) -> int:
+    """Return the memory of a camera whose pictures have up to ``size`` bytes."""
+    return SLOTS * (size + 1)
 
 
 class _Camera:
@@ -45,12 +57,9 @@ class _Camera:
         fps: pictures a second.
         memory: of its pictures, ``size`` bytes each.
         sides: width and height of pixels; None of pictures that come as JPEG.
-        free: called with the slot of a picture that was taken.
     """
 
-    def __init__(  # noqa: PLR0917 - one camera
-        self, video: Path, fps: int, memory: mmap.mmap, size: int, sides: list[int] | None, free: Callable[[int], None]
-    ) -> None:
+    def __init__(self, video: Path, fps: int, memory: mmap.mmap, size: int, sides: list[int] | None) -> None:
         self.waiting = deque[tuple[float, int, int]]()
         """Arrival, slot and length of each picture that came."""
 
@@ -59,7 +68,7 @@ class _Camera:
 
         self.failed = ""
         self._video, self._fps, self._memory, self._size = video, fps, memory, size
-        self._sides, self._free = sides, free
+        self._sides = sides
         self._writer: VideoWriter | None = None
         self._rows: Any = None
         self._shown = (0.0, b"")
@@ -113,6 +122,9 @@ class _Camera:
                 self._writer.discard()
             else:
                 write_statistics(self._video, self._writer.finish().statistics)
+
+    def _free(self, slot: int) -> None:
+        self._memory[SLOTS * self._size + slot] = FREE[0]
 
     def _pixels(self, data: bytes) -> Any:
         if self._sides is None:
@@ -190,14 +202,10 @@ class _Encoder:
                 camera.waiting.append((order["at"], order["slot"], order["length"]))
         elif "camera" in order:
             name, descriptor = order["camera"], self._descriptors.popleft()
-            memory = mmap.mmap(descriptor, order["slots"] * order["size"])
+            memory = mmap.mmap(descriptor, memory_bytes(order["size"]))
             os.close(descriptor)
-
-            def free(slot: int) -> None:
-                self._say(free=[name, slot])
-
             video = self._folder / f"{name}{VIDEO}"
-            self._cameras[name] = _Camera(video, self._fps, memory, order["size"], order["sides"], free)
+            self._cameras[name] = _Camera(video, self._fps, memory, order["size"], order["sides"])
         elif "begin" in order:
             # A camera that is read at each beat from now on has its picture well before the next moment.
             self._folder, self._fps, self._began = Path(order["begin"]), order["fps"], time.time()
@@ -213,9 +221,18 @@ class _Encoder:
             return  # the recorder is gone, which the next look at the orders tells
 
 
+def _give_way() -> None:
+    """Run in the time that others leave, so that no control loop waits."""
+    if sys.platform == "linux":
+        with suppress(OSError):
+            os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+            return
+    os.nice(NICENESS)
+
+
 def main(descriptor: int) -> None:
     """Encode for the recorder at the other end of a socket."""
-    os.nice(NICENESS)
+    _give_way()
     with socket.socket(fileno=descriptor) as orders:
         _Encoder(orders).run()
 

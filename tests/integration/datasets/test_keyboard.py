@@ -69,7 +69,7 @@ def attempt(terminal: Terminal, folder: Path, keys: str, word: str) -> None:
     terminal.shows("drops it and ends")
     running = next((folder / ".running").glob("*.mcap"))
     until = time.monotonic() + 30
-    while running.stat().st_size < 12_000:
+    while running.stat().st_size < 6_000:
         assert time.monotonic() < until
         terminal.press(keys)
         select.select([], [], [], 0.05)
