@@ -26,9 +26,10 @@ from fixtures.child import serve
 from fixtures.replayed_cameras import ReplayedCameras, stamped
 from rich.console import Console
 
-from strands_robots.cli.dataset_recording import Attempts, LocalAttempts, record_attempts
+from strands_robots.cli.dataset_recording import Attempts, record_attempts
 from strands_robots.cli.leading import LEADER, TeleopOptions, begin
 from strands_robots.cli.led_robot import LedRobot
+from strands_robots.cli.local_recording import Driver, LocalAttempts
 from strands_robots.cli.output import Screen
 from strands_robots.contract import RolloutEvent
 from strands_robots.datasets import tables
@@ -102,8 +103,11 @@ class RecordedArm:
 
         with RecordingSession(self.folder, FPS, TASK, "so100", lambda said: None) as session:
             attempts = Attempts(1, lead, FPS, seconds, 0.0, success=True)
-            local = LocalAttempts(self.led, frames, ExitStack(), person=True)
-            record_attempts(self.screen, local, session, attempts)
+            record_attempts(self.screen, self.attempts(frames, lead), session, attempts)
+
+    def attempts(self, frames: Frames | None, begin: Callable[[], Any]) -> LocalAttempts:
+        """Return it as the product's loop for attempts takes it."""
+        return LocalAttempts(self.led, frames, Driver(begin, ExitStack(), person=True))
 
     def periods(self) -> list[float]:
         """Return the times between its beats, in ms."""

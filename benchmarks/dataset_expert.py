@@ -39,7 +39,7 @@ class CubeArm:
     def __init__(self, seed: int = 0) -> None:
         self.is_connected = False
         self._turn = threading.RLock()
-        self._world: Any = None
+        self._world: Any = Simulation("bench", realtime=False)
         self.set_up(seed)
         body = self._world.body(ROBOT)
         self.joint_ranges: Mapping[str, tuple[float, float]] = dict(body.bounds)
@@ -49,8 +49,7 @@ class CubeArm:
     def set_up(self, seed: int, hz: float = HZ) -> None:
         """Put the cube where the seed of an episode has it, and the arm where it begins."""
         with self._turn:
-            if self._world is not None:
-                self._world.cleanup()
+            self._world.cleanup()
             self._world = Simulation("bench", realtime=False, stop_level="hold")
             self._world.add_robot(ROBOT, "so100")
             self._task = task_of(TASK)

@@ -26,7 +26,7 @@ from fixtures.waiting import eventually, free_port
 
 from benchmarks.dataset_children import FPS, TASK, RecordedArm, stored_pictures
 from benchmarks.dataset_writers import CAMERAS, device
-from strands_robots.cli.dataset_recording import Attempts, LocalAttempts, record_attempts
+from strands_robots.cli.dataset_recording import Attempts, record_attempts
 from strands_robots.datasets.session import RecordingSession
 from strands_robots.device_connect import init_device_connect_sync, loopback_config, stop_device_connect
 from strands_robots.hardware import HardwareRobot
@@ -63,8 +63,12 @@ class ServedArm:
 
     def _record(self) -> None:
         with RecordingSession(self._arm.folder, FPS, TASK, "arm", lambda said: None) as session:
-            attempts = Attempts(1, lambda: self._task, FPS, None, 0.0, success=False)
-            local = LocalAttempts(self._arm.led, self._robot.camera_frames, ExitStack(), person=True)
+
+            def begin() -> LastingTask:
+                return self._task
+
+            attempts = Attempts(1, begin, FPS, None, 0.0, success=False)
+            local = self._arm.attempts(self._robot.camera_frames, begin)
             record_attempts(self._arm.screen, local, session, attempts)
 
     def ready(self) -> bool:

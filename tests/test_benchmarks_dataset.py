@@ -74,3 +74,4 @@ def test_two_policies_are_compared_seed_by_seed() -> None:
     assert high < 0
     assert train_row(better, better, 100, 2500).ok
     assert not train_row([False] * 8 + better[8:], better, 100, 2500).ok
+    assert not train_row([False] * 100, [False] * 100, 2, 20).ok, "two that learned nothing are no proof"

@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 from fixtures.episodes import CAMERA, FPS, INFO, JOINTS, episode
 
-from strands_robots.datasets import Dataset, DatasetError, DatasetInfo, Feature, tables
+from strands_robots.datasets import Dataset, DatasetEpisode, DatasetError, DatasetInfo, Feature, tables
 from strands_robots.datasets.check import check_dataset
+from strands_robots.datasets.fit import RobotJoints, robot_findings
 from strands_robots.datasets.layout import STATS, data_file, read_info
 from strands_robots.utils import ValidationError
 
@@ -173,3 +174,15 @@ def test_check_names_what_a_stranger_broke(tmp_path: Path) -> None:
     video.write_bytes(video.read_bytes()[:-200])
     _, found = check_dataset(tmp_path)
     assert {each.where.partition(",")[0] for each in found if each.wrong} >= {"episode 0", "episode 1"}
+
+
+def test_check_looks_at_a_robot_of_one_joint(tmp_path: Path) -> None:
+    joint = Feature("float32", (1,), ("pan",))
+    turn = np.repeat(np.array([0.0, 1.0], dtype=np.float32), 20)
+    with Dataset(tmp_path, DatasetInfo(FPS, {"observation.state": joint, "action": joint})) as dataset:
+        dataset.save(DatasetEpisode("turn", {"observation.state": turn, "action": turn}))
+    info, found = check_dataset(tmp_path)
+    assert [each.said for each in found] == [f"pan of {name} jumps by 1 at frame 20" for name in info.features]
+    ranges = {"ranges": {"pan": [-0.5, 0.5]}, "observation_features": {"pan": ""}, "action_features": {"pan": ""}}
+    outside = robot_findings(tmp_path, info, RobotJoints.of("table", ranges))
+    assert [each.wrong for each in outside] == [True, True]

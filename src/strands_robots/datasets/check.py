@@ -149,7 +149,8 @@ def _jumps(info: DatasetInfo, frames: dict[str, NDArray[Any]]) -> Iterator[str]:
     for key, feature in info.columns.items():
         if key in INDEX or not feature.names or len(frames.get(key, ())) < 3:
             continue
-        values = np.asarray(frames[key], dtype=np.float64)
+        # A vector of one number is a plain column.
+        values = np.asarray(frames[key], dtype=np.float64).reshape(len(frames[key]), -1)
         reach, steps = np.ptp(values, axis=0), np.abs(np.diff(values, axis=0))
         for column in np.flatnonzero((steps.max(axis=0) > JUMP_SHARE * reach) & (reach > STILL)):
             at = int(steps[:, column].argmax()) + 1
