@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from typing import TYPE_CHECKING, Any, Protocol
 
+from strands_robots.cli.attempt_progress import AttemptProgress
 from strands_robots.cli.output import POLL_S, CliError, Screen, wait_until
 from strands_robots.datasets.recorded import ATTEMPT_ENDED
 from strands_robots.recording.file import Pictures, Recorder
@@ -221,7 +222,9 @@ def _attempt(
         recorder = recorded.enter_context(Recorder(session.recording, joints_of_events=False))
         if encoder is not None:
             recorded.enter_context(encoder.attempt(recorder.path))
-        recorded.enter_context(led.recorded(recorder, attempts.fps, None if encoder is None else encoder.offer))
+        progress = AttemptProgress(recorder, attempts.fps, encoder)
+        pictures = None if encoder is None else progress.take_picture
+        recorded.enter_context(led.recorded(recorder, attempts.fps, pictures))
         task, began = attempts.begin(), time.monotonic()
         if attempts.keys is not None:
             screen.say(KEYBOARD if attempts.keys.leading else KEYS)
@@ -247,7 +250,8 @@ def _attempt(
             recorder.take(led.name, ATTEMPT_ENDED, {})
             ends.append(("", led.halt("attempt ended")))
 
-        why = wait_until(screen, over, attempts.seconds or 0.0, at_end=end)
+        with progress.shown(screen):
+            why = wait_until(screen, over, at_end=end)
     stopped_by, verdict = ends[0]
     done = attempts.success and why in ("time", "ended") and not task.error
     word = said[0] if said else Said.SUCCESS if done else Said.FAILURE

@@ -162,6 +162,12 @@ class Screen:
         if not self.machine:
             self.out.print(thing, width=PANEL_WIDTH if isinstance(thing, Panel) and not self.out.is_terminal else None)
 
+    def redraw(self, text: str) -> None:
+        """Draw one line over the one before it; an empty text takes it away."""
+        if self.live:
+            width = max(1, self.out.width - 1)
+            self.out.print(label(text[:width].ljust(width)), end="\r", soft_wrap=True)
+
     def data(self, value: Any) -> None:
         """Print one JSON value on its own line, for programs."""
         if self.machine:

@@ -203,6 +203,10 @@ class Recorder:
         self.path = path
         self.lost = 0
         self.counts: Counter[str] = Counter()
+        self.arrived: dict[str, tuple[float, float]] = {}
+        """Moments of the first and the newest event of each name, in seconds since the epoch."""
+        self._writing: float | None = None
+        self._late_s = 0.0
         self._joints_of_events = joints_of_events
         self._pending: queue.Queue[RecordedItem | None] = queue.Queue(PENDING_MAX)
         self._picture_bytes = 0
@@ -224,9 +228,17 @@ class Recorder:
         if self._failure is not None:
             raise self._failure
 
+    @property
+    def lag_s(self) -> float:
+        """Seconds from the arrival to the writing of the newest item."""
+        writing = self._writing
+        return self._late_s if writing is None else max(self._late_s, time.time() - writing)
+
     def take(self, device: str, event: str, payload: Mapping[str, Any], at: float | None = None) -> None:
         """Record one event, of now or of ``at`` (s since the epoch); returns at once."""
-        self._put(RecordedEvent(time.time() if at is None else at, device, event, payload))
+        moment = time.time() if at is None else at
+        self.arrived[event] = (self.arrived.get(event, (moment,))[0], moment)
+        self._put(RecordedEvent(moment, device, event, payload))
 
     def take_joints(self, device: str, joints: Mapping[str, float]) -> None:
         """Record the joints of this moment; returns at once."""
@@ -251,6 +263,7 @@ class Recorder:
             with self._file as file:
                 channels = _Channels(file, self.counts)
                 while (item := self._next(channels)) is not None:
+                    self._writing = item.at
                     if isinstance(item, RecordedEvent):
                         self._write_event(channels, item)
                     elif isinstance(item, RecordedJoints):
@@ -259,6 +272,7 @@ class Recorder:
                         self._picture_bytes -= len(item.jpeg)
                         data = schemas.compressed_image(_ns(item.at), item.camera, item.jpeg)
                         channels.write(f"/{item.device}/{CAMERA}/{item.camera}", schemas.IMAGE, item.at, data)
+                    self._late_s, self._writing = max(0.0, time.time() - item.at), None
                 channels.finish()
         except Exception as exc:  # noqa: BLE001 - raised to the caller that ends the recording
             self._failure = exc
