@@ -182,7 +182,8 @@ def _record(
         else:
             lacking = _save(screen, session, success=ended.said is Said.SUCCESS)
             if lacking and attempts.keys is None:
-                raise CliError(f"{ended.failed or lacking} Nothing more is recorded.")
+                failed = f"The attempt failed: {ended.failed.rstrip('.')}. " if ended.failed else ""
+                raise CliError(f"{failed}{lacking} Nothing more is recorded.")
             saved += not lacking
         if ended.failed:
             raise CliError(f"The attempt failed: {ended.failed}")
@@ -263,7 +264,7 @@ def _with_pictures(screen: Screen, encoder: CameraEncoder, ended: _Ended) -> _En
     """Tell which pictures an attempt lacks, and return its end."""
     for camera, count in sorted(encoder.dropped.items()):
         screen.data({"event": "dropped", "camera": camera, "pictures": count})
-        screen.say(f"Camera {camera}: {count} pictures were dropped.", "yellow")
+        screen.say(f"Camera {camera}: pictures dropped: {count}.", "yellow")
     if not encoder.failed:
         return ended
     # Its end is not in it.

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -87,6 +88,11 @@ def cameras_folder(recording: Path) -> Path:
     return recording.with_suffix(CAMERAS)
 
 
+def offered_cameras(recording: Path) -> set[str]:
+    """Return the cameras of which a picture came, also where none was encoded."""
+    return {path.name.removesuffix(ROWS) for path in cameras_folder(recording).glob(f"*{ROWS}")}
+
+
 def encoded_videos(recording: Path, fps: int) -> dict[str, EncodedVideo]:
     """Return the videos of a recording by camera.
 
@@ -121,8 +127,8 @@ def common_moments(
         fps: moments a second.
     """
     each = list(videos.values())
-    longest = max(each, key=lambda video: float(video.rows["moment"][0]))
-    moments = np.asarray(longest.rows["moment"])
+    latest = max(each, key=lambda video: float(video.rows["moment"][0]))
+    moments = np.asarray(latest.rows["moment"])
     last = min([last_at, *(float(video.rows["moment"][-1]) for video in each)])
     # Times are kept in nanoseconds, and a step belongs to the frame that it comes with.
     soon = 1e-3 / fps
@@ -148,7 +154,8 @@ def _read(path: Path) -> EncodedVideo | None:
         return None
     rows = path.with_suffix(ROWS).read_bytes()
     found, statistics = np.frombuffer(rows, ROW, len(rows) // ROW.itemsize), None
-    if path.with_suffix(STATISTICS).is_file():
+    # After a power cut it may be there, and empty.
+    with suppress(OSError, ValueError):
         stated = json_object(path.with_suffix(STATISTICS).read_bytes(), _STATISTICS_BYTES)
         statistics = {name: np.asarray(value) for name, value in stated.items()}
     # The last group of a video that was not finished may be cut, and a row is written before its picture.

@@ -177,7 +177,11 @@ class CameraEncoder:
         with its:
             # Ctrl-C at the terminal is for the recorder alone.
             self._process = subprocess.Popen(
-                [*PROGRAM, str(its.fileno())], pass_fds=[its.fileno()], stdin=subprocess.DEVNULL, start_new_session=True
+                [*PROGRAM, str(its.fileno())],
+                pass_fds=[its.fileno()],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                start_new_session=True,
             )
 
     def _made(self, camera: str, sides: tuple[int, int] | None) -> _Camera:

@@ -73,6 +73,14 @@ class _Camera:
         self._rows: Any = None
         self._shown = (0.0, b"")
 
+    def begin(self) -> None:
+        """Make the file of its rows, which tells that there is such a camera.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        self._rows = self._video.with_suffix(ROWS).open("wb", buffering=0)
+
     def frame(self, number: int, moment: float) -> None:
         """Encode the newest picture of a moment.
 
@@ -101,7 +109,6 @@ class _Camera:
             assert picture is not None
             high, wide = picture.shape[:2]
             self._writer = VideoWriter(self._video, self._fps, wide, high, live=True)
-            self._rows = self._video.with_suffix(ROWS).open("wb", buffering=0)
         self._rows.write(np.array([(moment, at, same)], ROW).tobytes())
         if picture is None:
             self._writer.repeat()
@@ -116,12 +123,9 @@ class _Camera:
             StrandsRobotsError, OSError: they cannot be written.
         """
         self._memory.close()
+        self._rows.close()
         if self._writer is not None:
-            self._rows.close()
-            if self.failed:
-                self._writer.discard()
-            else:
-                write_statistics(self._video, self._writer.finish().statistics)
+            write_statistics(self._video, self._writer.finish().statistics)
 
     def _free(self, slot: int) -> None:
         self._memory[SLOTS * self._size + slot] = FREE[0]
@@ -206,6 +210,7 @@ class _Encoder:
             os.close(descriptor)
             video = self._folder / f"{name}{VIDEO}"
             self._cameras[name] = _Camera(video, self._fps, memory, order["size"], order["sides"])
+            self._or_failed(name, self._cameras[name].begin)
         elif "begin" in order:
             # A camera that is read at each beat from now on has its picture well before the next moment.
             self._folder, self._fps, self._began = Path(order["begin"]), order["fps"], time.time()

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Self
 
-from strands_robots.datasets.encoded import cameras_folder, encoded_videos
+from strands_robots.datasets.encoded import cameras_folder, encoded_videos, offered_cameras
 from strands_robots.datasets.episodes import RECORDING, RUNNING, Dataset, DatasetHold
 from strands_robots.datasets.layout import CAMERAS, INFO, DatasetError, DatasetInfo, read_info
 from strands_robots.datasets.recorded import IMAGES, Attempt, attempts_in, info_of, moments_of, save_attempt
@@ -93,7 +93,7 @@ class RecordingSession:
             return None
         attempt = max(attempts, key=lambda each: len(each.steps))
         attempt.videos = encoded_videos(recording, self._fps)
-        if lacking := self._lacking(attempt):
+        if lacking := self._lacking(attempt, offered_cameras(recording)):
             aside = self._move_aside(recording)
             raise NoPictureError(f"the attempt has no picture of {lacking}: it is no episode, and was moved to {aside}")
         dataset = self._dataset_for(attempt)
@@ -106,11 +106,11 @@ class RecordingSession:
         """Remove the recorded attempt."""
         _remove(self.recording)
 
-    def _lacking(self, attempt: Attempt) -> str:
+    def _lacking(self, attempt: Attempt, offered: set[str]) -> str:
         """Return the cameras without a picture of an attempt; empty for none."""
         known = () if self._dataset is None else self._dataset.info.videos
-        cameras = [name.removeprefix(IMAGES) for name in known]
-        lacking = [each for each in cameras if each not in attempt.videos and not attempt.pictures.get(each)]
+        cameras = offered | {name.removeprefix(IMAGES) for name in known}
+        lacking = [each for each in sorted(cameras) if each not in attempt.videos and not attempt.pictures.get(each)]
         return ", ".join(lacking) or ("" if len(moments_of(attempt, self._fps)) else "all cameras at one moment")
 
     def _move_aside(self, recording: Path) -> Path:

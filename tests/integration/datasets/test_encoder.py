@@ -199,6 +199,20 @@ def test_attempt_without_a_camera_of_the_dataset_is_moved_aside(encoder: CameraE
         assert (cameras_folder(aside) / f"{TOP}.mp4").exists()
 
 
+def test_first_attempt_whose_camera_cannot_be_encoded_makes_no_dataset_without_it(
+    encoder: CameraEncoder, tmp_path: Path
+) -> None:
+    with session(tmp_path) as recording:
+        path = recording.recording
+        with Recorder(path) as recorder, encoder.attempt(path):
+            recorder.take("arm-1", "streamStep", {"observation": {"pan": 0}, "action": {"pan": 0}})
+            encoder.offer(TOP, picture(0, width=63))
+            eventually(lambda: encoder.failed)
+        with pytest.raises(NoPictureError, match="has no picture of top"):
+            recording.keep(success=True)
+    assert not (tmp_path / "meta").exists()
+
+
 def test_picture_that_cannot_be_encoded_is_told_by_its_camera(encoder: CameraEncoder, tmp_path: Path) -> None:
     with encoder.attempt(tmp_path / "attempt-000000.mcap"):
         encoder.offer(TOP, picture(0, width=63))
