@@ -8,6 +8,7 @@ does.
 from __future__ import annotations
 
 import json
+import math
 import mmap
 import os
 import select
@@ -34,6 +35,12 @@ MARGIN_S = 0.005
 
 BEHIND_S = 30.0
 """It gives the attempt up where it is so far behind the clock."""
+
+BEFORE = 2 / 3
+"""Share of a period by which the first picture comes before the first moment.
+
+Cameras are read at the same rate: far from a moment, a picture that is a little early or late is still that of its own.
+"""
 
 SOON_S = 1e-5
 
@@ -150,7 +157,8 @@ class _Encoder:
         """Serve until the recorder is gone; the files are whole whenever."""
         while True:
             running = self._until >= 0
-            wait = max(0.0, min(self._moment + MARGIN_S, self._until) - time.time()) if running else None
+            due = min(self._moment + MARGIN_S, self._until) if running else math.inf
+            wait = None if due == math.inf else max(0.0, due - time.time())
             if select.select([self._orders], [], [], wait)[0] and not self._receive():
                 return
             if self._until >= 0:
@@ -203,6 +211,8 @@ class _Encoder:
     def _order(self, order: dict[str, Any]) -> None:
         if "picture" in order:
             if (camera := self._cameras.get(order["picture"])) is not None:
+                if self._began == math.inf:
+                    self._began = order["at"] + BEFORE / self._fps
                 camera.waiting.append((order["at"], order["slot"], order["length"]))
         elif "camera" in order:
             name, descriptor = order["camera"], self._descriptors.popleft()
@@ -212,8 +222,7 @@ class _Encoder:
             self._cameras[name] = _Camera(video, self._fps, memory, order["size"], order["sides"])
             self._or_failed(name, self._cameras[name].begin)
         elif "begin" in order:
-            # A camera that is read at each beat from now on has its picture well before the next moment.
-            self._folder, self._fps, self._began = Path(order["begin"]), order["fps"], time.time()
+            self._folder, self._fps, self._began = Path(order["begin"]), order["fps"], math.inf
             self._cameras, self._number, self._until = {}, 0, float("inf")
             self._say(begun=True)
         elif self._until >= 0:

@@ -233,3 +233,21 @@ def test_jpeg_is_decoded_in_the_process(encoder: CameraEncoder, tmp_path: Path) 
     video = encoded_videos(path, FPS)[TOP]
     assert (video.width, video.height) == (64, 48)
     assert next(pictures_of(video.path)).mean() == pytest.approx(100, abs=3)
+
+
+def test_picture_that_is_early_or_late_is_still_that_of_its_moment(tmp_path: Path) -> None:
+    path, beat, period = tmp_path / "attempt-000000.mcap", threading.Event(), 0.05
+    with CameraEncoder(round(1 / period)) as slow, slow.attempt(path):
+        # Whenever the first one comes: here shortly before the grid that began with the attempt.
+        beat.wait(0.9 * period)
+        began = time.time()
+        for number in range(12):
+            at = began + period * (number + (0.25 if number % 2 else 0))
+            # It is there long before its time, however busy the machine is.
+            beat.wait(max(0.0, at - 4 * period - time.time()))
+            slow.offer(TOP, picture(number), at)
+        beat.wait(max(0.0, at + period - time.time()))
+    rows = encoded_videos(path, round(1 / period))[TOP].rows
+    stored = len(np.unique(rows["at"]))
+    assert stored >= 11, "the first one may come before the first group"
+    assert np.flatnonzero(rows["same"]).tolist() == [*range(stored, len(rows))]
