@@ -93,12 +93,16 @@ def kills_row(kills: Sequence[Kill], saving: int, lost: Sequence[str], lerobots:
     ``lerobots`` are the episodes that LeRobot's own writer lost by one kill; None where it is not installed.
     """
     counts = Counter(kill.target for kill in kills)
-    cuts = sorted(kill.cut_s for kill in kills if kill.cut_s is not None)
-    worst = cuts[-1] if cuts else 0.0
+    cuts = {
+        target: [kill.cut_s for kill in kills if kill.target == target and kill.cut_s is not None] for target in TARGETS
+    }
+    running = sum(len(each) for each in cuts.values())
+    worst = max((max(each, default=0.0) for each in cuts.values()), default=0.0)
+    each = ", ".join(f"{max(cuts[target], default=0.0):.2f}" for target in TARGETS)
     of = ", ".join(f"{counts[target]} of the {target}" for target in TARGETS)
     return Row(
         f"SIGKILL at {len(kills) + saving} random moments: {of}, {saving} of a process that saves all the time",
-        f"{len(lost)} saved episodes lost; {len(cuts)} running ones, cut by at most {worst:.2f} s",
+        f"{len(lost)} saved episodes lost; {running} running ones, cut by at most {each} s",
         "" if lerobots is None else f"{lerobots} of {SAVED} saved episodes lost by one kill of LeRobot 0.6.1's writer",
         None,
         f"0 lost, the running one cut by at most {CUT_S:g} s, each part killed",

@@ -40,7 +40,7 @@ A chunk may unpack to the first, and a file to so many times its own size beside
 CHUNK_BYTES = 16_384
 """Largest chunk: at most this much is lost of a file that was cut off."""
 
-CHUNK_S = 1.0
+CHUNK_S = 0.5
 """Longest time a chunk stays open, in seconds; an event that is not steady closes it at once."""
 
 PENDING_MAX = 50_000
