@@ -51,7 +51,7 @@ class RolloutEvent:
     ``clamped_steps`` counts the actions that the robot's speed limit held back.
     ``observation`` and ``action`` hold numbers only, by joint name, in the robot's own units. ``follows_instruction``
     is False for a policy that moves by itself, whatever it was told, as ``mock`` does. ``loop`` of a finished one has
-    the figures of its control loop. ``led_by`` of a step is the leader whose action it was, empty for a policy's.
+    the figures of its control loop. ``led_by`` of a step is the leader that had taken over from the policy.
     """
 
     kind: Literal["started", "step", "finished"]

@@ -153,7 +153,8 @@ class LeadMixin:
         session = self.tasks.by_leader.get(lead.leader)
         if session is not None and not end and (session.voided or not session.running):
             why = lead.why or session.error or "it was stopped"
-            return error(f"The lead of {lead.leader} is over: {why}.", **{**lead.facts(), "state": "over"})
+            facts = {**lead.facts(), "state": "over", "halted": session.voided}
+            return error(f"The lead of {lead.leader} is over: {why}.", **facts)
         return success(f"{lead.leader}: {lead.state}.", **lead.facts())
 
     @cached_property

@@ -49,13 +49,18 @@ def test_robot_that_no_leader_can_lead_is_refused_by_name_and_let_go(run: Run, m
     assert let_go == ["barista"]
 
 
-def test_replay_to_a_device_connect_device_is_refused(run: Run, tmp_path: Path) -> None:
+@pytest.mark.parametrize("line", [("replay", "FILE", "--to", "arm-1"), ("teleop", "FILE", "arm-1")])
+def test_follower_of_another_process_takes_no_option_of_one_here(
+    run: Run, tmp_path: Path, line: tuple[str, ...]
+) -> None:
     write_csv(tmp_path / "run.csv", [(0.0, {"shoulder_pan": 0.0})])
-    result = run("replay", str(tmp_path / "run.csv"), "--to", "arm-1", "--json")
+    words = [str(tmp_path / "run.csv") if word == "FILE" else word for word in line]
+    result = run(*words, "--peer-id", "arm-2", "--json")
     assert result.exit_code == 2
-    reason = json.loads(result.stdout)["reason"]
-    assert "'arm-1' is not known" in reason
-    assert "mesh:PEER" in reason
+    assert "arm-1 is served elsewhere" in json.loads(result.stdout)["reason"]
+    result = run(*words, "--no-network", "--json")
+    assert result.exit_code == 2
+    assert "is led by its id, over a network" in json.loads(result.stdout)["reason"]
 
 
 def test_refused_option_is_not_reported_as_unknown_follower(run: Run, tmp_path: Path) -> None:

@@ -50,8 +50,8 @@ class Seat:
 def test_robot_holds_until_its_leader_takes_over() -> None:
     seat = Seat()
     assert seat.beat() == []
-    assert seat.led(1, pan=0.01) == {"pan": 0.01}
-    assert (seat.lead.state, seat.policy.led_by) == ("led", "hand")
+    assert seat.led(1, pan=0.01) == {"pan": 0.01, "lift": 0.0}, "what it does not lead keeps its place"
+    assert (seat.lead.state, seat.policy.led_by) == ("led", ""), "it has taken over from no policy"
 
 
 def test_follower_goes_to_a_leader_that_stands_apart_without_a_jump() -> None:
@@ -65,8 +65,8 @@ def test_follower_goes_to_a_leader_that_stands_apart_without_a_jump() -> None:
 def test_differences_begin_where_the_robot_is() -> None:
     seat = Seat(guide="differences")
     seat.joints["pan"] = 0.3
-    assert seat.led(1, pan=-0.8) == {"pan": pytest.approx(0.3)}
-    assert seat.led(1, pan=-0.75) == {"pan": pytest.approx(0.35)}
+    assert seat.led(1, pan=-0.8)["pan"] == pytest.approx(0.3)
+    assert seat.led(1, pan=-0.75)["pan"] == pytest.approx(0.35)
 
 
 def test_leader_that_runs_beyond_the_range_turns_around_at_once() -> None:
@@ -82,7 +82,7 @@ def test_leader_takes_over_from_a_policy_and_its_plan_is_dropped() -> None:
     seat = Seat(policy)
     seat.send(0, leads=False)
     assert seat.beat() == {"pan": 0.1}
-    assert seat.led(1, lift=0.01) == {"lift": 0.01}
+    assert seat.led(1, lift=0.01) == {"lift": 0.01, "pan": 0.1}
     assert seat.policy.led_by == "hand"
     seat.send(2, leads=False)
     assert seat.beat() == {"pan": -0.1}, "nothing of the chunk from before is played"
@@ -96,7 +96,7 @@ def test_silence_holds_within_a_beat_and_only_a_new_turn_goes_on() -> None:
     held = next(action for action in iter(seat.beat, None) if seat.lead.state == "held")
     assert held == seat.joints
     assert "no fresh command of hand" in seat.lead.why
-    assert seat.led(1, pan=-0.5) == [], "the turn is over"
+    assert seat.led(1, pan=-0.5) == held, "the turn is over, and the place is kept"
     assert seat.lead.counts.unled == 1
     assert seat.led(2, pan=0.49)["pan"] == pytest.approx(0.5 - 0.01, abs=STEP)
 
@@ -134,7 +134,7 @@ def test_policy_whose_leader_is_silent_holds_too() -> None:
     seat.beat(0.2)
     assert seat.lead.state == "held"
     seat.send(0, leads=False)
-    assert seat.beat() == []
+    assert seat.beat() == {"pan": 0.1, "lift": 0.0}, "it keeps its place"
     seat.send(1, leads=False)
     assert seat.beat() == {"pan": 0.1}
 

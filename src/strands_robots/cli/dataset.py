@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from strands_robots import settings
+from strands_robots.cli.far_hand import HandLeader
 from strands_robots.cli.leading import arm_options, is_own, made_follower
 from strands_robots.cli.led_robot import Serving, halted_first
 from strands_robots.cli.network import Network, answering, say_missing
@@ -27,8 +28,6 @@ if TYPE_CHECKING:
     from strands_robots.cli.dataset_recording import Attempts
     from strands_robots.cli.far_recording import FarRobot
     from strands_robots.datasets.fit import RobotJoints
-
-SERVED = "A robot that another process serves is recorded with --policy NAME or --leader page."
 
 PAGE = "page"
 """Leader of a served robot that others move: the page, or an agent."""
@@ -50,14 +49,15 @@ def record(
         str | None,
         typer.Option(
             "--leader",
-            help="TYPE@PORT of a leader arm, keyboard, gamepad, a recording, or page: whoever moves a served robot.",
+            help="TYPE@PORT of a leader arm, keyboard, gamepad, a recording, or page: whoever moves a served robot. "
+            "With --policy it takes over from it.",
         ),
     ] = None,
     policy: Annotated[
         str | None,
         typer.Option(
             "--policy",
-            help="In its place: a policy or a profile of one, which this command runs, or else the served robot.",
+            help="A policy or a profile of one, which this command runs, or else the served robot.",
             metavar="NAME",
         ),
     ] = None,
@@ -85,15 +85,14 @@ def record(
 ) -> None:
     """Record episodes of a robot that is led. What is saved outlives a kill."""
     from strands_robots.cli.dataset_recording import Attempts, Keys, record_attempts  # noqa: PLC0415 - an extra
-    from strands_robots.cli.local_recording import LocalAttempts, leader_drives, policy_drives  # noqa: PLC0415 - as above
+    from strands_robots.cli.local_recording import LocalAttempts, leader_drives, policy_drives, turns_drive  # noqa: PLC0415 - as above
     from strands_robots.datasets.session import RecordingSession  # noqa: PLC0415 - as above
     from strands_robots.recording.cameras import chosen_frames  # noqa: PLC0415 - as above
 
     whole("--episodes", episodes, low=1, high=10_000)
     number("--pause-s", pause_s, low=0, high=3600)
     longest = None if episode_s is None else number("--episode-s", episode_s, above=0, high=3600)
-    if (leader is None) == (policy is None):
-        raise ValidationError("give either --leader or --policy.")
+    _check_drivers(robot, leader, policy)
     asked = screen.live and sys.stdin.isatty()
     if not asked and longest is None:
         raise ValidationError("--episode-s is needed without a terminal: nobody says when an attempt is over.")
@@ -102,37 +101,37 @@ def record(
     of_leader = arm_options("", leader_id, leader_calibration)
     if policies is not None and not (policy and is_own(robot)):
         raise ValidationError("--policies goes with --policy and a robot of this command; a served one has its own.")
-    if policy is not None and of_leader:
-        raise ValidationError("--leader-id and --leader-calibration go with a leader arm, not with --policy.")
-    if leader == PAGE or (policy is not None and not is_own(robot)):
-        given = (follower_id, calibration, leader_id, leader_calibration, peer_id)
-        if no_network or any(each is not None for each in given):
+    if leader in (None, PAGE) and of_leader:
+        raise ValidationError("--leader-id and --leader-calibration go with a leader arm.")
+    if (leader or "").startswith(MESH_PREFIX) or robot.startswith(MESH_PREFIX):
+        raise ValidationError(
+            "--leader must be of this machine, and --robot one of this command or the id of a served one."
+        )
+    if leader == PAGE or not (no_network or is_own(robot)):
+        if no_network or any(each is not None for each in (follower_id, calibration, peer_id)):
             raise ValidationError(
-                f"--policy and --leader {PAGE} go with a served robot, such as {robot}, without options of an arm."
+                f"--robot must be the id of a served robot, without options of one of this command, not {robot}."
             )
-        with served_robot(screen, network, robot, policy or "", task, names) as far:
+        hand = HandLeader(screen, leader, of_leader, keys) if leader not in (None, PAGE) else None
+        with served_robot(screen, network, robot, policy or "", task, names, hand) as far:
             attempts = Attempts(episodes, partial(far.begin, longest), fps, longest, pause_s, success, keys)
             _record_served(screen, folder, far, task, attempts)
         return
-    if (leader or "").startswith(MESH_PREFIX) or robot.startswith(MESH_PREFIX):
-        raise ValidationError(
-            "--leader must be of this machine, and --robot one of this command; "
-            f"--leader {PAGE} and --policy NAME record a served robot."
-        )
     how = Serving.of(network, peer_id, None, alone=no_network)
     if policies is not None:
         settings.put("STRANDS_POLICIES", str(policies))
     if policy is not None:
         resolve_provider(policy)
     kind, arm = robot.partition("@")[0], arm_options("", follower_id, calibration)
-    drives = (
-        partial(policy_drives, screen, policy, task, longest)
-        if policy
-        else partial(leader_drives, screen, leader or "", robot, of_leader, keys)
-    )
+    if policy and leader:
+        drives = partial(turns_drive, screen, policy, task, longest, HandLeader(screen, leader, of_leader, keys))
+    elif policy:
+        drives = partial(policy_drives, screen, policy, task, longest)
+    else:
+        drives = partial(leader_drives, screen, leader or "", robot, of_leader, keys)
     with (
         RecordingSession(folder, fps, task, kind, lambda said: screen.say(said, "yellow")) as session,
-        made_follower(screen, robot, arm, None, how, SERVED) as led,
+        made_follower(screen, robot, arm, None, how) as led,
         drives(led) as driver,
         halted_first(led.robot),
     ):
@@ -141,6 +140,20 @@ def record(
         record_attempts(screen, local, session, Attempts(episodes, driver.begin, fps, longest, pause_s, success, keys))
         count = session.episodes
     _tell_dataset(screen, folder, count)
+
+
+def _check_drivers(robot: str, leader: str | None, policy: str | None) -> None:
+    """Refuse what cannot drive a robot that is recorded.
+
+    Raises:
+        ValidationError: naming the flag.
+    """
+    if leader is None and policy is None:
+        raise ValidationError("give --leader, --policy, or both: the leader then takes over from the policy.")
+    if leader == PAGE and policy is not None:
+        raise ValidationError(f"--policy goes with a leader of this machine, not with {PAGE}.")
+    if (leader or "").startswith(MESH_PREFIX) or robot.startswith(MESH_PREFIX):
+        raise ValidationError("--leader must be of this machine, and --robot one of this command or a served one's id.")
 
 
 def _record_served(screen: Screen, folder: Path, far: FarRobot, task: str, attempts: Attempts) -> None:
@@ -166,7 +179,13 @@ def _tell_dataset(screen: Screen, folder: Path, count: int) -> None:
 
 @contextmanager
 def served_robot(  # noqa: PLR0917 - one robot, and what is asked of it
-    screen: Screen, network: Network, robot: str, policy: str, task: str, cameras: list[str] | None
+    screen: Screen,
+    network: Network,
+    robot: str,
+    policy: str,
+    task: str,
+    cameras: list[str] | None,
+    hand: HandLeader | None,
 ) -> Iterator[FarRobot]:
     """Join the networks, and yield the served robot ``ID`` or ``WORLD/ROBOT``.
 
@@ -182,8 +201,9 @@ def served_robot(  # noqa: PLR0917 - one robot, and what is asked of it
         there.settled()
         say_missing(screen, there)
         with answering(there, peer, ""):
-            far = FarRobot(Fleet(there)[peer], there, part, policy, task, cameras)
-        yield far
+            far = FarRobot(Fleet(there)[peer], there, part, policy, task, cameras, hand)
+        with nullcontext() if hand is None else hand.connected():
+            yield far
 
 
 def _served_name(robot: str) -> tuple[str, str]:

@@ -53,11 +53,15 @@ class Keys:
         self.leading = False
         """True while a keyboard leads: its keys come by :meth:`pressed`, and no line is read."""
         self._fd = sys.stdin.fileno() if fd is None else fd
+        self.turn: Callable[[], None] = lambda: None
+        """Takes the robot over from its policy, or gives it back, by the key ``t`` Enter, or ``v`` of a keyboard."""
         self._words: deque[Said] = deque()
         self._line = b""
 
     def pressed(self, key: str) -> None:
         """Note a key of the leader."""
+        if key.lower() == "v":
+            self.turn()
         if (word := _KEYBOARD.get(key.lower())) is not None:
             self._words.append(word)
 
@@ -89,6 +93,8 @@ class Keys:
             *lines, self._line = (self._line + data).split(b"\n")
             for line in lines:
                 said = line.decode("utf-8", "replace").strip().lower()
+                if said == "t":
+                    self.turn()
                 self._words.extend(each for each in Said if each.value == said)
 
 

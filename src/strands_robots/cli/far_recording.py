@@ -1,7 +1,7 @@
 """Recording of a robot that another process serves, as it is seen from here.
 
-Nothing of it is led from here but a policy that it runs itself. The tasks and motions that others give it (the page,
-an agent) are in the recording as well. Readings count from their arrival here.
+It runs a policy itself, or a leader of this machine leads it, or both in turns. The tasks and motions that others give
+it (the page, an agent) are in the recording as well. Readings count from their arrival here.
 """
 
 from __future__ import annotations
@@ -11,10 +11,13 @@ import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
+from strands_robots.cli.far_hand import HandLeader
 from strands_robots.cli.output import CliError, Screen
 from strands_robots.cli.record import NO_CAMERAS
+from strands_robots.datasets.recorded import LED_BY_PERSON
 from strands_robots.errors import NoAnswerError, RefusalError, RobotError, UnreachableError
 from strands_robots.fleet.adapter import Detail, RobotEvent
 from strands_robots.fleet.networks import Networks
@@ -88,7 +91,8 @@ class FarRobot:
         world: the robot, or the world that it is in.
         networks: on which its events are followed.
         part: which robot of a world; empty for the only one.
-        policy: runs there in each attempt; empty for none, where others move it.
+        policy: runs there in each attempt; empty for none.
+        hand: leads it from here, in turns with the policy; None where others move it.
         task: told to the policy.
         cameras: names, or None for those of the robot itself.
 
@@ -98,7 +102,14 @@ class FarRobot:
     """
 
     def __init__(  # noqa: PLR0917 - one robot, and what is asked of it
-        self, world: RemoteRobot, networks: Networks, part: str, policy: str, task: str, cameras: Sequence[str] | None
+        self,
+        world: RemoteRobot,
+        networks: Networks,
+        part: str,
+        policy: str,
+        task: str,
+        cameras: Sequence[str] | None,
+        hand: HandLeader | None = None,
     ) -> None:
         robots = world.robots
         if part not in robots and (part or len(robots) > 1):
@@ -107,6 +118,7 @@ class FarRobot:
         self.remote = robots[part] if part else world
         self.networks, self._part, self._policy, self._task = networks, part, policy, task
         self._cameras = _cameras_of(world, part, cameras)
+        self._hand = hand
         self._attempt: FarTask | None = None
         self._recorder: Recorder | None = None
 
@@ -143,17 +155,14 @@ class FarRobot:
         Raises:
             CliError: the robot refused it.
         """
-        if self._policy and seconds is None and not self.remote.has_lease:
+        if self._policy and self._hand is None and seconds is None and not self.remote.has_lease:
             raise CliError(
                 f"--episode-s is needed: {self.name} has no control lease, and would not halt where this is killed."
             )
         task = self._attempt = FarTask()
-        if self._policy:
-            duration = min(seconds or DURATION_MAX_S, DURATION_MAX_S)
+        if self._policy or self._hand is not None:
             try:
-                # By its name on the network that motions go to.
-                starts = self.networks.of(self.name, moves=True).starts
-                self.remote.call(starts, instruction=self._task, policy_provider=self._policy, duration=duration)
+                self._start(task, seconds)
             except RefusalError as refused:
                 why = said(refused)
                 task.end(why)
@@ -165,11 +174,32 @@ class FarRobot:
         threading.Thread(target=self._watch, args=(task,), name=f"attempt {self.name}", daemon=True).start()
         return task
 
+    def _start(self, task: FarTask, seconds: float | None) -> None:
+        """Start the policy, the leader or both."""
+        duration = min(seconds or DURATION_MAX_S, DURATION_MAX_S)
+        if self._hand is not None:
+            how = {"duration": duration}
+            self._hand.begin(self.remote, self._policy, self._task, how, partial(self._hand_ended, task))
+            return
+        # By its name on the network that motions go to.
+        starts = self.networks.of(self.name, moves=True).starts
+        self.remote.call(starts, instruction=self._task, policy_provider=self._policy, duration=duration)
+
+    @staticmethod
+    def _hand_ended(task: FarTask, why: str, halted: bool) -> None:
+        """Note the end of the leader; whether the robot was locked is asked elsewhere."""
+        if halted:
+            task.halted.set()
+        else:
+            task.end(why)
+
     def halt(self, reason: str) -> StopVerdict:
         """Halt it at the end of an attempt."""
         if self._attempt is not None:
             self._attempt.halting = True
             self._attempt.end()
+        if self._hand is not None:
+            self._hand.end()
         return self.remote.halt(reason)
 
     def hold(self, screen: Screen) -> None:
@@ -179,14 +209,14 @@ class FarRobot:
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Hold the robot in the block where its policy is started from here.
+        """Hold a robot in the block that is started from here.
 
         If this process dies, the robot halts when :data:`LEASE_S` are over.
 
         Raises:
             RefusalError: another caller holds it.
         """
-        if self._policy and self.remote.has_lease:
+        if (self._policy or self._hand is not None) and self.remote.has_lease:
             with self.remote.control(LEASE_S):
                 yield
         else:
@@ -202,6 +232,8 @@ class FarRobot:
             )
             for each in (() if pictures is None else self._cameras)
         ]
+        if self._hand is not None and self._hand.person and not self._policy:
+            recorder.take(self.name, LED_BY_PERSON, {})
         end = self.networks.subscribe(self.name, lambda event: self._take(recorder, event), Detail.ALL)
         try:
             for thread in threads:

@@ -28,7 +28,7 @@ LEADER = "leader"
 EXECUTE = "execute"
 """The motion of a policy, as callers ask for it."""
 
-ELSEWHERE = "A device of Device Connect takes no frames; serve its robot on the mesh too, and name it mesh:PEER."
+ELSEWHERE = "A robot that another process serves is led by its id, over a network."
 
 MANUAL = ("keyboard", "gamepad")
 """Leaders that a person holds in hand, without an arm."""
@@ -149,13 +149,10 @@ def announce(screen: Screen, leader: str, follower: str, source: Any) -> None:
 
 
 @contextmanager
-def made_follower(  # noqa: PLR0917 - one robot, and what is done with it
-    screen: Screen, follower: str, arm: dict[str, Any], record: Path | None, how: Serving, elsewhere: str = ELSEWHERE
+def made_follower(
+    screen: Screen, follower: str, arm: dict[str, Any], record: Path | None, how: Serving
 ) -> Iterator[LedRobot]:
-    """Make, serve and record ``TYPE@PORT`` or a model; halt it at the end.
-
-    ``elsewhere`` is said of a name that is no model, and may be that of a robot of another process.
-    """
+    """Make, serve and record ``TYPE@PORT`` or a model; halt it at the end."""
     from strands_robots.robot import NO_SUCH_MODEL, Robot, counts_as_hardware  # noqa: PLC0415 - heavy, and needed by these commands alone
 
     kind, at, port = follower.partition("@")
@@ -165,7 +162,7 @@ def made_follower(  # noqa: PLR0917 - one robot, and what is done with it
     except ValidationError as exc:
         if exc.code != NO_SUCH_MODEL or "/" in kind or "." in kind:
             raise
-        raise ValidationError(f"{exc} {elsewhere}") from exc
+        raise ValidationError(f"{exc} {ELSEWHERE}") from exc
     try:
         if not callable(getattr(robot, "attach_teleop", None)):
             raise ValidationError(f"follower must be a robot that a leader can lead; {kind} has no attach_teleop.")

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from strands_robots.cli.dataset_recording import Keys
+from strands_robots.cli.far_hand import HandLeader, LeadableHere
 from strands_robots.cli.leading import (
     LEADER,
     MANUAL,
@@ -20,12 +21,16 @@ from strands_robots.cli.leading import (
     load_policy,
 )
 from strands_robots.cli.led_robot import LedRobot
-from strands_robots.cli.output import Screen
+from strands_robots.cli.output import CliError, Screen
 from strands_robots.datasets.recorded import LED_BY_PERSON
+from strands_robots.errors import RefusalError
+from strands_robots.fleet.reports import said
+from strands_robots.policies.rollout import Rollout
 from strands_robots.recording.cameras import Frames
 from strands_robots.recording.file import Pictures, Recorder, RobotRecording
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.teleoperators import RecordedLeader
+from strands_robots.utils import DURATION_MAX_S
 
 CAMERAS_HZ_MAX = 60
 
@@ -62,6 +67,63 @@ def policy_drives(screen: Screen, policy: str, task: str, seconds: float | None,
     load_policy(screen, policy)
     screen.say(f"The policy {policy} drives {led.robot.tool_name_str}. Ctrl-C stops the robot.")
     yield Driver(started, ExitStack())
+
+
+@contextmanager
+def turns_drive(  # noqa: PLR0917 - one leader, one policy, and what is done with them
+    screen: Screen, policy: str, task: str, seconds: float | None, hand: HandLeader, led: LedRobot
+) -> Iterator[Driver]:
+    """Have a policy drive the robot in each attempt of the block, and a leader take over from it.
+
+    Raises:
+        ConnectionError: a leader arm cannot be connected.
+        ValidationError: there is no such policy, or the leader leads joints that the robot lacks.
+        CliError: the policy cannot be loaded.
+    """
+    turn = ExitStack()
+
+    def begun() -> Any:
+        load_policy(screen, policy)
+        turn.callback(hand.end)
+        how = {"duration": min(seconds or DURATION_MAX_S, DURATION_MAX_S)}
+        failures = list[str]()
+        try:
+            hand.begin(LeadableHere(led.robot), policy, task, how, lambda why, _: failures.append(why))
+        except RefusalError as refused:
+            raise CliError(said(refused)) from refused
+        return TurnsTask(led.robot.tasks.by_leader[hand.leader_id], failures)
+
+    load_policy(screen, policy)
+    with hand.connected():
+        screen.say(f"The policy {policy} drives {led.robot.tool_name_str} until the leader takes over.")
+        yield Driver(begun, turn)
+
+
+class TurnsTask:
+    """The run of a lead, which a leader that fails ends as well.
+
+    Args:
+        session: of the robot.
+        failures: gets the reason of the leader's end; an empty one is none.
+    """
+
+    def __init__(self, session: Rollout, failures: list[str]) -> None:
+        self._session, self._failures = session, failures
+
+    @property
+    def running(self) -> bool:
+        """True until its end."""
+        return self._session.running and not self._failures
+
+    @property
+    def voided(self) -> bool:
+        """True where the robot was stopped."""
+        return self._session.voided
+
+    @property
+    def error(self) -> str:
+        """The reason of a failure; empty without one."""
+        return self._session.error or "".join(self._failures[:1])
 
 
 @contextmanager

@@ -14,6 +14,7 @@ import typer
 from rich.control import Control
 
 from strands_robots.cli.app import Seconds
+from strands_robots.cli.far_hand import HandLeader
 from strands_robots.cli.leading import (
     LEADER,
     MANUAL,
@@ -23,20 +24,22 @@ from strands_robots.cli.leading import (
     begin,
     check_keys,
     connected_leader,
+    is_own,
     made_follower,
     recorded_leader,
 )
 from strands_robots.cli.led_robot import LedRobot, Serving, halted_first
-from strands_robots.cli.network import Network, mesh_peer
+from strands_robots.cli.network import Network, answering, mesh_peer, say_missing
 from strands_robots.cli.output import POLL_S, CliError, Exit, Screen, table, wait_until
 from strands_robots.envelope import text_of
 from strands_robots.errors import NoAnswerError, NoSuchRobotError, RefusalError
 from strands_robots.policies.rollout import STOP_JOIN_S
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.teleoperators import FULL_RANGES_PER_S, LeaderPolicy
-from strands_robots.utils import ValidationError, identifier, number
+from strands_robots.utils import DURATION_MAX_S, ValidationError, identifier, number
 
 if TYPE_CHECKING:
+    from strands_robots.fleet import RemoteRobot
     from strands_robots.hardware.lerobot_device import JointReach
 
 MESH_PREFIX = "mesh:"
@@ -72,7 +75,10 @@ def teleop(
         ),
     ],
     follower: Annotated[
-        str, typer.Argument(help="TYPE@PORT of a real arm, a model in simulation, mesh:PEER, or none to --publish.")
+        str,
+        typer.Argument(
+            help="TYPE@PORT of a real arm, a simulated robot, the id of a served one, or none to --publish."
+        ),
     ],
     leader_id: Annotated[str | None, typer.Option("--leader-id", help="Calibration id of the leader.")] = None,
     follower_id: FollowerId = None,
@@ -104,8 +110,15 @@ def teleop(
         _follow(screen, peer, follower, arm, how=how, options=options, record=record)
         return
 
+    of_leader = arm_options("", leader_id, leader_calibration)
+    if not no_network and _is_served(follower):
+        if publish is not None or record is not None or arm or peer_id is not None:
+            raise ValidationError(f"{follower} is served elsewhere: leave out what is of a follower of this command.")
+        _lead_served(screen, network, HandLeader(screen, leader, of_leader, None), follower, options)
+        return
+
     def connected(robot: Any) -> AbstractContextManager[Any]:
-        return connected_leader(leader, robot, arm_options("", leader_id, leader_calibration))
+        return connected_leader(leader, robot, of_leader)
 
     _drive(screen, leader, follower, connected, arm, how=how, options=options, publish=publish, record=record)
 
@@ -115,7 +128,7 @@ def replay(
     network: Network,
     *,
     file: Annotated[Path, typer.Argument(help="A recording: .mcap, .csv or .parquet.")],
-    to: Annotated[str, typer.Option("--to", help="TYPE@PORT of a real arm, a model, or mesh:PEER.")],
+    to: Annotated[str, typer.Option("--to", help="TYPE@PORT of a real arm, a model, or the id of a served robot.")],
     device: Annotated[str | None, typer.Option("--device", help="Device in a recording of several.")] = None,
     follower_id: FollowerId = None,
     calibration: Calibration = None,
@@ -123,9 +136,14 @@ def replay(
     peer_id: PeerId = None,
     no_network: NoNetwork = False,
 ) -> None:
-    """Play the recorded actions of a device to a follower, here or on the mesh, and stop it at the end."""
+    """Play the recorded actions of a device to a follower, and stop it at the end."""
     leader = recorded_leader(file, device, speed)
     arm = arm_options("", follower_id, calibration)
+    if not no_network and _is_served(to):
+        if arm or peer_id is not None:
+            raise ValidationError(f"{to} is served elsewhere: leave out what is of a follower of this command.")
+        _lead_served(screen, network, HandLeader(screen, file.name, {}, None, leader), to, TeleopOptions())
+        return
     how = _how_served(network, to, peer_id, None, alone=no_network)
     _drive(screen, file.name, to, lambda _: nullcontext(leader), arm, how=how, options=TeleopOptions())
 
@@ -323,6 +341,61 @@ def _lead_peer(
     if why.startswith(peer):
         raise CliError(f"Ended: {why.rstrip('.')}.", **row)
     _report_sent(screen, why, row)
+
+
+def _is_served(follower: str) -> bool:
+    """Return True for the id of a robot that another process serves."""
+    return not follower.startswith(MESH_PREFIX) and follower != NO_FOLLOWER and not is_own(follower)
+
+
+def _lead_served(screen: Screen, network: Network, hand: HandLeader, follower: str, options: TeleopOptions) -> None:
+    """Let a leader drive a robot that another process serves, and stop it.
+
+    Raises:
+        CliError: it was refused, the leader failed, or others stopped the robot.
+    """
+    ends = list[tuple[str, bool]]()
+    with served_follower(screen, network, follower) as robot, hand.connected(), halted_first(robot):
+        how = {"max_speed": options.max_speed, "duration": options.seconds or DURATION_MAX_S}
+        with _refused():
+            hand.begin(robot, "", "", how, lambda why, halted: ends.append((why, halted)))
+        verdicts = list[StopVerdict]()
+
+        def stop() -> None:
+            hand.end()
+            verdicts.append(robot.halt("teleop ended"))
+
+        over = options.timed(lambda: ends[0][0] or "The leader has finished." if ends else "")
+        why = wait_until(screen, over, at_end=stop)
+    why, halted = ends[0] if ends else (why, False)
+    screen.data({"event": "ended", "why": why, "stopped": verdicts[0].stopped, "stopped_by_others": halted})
+    if ends and why:
+        raise CliError(f"Ended: {why}")
+    _check_stopped(verdicts[0], "")
+    screen.say(f"{why or 'The leader has finished.'} {follower} stands still.", "green")
+
+
+@contextmanager
+def served_follower(screen: Screen, network: Network, name: str) -> Iterator[RemoteRobot]:
+    """Join the networks, and yield the served robot ``ID`` or ``WORLD/ROBOT``.
+
+    Raises:
+        CliError: there is no such robot, or it does not answer.
+    """
+    from strands_robots.fleet import Fleet  # noqa: PLC0415 - as above
+
+    peer, _, part = name.partition("/")
+    identifier("FOLLOWER", peer)
+    with network.joined(stays=True) as there:
+        there.settled()
+        say_missing(screen, there)
+        with answering(there, peer, ""):
+            world = Fleet(there)[peer]
+            robots = world.robots if part else {}
+        if part and part not in robots:
+            known = ", ".join(f"{peer}/{each}" for each in robots) or peer
+            raise ValidationError(f"FOLLOWER must be one of {known}, not {name}.")
+        yield robots[part] if part else world
 
 
 def _publish(screen: Screen, leader: str, peer: str, source: Any, options: TeleopOptions) -> None:

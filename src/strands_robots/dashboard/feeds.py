@@ -34,12 +34,13 @@ from strands_robots.fleet.verdicts import NetworkVerdict
 from strands_robots.safety.identity import KeyFileError
 from strands_robots.serving.advertised import AdvertisedParameter, AdvertisedVerb, RobotDescription
 from strands_robots.serving.control_leases import CONTROL_VERBS
+from strands_robots.serving.lead_verbs import LEAD_VERBS
 from strands_robots.threads import LoopThread
 from strands_robots.utils import plain_text
 
 logger = logging.getLogger(__name__)
 
-LEFT_OUT = frozenset({*CONTROL_VERBS, "resume", "ping", "teleop_status", "teleop_receive", "teleop_stop"})
+LEFT_OUT = frozenset({*CONTROL_VERBS, *LEAD_VERBS, "resume", "ping", "teleop_status", "teleop_receive", "teleop_stop"})
 """Verbs that the page has a control of its own for, or none."""
 
 FORMS_MAX, PARAMETERS_MAX, TEXT_MAX = 100, 40, 600

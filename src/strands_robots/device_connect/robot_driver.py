@@ -89,7 +89,7 @@ class RobotDeviceDriver(RobotDriver):
             step: Number of the step
             observation: Joint positions by name, numbers only
             action: What the joints were told, by name
-            led_by: The leader whose action it was, empty for a policy's
+            led_by: The leader that had taken over from the policy; empty for none
         """
 
     @emit()

@@ -141,7 +141,7 @@ class SimulationDeviceDriver(RobotDriver):
             observation: Joint positions by name, numbers only
             action: What the joints were told, by name
             robot_name: The simulated robot
-            led_by: The leader whose action it was, empty for a policy's
+            led_by: The leader that had taken over from the policy; empty for none
         """
 
     def glance(self) -> Activity:

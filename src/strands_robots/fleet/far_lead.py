@@ -110,6 +110,11 @@ class FarLead:
         """True where the leader drives in its present turn."""
         return self._leads
 
+    @property
+    def turn(self) -> int:
+        """Number of the turn that the next command belongs to."""
+        return self._turn
+
     def grip(self) -> None:
         """Take over with the next command: from the policy, or after a hold."""
         self._begin(leads=True)

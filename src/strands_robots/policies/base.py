@@ -87,10 +87,10 @@ class Restartable(Protocol):
 
 @runtime_checkable
 class Led(Protocol):
-    """Policy whose actions may be a leader's."""
+    """Policy that a leader may take over."""
 
     led_by: str
-    """The leader whose action was the last one; empty where it was none."""
+    """The leader that has taken over; empty while none has."""
 
 
 @runtime_checkable

@@ -266,7 +266,7 @@ class LedPolicy:
     ) -> None:
         self.lead = lead
         self.led_by = ""
-        """The leader in its own turns; see :class:`Led`."""
+        """The leader while it has taken over from the policy; see :class:`Led`."""
         self.follows_instruction = getattr(policy, "follows_instruction", True)
         self.errors = self.event_errors = 0
         self.last_error = ""
@@ -281,6 +281,7 @@ class LedPolicy:
         self._chunk: list[Action] = []
         self._last: Action = {}
         self._from: dict[str, float] = {}
+        self._place: Action = {}
 
     @property
     def uses_cameras(self) -> bool:
@@ -321,13 +322,16 @@ class LedPolicy:
         """
         beat = self.lead.beat()
         self.lead.saw(numbers(observation))
-        self.led_by = self.lead.leader if beat.state == "led" else ""
+        self.led_by = self.lead.leader if beat.state == "led" and self._policy is not None else ""
         if beat.state == "over":
             if self.lead.why:
                 raise PolicyError(self.lead.why)
             return None
         if beat.state == "held":
-            return self._held(observation) if beat.begins else []
+            if beat.begins:
+                self._place = self._held(observation)
+            # Written at each beat: a recording then has frames of it. Nothing is before the first turn.
+            return dict(self._place) or []
         if beat.state == "policy":
             return self._of_policy(observation, anew=beat.begins)
         try:
@@ -383,16 +387,15 @@ class LedPolicy:
     def _led(self, observation: Mapping[str, Any], beat: Beat) -> Action:
         wanted = checked_action(beat.action, dict.fromkeys(self._ranges, (-math.inf, math.inf)))
         if beat.begins:
-            self._drop_plan()
-            present = numbers(observation)
-            self._last = {key: present[key] for key in self._ranges if key in present}
-            self._from = {}
+            # Joints that it does not lead keep the place that they have now.
+            self._place = self._held(observation)
+            self._last, self._from = dict(self._place), {}
         if self._guide == "differences":
             wanted = self._moved(wanted)
         target = checked_action(wanted, self._ranges)
         bounded = limited(target, self._last, self._speeds, self._period)
         self._last = {**self._last, **bounded}
-        return {key: self._last[key] for key in target}
+        return {**self._place, **{key: self._last[key] for key in target}}
 
     def _moved(self, wanted: Action) -> Action:
         """Return the robot's place when its leader is at ``wanted``, by differences."""

@@ -60,7 +60,7 @@ def _takes(robot: Any, arguments: Arguments) -> Envelope:
 
 
 def is_led(robot: Any) -> bool:
-    """Return True for a robot that follows leaders elsewhere, and a world with one in it."""
+    """Return True for a robot or a world that follows leaders elsewhere."""
     body = body_of(robot)
     robots = getattr(body, "list_robots", None)
     return callable(getattr(body, "lead", None)) and (not callable(robots) or bool(robots()))

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from fixtures.command_line import COMMAND
+from fixtures.leaders import write_csv
 from fixtures.waiting import eventually, free_port
 from typer.testing import CliRunner
 
@@ -74,6 +75,33 @@ def test_policy_that_a_served_robot_runs_is_recorded_attempt_by_attempt(
         assert frames["action"].std(axis=0).max() > 0, "it moves"
 
 
+@pytest.mark.parametrize("network", [(), ("--mesh",)], ids=["device_connect", "mesh"])
+def test_leader_here_leads_a_served_robot_and_takes_over_from_its_policy(
+    tmp_path: Path, network: tuple[str, ...]
+) -> None:
+    folder, at = tmp_path / "set", ("--port", str(free_port()), *network)
+    leader = tmp_path / "lead.csv"
+    still = [(step / 50, {"shoulder_pan": 0.0}) for step in range(50)]
+    write_csv(leader, [*still, *((1 + step / 50, {"shoulder_pan": step / 50}) for step in range(50))])
+    words = ("--leader", str(leader), "--cameras", "none", "--episodes", "1", "--episode-s", "20", "--success")
+    with arm(*at):
+        rows = told(recording(folder, *words, *at))
+        assert [each["event"] for each in rows] == ["turn", "saved", "dataset"]
+        rows = told(recording(folder, *words, "--policy", "mock", *at))
+        assert [each.get("state") for each in rows[:2]] == ["policy", "led"]
+    info, found = check_dataset(folder)
+    assert (info.episodes, [each for each in found if each.wrong]) == (2, [])
+    led, turns = (tables.read_frames(folder / data_file(number)) for number in range(2))
+    assert led["observation.state"][-1][0] == pytest.approx(0.98, abs=0.1)
+    assert led["next.success"][-1]
+    assert not led["intervention"].any(), "a recording is no person"
+    began = int(turns["intervention"].argmax())
+    assert 0 < began < len(turns["intervention"]) - 5
+    assert turns["intervention"][began:].all(), "the leader leads to the end, from where the policy had come"
+    moved = turns["action"][began][0] - turns["observation.state"][began][0]
+    assert abs(moved) < 0.2
+
+
 @pytest.mark.system
 def test_pictures_of_a_served_robot_are_recorded_with_their_ages(tmp_path: Path) -> None:
     folder, at = tmp_path / "set", ("--port", str(free_port()))
@@ -118,11 +146,13 @@ def test_what_others_have_it_do_is_one_episode_and_a_stop_is_in_it(tmp_path: Pat
 @pytest.mark.parametrize(
     ("words", "why"),
     [
-        (("--episode-s", "1"), "either --leader or --policy"),
-        (("--policy", "mock", "--leader", "page", "--episode-s", "1"), "either --leader or --policy"),
+        (("--episode-s", "1"), "give --leader, --policy, or both"),
+        (("--policy", "mock", "--leader", "page", "--episode-s", "1"), "not with page"),
         (("--policy", "mock"), "--episode-s is needed without a terminal"),
-        (("--policy", "mock", "--episode-s", "1", "--peer-id", "x"), "go with a served robot"),
-        (("--leader", "gamepad", "--episode-s", "1", "--no-network"), "--leader page"),
+        (("--policy", "mock", "--episode-s", "1", "--peer-id", "x"), "the id of a served robot, without options"),
+        (("--leader", "gamepad", "--episode-s", "1", "--no-network"), "is led by its id, over a network"),
+        (("--leader", "mesh:lead-1", "--episode-s", "1"), "--leader must be of this machine"),
+        (("--policy", "mock", "--leader-id", "x", "--episode-s", "1"), "go with a leader arm"),
     ],
 )
 def test_what_a_served_robot_cannot_be_recorded_with_is_refused(

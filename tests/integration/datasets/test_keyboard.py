@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from fixtures.command_line import COMMAND
+from fixtures.waiting import eventually
 
 from strands_robots.datasets import tables
 from strands_robots.datasets.check import check_dataset
@@ -55,6 +56,15 @@ class Terminal:
 
 
 @pytest.fixture
+def turns(tmp_path: Path) -> Iterator[Terminal]:
+    """A recording in which a keyboard may take over from a policy."""
+    words = ["--robot", "so100", "--policy", "mock", "--leader", "keyboard", "--task", "wave", "--episodes", "1"]
+    made = Terminal("dataset", "record", str(tmp_path / "set"), *words, "--cameras", "none", "--no-network")
+    yield made
+    made.close()
+
+
+@pytest.fixture
 def terminal(tmp_path: Path) -> Iterator[Terminal]:
     words = ["--robot", "so100", "--leader", "keyboard", "--task", "jog", "--episodes", "2", "--cameras", "none"]
     made = Terminal("dataset", "record", str(tmp_path / "set"), *words, "--no-network")
@@ -94,3 +104,38 @@ def test_keyboard_leads_each_attempt_from_where_the_robot_is(tmp_path: Path, ter
     assert (first["next.success"].any(), second["next.success"][-1]) == (False, True)
     assert first["intervention"].all()
     assert second["intervention"].all()
+
+
+def test_keyboard_takes_over_from_a_policy_and_gives_back(tmp_path: Path, turns: Terminal) -> None:
+    folder = tmp_path / "set"
+    turns.shows("Enter begins")
+    turns.press("\n")
+    turns.shows("v takes over and gives back")
+    turns.shows("The policy drives.")
+    grown(folder, 8_000)
+    turns.press("qq")
+    turns.shows("The leader leads.")
+    grown(folder, 16_000)
+    turns.press("v")
+    turns.shows("The policy drives.")
+    grown(folder, 24_000)
+    turns.press("\n")
+    turns.shows("a success")
+    assert turns.child.wait(30) == 0
+    info, found = check_dataset(folder)
+    assert (info.episodes, [each for each in found if each.wrong]) == (1, [])
+    frames = tables.read_frames(folder / data_file(0))
+    led = [bool(each) for each in frames["intervention"]]
+    assert [each for each, before in zip(led, [not led[0], *led], strict=False) if each != before] == [
+        False,
+        True,
+        False,
+    ]
+    steps = abs(frames["action"][1:, 0] - frames["action"][:-1, 0])
+    assert steps.max() < 0.3, "no jump at a seam"
+    assert frames["next.success"][-1]
+
+
+def grown(folder: Path, size: int) -> None:
+    """Wait until the running attempt has so many bytes."""
+    eventually(lambda: next((folder / ".running").glob("*.mcap")).stat().st_size > size, within=30)
