@@ -20,6 +20,7 @@ from strands_robots.cli.record import NO_CAMERAS
 from strands_robots.datasets.recorded import LED_BY_PERSON
 from strands_robots.errors import NoAnswerError, RefusalError, RobotError, UnreachableError
 from strands_robots.fleet.adapter import Detail, RobotEvent
+from strands_robots.fleet.far_lead import LOST_S
 from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.remote_robot import ROBOT_NAME, RemoteRobot
 from strands_robots.fleet.reports import runs, said
@@ -211,13 +212,14 @@ class FarRobot:
     def held(self) -> Iterator[None]:
         """Hold a robot in the block that is started from here.
 
-        If this process dies, the robot halts when :data:`LEASE_S` are over.
+        If this process dies, the robot halts when :data:`LEASE_S` are over, and that of a leader holds at once.
 
         Raises:
             RefusalError: another caller holds it.
         """
         if (self._policy or self._hand is not None) and self.remote.has_lease:
-            with self.remote.control(LEASE_S):
+            # The robot of a leader that is cut off holds at once, and waits for it.
+            with self.remote.control(LEASE_S if self._hand is None else LOST_S):
                 yield
         else:
             yield

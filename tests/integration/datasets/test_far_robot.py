@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,6 +12,7 @@ from pathlib import Path
 import pytest
 from fixtures.command_line import COMMAND
 from fixtures.leaders import write_csv
+from fixtures.terminal import Terminal
 from fixtures.waiting import eventually, free_port
 from typer.testing import CliRunner
 
@@ -183,3 +185,48 @@ def test_robot_of_a_world_is_halted_when_the_recorder_of_its_policy_is_killed(tm
     assert [each["event"] for each in rows] == ["saved", "dataset"]
     assert check_dataset(folder)[0].episodes == 2, "what was running when it was killed is the first"
     assert "--robot must be one of arm-1/so100, not 'arm-1/left'" in str(other[-1]["reason"])
+
+
+def test_operator_who_was_cut_off_grips_again_and_the_attempt_is_one_episode(tmp_path: Path) -> None:
+    folder, at = tmp_path / "set", ("--port", str(free_port()))
+    with arm(*at):
+        words = ("--robot", "arm-1", "--policy", "mock", "--leader", "keyboard", "--task", "wave", "--episodes", "1")
+        seat = Terminal("dataset", "record", str(folder), *words, "--cameras", "none", *at)
+        try:
+            seat.shows("Enter begins")
+            seat.press("\n")
+            seat.shows("The policy drives.")
+            running(folder)
+            seat.press("qq")
+            seat.shows("The leader leads.")
+            seat.child.send_signal(signal.SIGSTOP)
+            rests(at)
+            seat.child.send_signal(signal.SIGCONT)
+            seat.shows("Held: no fresh command of keyboard has come")
+            seat.press("v")
+            seat.shows("The leader leads.")
+            seat.press("qq")
+            seat.press("v")
+            seat.shows("The policy drives.")
+            seat.press("\n")
+            seat.shows("a success")
+            assert seat.child.wait(30) == 0
+        finally:
+            seat.close()
+    info, found = check_dataset(folder)
+    assert (info.episodes, [each for each in found if each.wrong]) == (1, [])
+    frames = tables.read_frames(folder / data_file(0))
+    assert frames["intervention"].any()
+    assert not frames["intervention"].all()
+    assert (set(frames["stop"].tolist()), bool(frames["next.success"][-1])) == ({0}, True), "a hold is no stop"
+
+
+def rests(at: tuple[str, ...]) -> None:
+    """Wait until the arm has not moved between two looks."""
+    seen: list[object] = []
+
+    def still() -> bool:
+        seen.append(on("call", "arm-1", "getPose", *at)[1][-1]["joints"])
+        return len(seen) > 1 and seen[-1] == pytest.approx(seen[-2], abs=0.05)
+
+    eventually(still, within=20)

@@ -2,57 +2,18 @@
 
 from __future__ import annotations
 
-import os
-import pty
 import select
-import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from fixtures.command_line import COMMAND
+from fixtures.terminal import Terminal
 from fixtures.waiting import eventually
 
 from strands_robots.datasets import tables
 from strands_robots.datasets.check import check_dataset
 from strands_robots.datasets.layout import data_file
-
-
-class Terminal:
-    """A command at a terminal of its own."""
-
-    def __init__(self, *words: str) -> None:
-        self.fd, terminal = pty.openpty()
-        environment = {**os.environ, "TERM": "xterm", "COLUMNS": "200"}
-        self.child = subprocess.Popen(
-            [*COMMAND, *words],
-            stdin=terminal,
-            stdout=terminal,
-            stderr=terminal,
-            env=environment,
-            start_new_session=True,
-        )
-        os.close(terminal)
-        self._shown = b""
-
-    def shows(self, text: str, within: float = 60.0) -> None:
-        """Wait until a text is shown after the last one."""
-        until = time.monotonic() + within
-        while text.encode() not in self._shown:
-            assert time.monotonic() < until, self._shown.decode(errors="replace")
-            if select.select([self.fd], [], [], 0.1)[0]:
-                self._shown += os.read(self.fd, 4096)
-        self._shown = self._shown.partition(text.encode())[2]
-
-    def press(self, keys: str) -> None:
-        """Type some keys."""
-        os.write(self.fd, keys.encode())
-
-    def close(self) -> None:
-        self.child.kill()
-        self.child.wait()
-        os.close(self.fd)
 
 
 @pytest.fixture
