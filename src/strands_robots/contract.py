@@ -47,14 +47,16 @@ AT_REST = frozenset({"idle", "completed", "stopped", "error"})
 class RolloutEvent:
     """An event of a rollout, given to observers from the control thread.
 
-    ``kind`` is started, step or finished; ``state`` of a finished one is completed, stopped or error.
+    ``kind`` is started, step, turn or finished; ``state`` of a finished one is completed, stopped or error. A turn
+    tells who drives from now on, of a robot that a leader elsewhere has: ``state`` is policy, led or held, ``error``
+    the reason of a hold, ``led_by`` the leader.
     ``clamped_steps`` counts the actions that the robot's speed limit held back.
     ``observation`` and ``action`` hold numbers only, by joint name, in the robot's own units. ``follows_instruction``
     is False for a policy that moves by itself, whatever it was told, as ``mock`` does. ``loop`` of a finished one has
     the figures of its control loop. ``led_by`` of a step is the leader that had taken over from the policy.
     """
 
-    kind: Literal["started", "step", "finished"]
+    kind: Literal["started", "step", "turn", "finished"]
     robot: str
     instruction: str
     policy: str

@@ -73,6 +73,8 @@ def test_arm_follows_its_leader_and_only_the_joints_that_it_has(world: Simulatio
 
 
 def test_motion_of_the_leader_takes_over_from_the_policy_and_a_key_gives_back(world: Simulation) -> None:
+    turns: list[tuple[str, str]] = []
+    world.subscribe(lambda event: turns.append((event.state, event.led_by)) if event.kind == "turn" else None)
     desk = Desk(world, **POLICY)
     desk.until("policy")
     desk.arm.at["shoulder_pan"] = 0.05
@@ -85,6 +87,7 @@ def test_motion_of_the_leader_takes_over_from_the_policy_and_a_key_gives_back(wo
     desk.hand.turn()
     desk.until("led")
     desk.hand.close()
+    assert turns == [("policy", "hand"), ("led", "hand"), ("policy", "hand"), ("led", "hand")]
 
 
 def test_stop_of_others_ends_it_as_one(world: Simulation) -> None:

@@ -25,7 +25,7 @@ from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.remote_robot import ROBOT_NAME, RemoteRobot
 from strands_robots.fleet.reports import runs, said
 from strands_robots.recording.cameras import OVERVIEW
-from strands_robots.recording.file import STEP, Pictures, Recorder, beats
+from strands_robots.recording.file import STEP, TURN, Pictures, Recorder, beats
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.utils import DURATION_MAX_S, ValidationError, shown
 
@@ -49,7 +49,7 @@ LEASE_S = 2.0
 
 PICTURE_WIDTH, PICTURE_HEIGHT = 640, 480
 
-TELLING = frozenset({STEP, "taskStarted", "policyStarted", "taskComplete", "policyComplete", "emergencyStop"})
+TELLING = frozenset({STEP, TURN, "taskStarted", "policyStarted", "taskComplete", "policyComplete", "emergencyStop"})
 """Events of a robot of which an episode is made."""
 
 _ENDS = ("taskComplete", "policyComplete")

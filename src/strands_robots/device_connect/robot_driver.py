@@ -92,6 +92,16 @@ class RobotDeviceDriver(RobotDriver):
             led_by: The leader that had taken over from the policy; empty for none
         """
 
+    @emit(labels={"modality": "motion"})
+    async def turnChanged(self, state: str, leader: str, why: str = "") -> None:
+        """Another drives from now on, of a robot that a leader elsewhere has.
+
+        Args:
+            state: policy, led or held
+            leader: The leader's name
+            why: Reason of a hold
+        """
+
     @emit()
     async def stateUpdate(self, task_status: str = "", instruction: str = "", step_count: int = 0) -> None:
         """Activity of the robot, told when it changes.
@@ -140,6 +150,8 @@ class RobotDeviceDriver(RobotDriver):
             await self.taskStarted(**fields)
         elif event.kind == "step":
             await self.streamStep(**fields)
+        elif event.kind == "turn":
+            await self.turnChanged(**fields)
         else:
             await self.taskComplete(duration=event.elapsed_s, **fields)
 

@@ -144,6 +144,17 @@ class SimulationDeviceDriver(RobotDriver):
             led_by: The leader that had taken over from the policy; empty for none
         """
 
+    @emit(labels={"modality": "motion"})
+    async def turnChanged(self, state: str, leader: str, why: str = "", robot_name: str = "") -> None:
+        """Another drives from now on, of a robot that a leader elsewhere has.
+
+        Args:
+            state: policy, led or held
+            leader: The leader's name
+            why: Reason of a hold
+            robot_name: The simulated robot
+        """
+
     def glance(self) -> Activity:
         """Return time, steps, policies and joints of the world."""
         facts = fields_of(self.world.get_state())
@@ -186,5 +197,7 @@ class SimulationDeviceDriver(RobotDriver):
             await self.policyStarted(**fields)
         elif event.kind == "step":
             await self.streamStep(**fields)
+        elif event.kind == "turn":
+            await self.turnChanged(**fields)
         else:
             await self.policyComplete(**fields)

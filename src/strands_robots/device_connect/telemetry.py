@@ -253,6 +253,8 @@ def rollout_fields(event: RolloutEvent) -> dict[str, Any]:
     if event.kind == "step":
         observation, action = plain_numbers(event.observation), plain_numbers(event.action)
         return {"step": event.step, "observation": observation, "action": action, "led_by": event.led_by}
+    if event.kind == "turn":
+        return {"state": event.state, "leader": event.led_by, "why": event.error}
     return {
         "instruction": event.instruction,
         "steps": event.step,

@@ -8,7 +8,7 @@ import math
 import random
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.moved import of_module
@@ -85,12 +85,29 @@ class Restartable(Protocol):
         """Drop the plan and each answer under way; begin from the next observation."""
 
 
+class Turn(NamedTuple):
+    """Driver of a robot in turns.
+
+    Attributes:
+        state: policy, led or held.
+        leader: its name.
+        why: reason of a hold; else empty.
+    """
+
+    state: str
+    leader: str
+    why: str = ""
+
+
 @runtime_checkable
 class Led(Protocol):
     """Policy that a leader may take over."""
 
     led_by: str
     """The leader that has taken over; empty while none has."""
+
+    turn: Turn
+    """Driver of the last control step."""
 
 
 @runtime_checkable

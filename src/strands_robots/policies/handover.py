@@ -23,6 +23,7 @@ from strands_robots.policies.base import (
     PolicyError,
     Ranges,
     Restartable,
+    Turn,
     checked_action,
     is_velocity,
     limited,
@@ -96,11 +97,13 @@ class Beat:
 
     Attributes:
         begins: the first step of a turn, or of a hold.
+        why: reason of a hold.
     """
 
     state: State
     action: Mapping[str, float] = field(default_factory=dict)
     begins: bool = False
+    why: str = ""
 
 
 class Lead:
@@ -211,7 +214,7 @@ class Lead:
             if self._state != "over":
                 self._watch(self._now())
             begins, self._begins = self._begins, False
-            return Beat(self._state, self._action, begins)
+            return Beat(self._state, self._action, begins, self.why)
 
     def _watch(self, now: float) -> None:
         """Hold a robot whose leader is silent, and give up a leader that stays so."""
@@ -267,6 +270,7 @@ class LedPolicy:
         self.lead = lead
         self.led_by = ""
         """The leader while it has taken over from the policy; see :class:`Led`."""
+        self.turn = Turn("", lead.leader)
         self.follows_instruction = getattr(policy, "follows_instruction", True)
         self.errors = self.event_errors = 0
         self.last_error = ""
@@ -322,6 +326,8 @@ class LedPolicy:
         """
         beat = self.lead.beat()
         self.lead.saw(numbers(observation))
+        if beat.state != "over":
+            self.turn = Turn(beat.state, self.lead.leader, beat.why)
         self.led_by = self.lead.leader if beat.state == "led" and self._policy is not None else ""
         if beat.state == "over":
             if self.lead.why:

@@ -26,6 +26,7 @@ from strands_robots.policies.base import (
     Policy,
     PolicyError,
     Ranges,
+    Turn,
     checked_action,
     is_velocity,
     limited,
@@ -203,6 +204,7 @@ class Rollout:
         self._paced = policy if isinstance(policy, Paced) else None
         self._noting = policy if isinstance(policy, Noting) else None
         self._led = policy if isinstance(policy, Led) else None
+        self._turn: Turn | None = None
         self.follows_instruction = getattr(policy, "follows_instruction", True) is not False
         """False for a policy that moves by itself, whatever it was told."""
         self._started_at: float | None = None
@@ -355,6 +357,7 @@ class Rollout:
             observation = self._body.get_observation() if self._policy.uses_cameras else dict(self._body.get_joints())
             if not chunk:
                 actions = self._policy.act(observation)
+                self._tell_turn()
                 if actions is None:
                     return "completed"
                 chunk.extend([actions] if isinstance(actions, Mapping) else actions)
@@ -388,6 +391,12 @@ class Rollout:
             tick = self._next(tick, started)
             self._clock.wait(started + tick * self._period, self._stop_requested)
         return "stopped"
+
+    def _tell_turn(self) -> None:
+        """Tell who drives, where that has changed."""
+        if self._led is not None and self._led.turn != self._turn:
+            self._turn = turn = self._led.turn
+            self._notify("turn", state=turn.state, error=turn.why, led_by=turn.leader)
 
     def _held(self) -> bool:
         """Wait for the end of a hold; return True if there was one since the last call."""
@@ -439,7 +448,7 @@ class Rollout:
         self._begun.set()
         self._notify("finished", state=state, error=self.error)
 
-    def _notify(self, kind: Literal["started", "step", "finished"], **more: Any) -> None:
+    def _notify(self, kind: Literal["started", "step", "turn", "finished"], **more: Any) -> None:
         self._observers.notify(
             RolloutEvent(
                 kind=kind,

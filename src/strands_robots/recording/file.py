@@ -50,6 +50,7 @@ PENDING_PICTURE_BYTES = 64_000_000
 """Most bytes of pictures among them."""
 
 STEP = "streamStep"
+TURN = "turnChanged"
 """Event that carries a robot's actions."""
 
 STEADY = frozenset({STEP, "observationUpdate", "stateUpdate", "state"})
@@ -595,6 +596,8 @@ class RobotRecording:
             step = {"step": event.step, "observation": dict(event.observation), "action": dict(event.action)}
             led = {"led_by": event.led_by} if event.led_by else {}
             self._take(STEP, {**step, **led, **robot})
+        elif event.kind == "turn":
+            self._take(TURN, {"state": event.state, "leader": event.led_by, "why": event.error, **robot})
         elif event.kind == "started":
             self._take(f"{kind}Started", {"instruction": event.instruction, "policy_provider": event.policy, **robot})
         else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import subprocess
 import sys
 import time
@@ -108,8 +109,12 @@ def test_stop_ends_the_lead_and_the_leader_is_told(robot: RemoteRobot) -> None:
             beat(lead, action, lambda: False)
 
 
-def test_policy_and_leader_drive_in_turns(robot: RemoteRobot) -> None:
-    with led(robot, policy_provider="mock", instruction="wave", guide="differences") as lead:
+def test_policy_and_leader_drive_in_turns(site: Site) -> None:
+    robot = site.robot
+    with (
+        robot.events(timeout=20) as events,
+        led(robot, policy_provider="mock", instruction="wave", guide="differences") as lead,
+    ):
         still = dict(lead.state.joints)
         beat(lead, still, lambda: lead.state.state == "policy" and bool(lead.state.written))
         before = lead.state.written
@@ -123,6 +128,8 @@ def test_policy_and_leader_drive_in_turns(robot: RemoteRobot) -> None:
         assert lead.state.written == pytest.approx(here, abs=0.02), "a hand that does not move leaves it where it is"
         lead.give_back()
         beat(lead, still, lambda: lead.state.state == "policy" and lead.state.written != here)
+        told = (each.payload["state"] for each in events if each.name == "turnChanged")
+        assert site.mesh or list(itertools.islice(told, 3)) == ["policy", "led", "policy"]
 
 
 KILLED = """
