@@ -85,7 +85,7 @@ class Restartable(Protocol):
         """Drop the plan and each answer under way; begin from the next observation."""
 
 
-class Turn(NamedTuple):
+class TurnOfDriver(NamedTuple):
     """Driver of a robot in turns.
 
     Attributes:
@@ -106,7 +106,7 @@ class Led(Protocol):
     led_by: str
     """The leader that has taken over; empty while none has."""
 
-    turn: Turn
+    turn: TurnOfDriver
     """Driver of the last control step."""
 
 

@@ -23,7 +23,7 @@ from strands_robots.policies.base import (
     PolicyError,
     Ranges,
     Restartable,
-    Turn,
+    TurnOfDriver,
     checked_action,
     is_velocity,
     limited,
@@ -270,7 +270,7 @@ class LedPolicy:
         self.lead = lead
         self.led_by = ""
         """The leader while it has taken over from the policy; see :class:`Led`."""
-        self.turn = Turn("", lead.leader)
+        self.turn = TurnOfDriver("", lead.leader)
         self.follows_instruction = getattr(policy, "follows_instruction", True)
         self.errors = self.event_errors = 0
         self.last_error = ""
@@ -327,7 +327,7 @@ class LedPolicy:
         beat = self.lead.beat()
         self.lead.saw(numbers(observation))
         if beat.state != "over":
-            self.turn = Turn(beat.state, self.lead.leader, beat.why)
+            self.turn = TurnOfDriver(beat.state, self.lead.leader, beat.why)
         self.led_by = self.lead.leader if beat.state == "led" and self._policy is not None else ""
         if beat.state == "over":
             if self.lead.why:

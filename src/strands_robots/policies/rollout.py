@@ -26,7 +26,7 @@ from strands_robots.policies.base import (
     Policy,
     PolicyError,
     Ranges,
-    Turn,
+    TurnOfDriver,
     checked_action,
     is_velocity,
     limited,
@@ -204,7 +204,7 @@ class Rollout:
         self._paced = policy if isinstance(policy, Paced) else None
         self._noting = policy if isinstance(policy, Noting) else None
         self._led = policy if isinstance(policy, Led) else None
-        self._turn: Turn | None = None
+        self._turn: TurnOfDriver | None = None
         self.follows_instruction = getattr(policy, "follows_instruction", True) is not False
         """False for a policy that moves by itself, whatever it was told."""
         self._started_at: float | None = None
