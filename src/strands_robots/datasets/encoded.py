@@ -22,7 +22,6 @@ from strands_robots.datasets.statistics import PictureStatistics, Statistics
 from strands_robots.datasets.video import (
     EACH,
     FIRST,
-    GROUP,
     Video,
     about_video,
     copy_pictures,
@@ -158,9 +157,8 @@ def _read(path: Path) -> EncodedVideo | None:
     with suppress(OSError, ValueError):
         stated = json_object(path.with_suffix(STATISTICS).read_bytes(), _STATISTICS_BYTES)
         statistics = {name: np.asarray(value) for name, value in stated.items()}
-    # The last group of a video that was not finished may be cut, and a row is written before its picture.
-    whole = len(pictures.keys) - (GROUP if statistics is None else 0)
-    count = max(0, min(len(found), whole))
+    # A row is written before its picture.
+    count = min(len(found), len(pictures.keys))
     keys = np.array(pictures.keys[:count], dtype=bool)
     return EncodedVideo(path, pictures.width, pictures.height, found[:count], keys, statistics) if count else None
 

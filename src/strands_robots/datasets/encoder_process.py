@@ -14,6 +14,7 @@ import os
 import select
 import socket
 import sys
+import threading
 import time
 from collections import deque
 from collections.abc import Callable
@@ -28,7 +29,11 @@ from strands_robots.datasets.encoded import ROW, ROWS, VIDEO, write_statistics
 from strands_robots.datasets.video import GROUP, VideoWriter, decoded
 from strands_robots.errors import StrandsRobotsError
 
-NICENESS = 19
+NICENESS = 5
+"""Of a thread that hurries, and of the process where threads have none of their own."""
+
+HURRY_S, CAUGHT_UP_S = 2.0, 0.2
+"""So far behind the clock it begins to hurry, and ends to."""
 
 MARGIN_S = 0.005
 """Time after a moment for which a picture of that moment may still be copied."""
@@ -152,17 +157,27 @@ class _Encoder:
         self._cameras: dict[str, _Camera] = {}
         self._folder, self._began, self._fps = Path(), 0.0, 1
         self._number, self._until = 0, -1.0
+        self.over = False
+        """True once the recorder is gone; the files are whole whenever."""
 
-    def run(self) -> None:
-        """Serve until the recorder is gone; the files are whole whenever."""
-        while True:
+    def run(self, *, hurry: bool) -> None:
+        """Serve until it is over, or until it is to go on otherwise."""
+        _give_way(hurry=hurry)
+        while not self.over and self._hurries(since_before=hurry) is hurry:
             running = self._until >= 0
             due = min(self._moment + MARGIN_S, self._until) if running else math.inf
             wait = None if due == math.inf else max(0.0, due - time.time())
             if select.select([self._orders], [], [], wait)[0] and not self._receive():
-                return
-            if self._until >= 0:
+                self.over = True
+            elif self._until >= 0:
                 self._step(time.time())
+
+    def _hurries(self, *, since_before: bool) -> bool:
+        """Return True where an attempt waits for its end, or it is far behind."""
+        if self._until < 0:
+            return False
+        behind = time.time() - self._moment
+        return self._until < float("inf") or behind > (CAUGHT_UP_S if since_before else HURRY_S)
 
     @property
     def _moment(self) -> float:
@@ -235,20 +250,28 @@ class _Encoder:
             return  # the recorder is gone, which the next look at the orders tells
 
 
-def _give_way() -> None:
-    """Run in the time that others leave, so that no control loop waits."""
+def _give_way(*, hurry: bool) -> None:
+    """Have this thread run in the time that others leave."""
     if sys.platform == "linux":
-        with suppress(OSError):
-            os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
-            return
-    os.nice(NICENESS)
+        if not hurry:
+            with suppress(OSError):
+                os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+                return
+        os.nice(NICENESS)
 
 
 def main(descriptor: int) -> None:
     """Encode for the recorder at the other end of a socket."""
-    _give_way()
+    if sys.platform != "linux":
+        os.nice(NICENESS)
     with socket.socket(fileno=descriptor) as orders:
-        _Encoder(orders).run()
+        encoder, hurry = _Encoder(orders), False
+        while not encoder.over:
+            # A thread of the idle class cannot leave it.
+            thread = threading.Thread(target=encoder.run, kwargs={"hurry": hurry})
+            thread.start()
+            thread.join()
+            hurry = not hurry
 
 
 if __name__ == "__main__":

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import io
+import os
+import struct
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, Self, cast
+from typing import Any, BinaryIO, Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +33,8 @@ GROUP = 2
 
 _LIVE = {"movflags": "frag_keyframe+empty_moov+default_base_moof", "flush_packets": "1"}
 """Options of a file that is readable up to its last group whenever its writer ends."""
+
+_BOX = struct.Struct(">I4s")
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,24 +196,26 @@ class EncodedPictures:
 
 
 def encoded_pictures(path: Path) -> EncodedPictures | None:
-    """Return the encoded pictures of a video; None where it has none.
+    """Return the encoded pictures of a live video; None where it has none.
 
-    A cut file has those before the cut, the last of them damaged.
+    A cut file has the groups that are whole.
 
     Raises:
         MissingExtraError: the [dataset] extra is not installed.
     """
     av = _pyav()
     keys: list[bool] = []
-    with suppress(OSError, av.FFmpegError, IndexError), av.open(str(path)) as file:
-        context = file.streams.video[0].codec_context
+    with suppress(OSError, av.FFmpegError, IndexError), _whole_part(path) as part, av.open(part) as file:
+        context: Any = file.streams.video[0].codec_context
+        if context is None:
+            return None  # it was cut in its head
         width, height = context.width, context.height
         keys.extend(bool(packet.is_keyframe) for packet in file.demux(video=0) if packet.size)
     return EncodedPictures(width, height, keys) if keys else None
 
 
 def copy_pictures(path: Path, target: Path, first: int, count: int, fps: int) -> None:
-    """Copy ``count`` pictures of a video without encoding them anew.
+    """Copy ``count`` pictures of a live video without encoding them anew.
 
     ``first`` is a key picture.
 
@@ -219,7 +225,7 @@ def copy_pictures(path: Path, target: Path, first: int, count: int, fps: int) ->
     """
     av, copied = _pyav(), 0
     try:
-        with av.open(str(path)) as file, av.open(str(target), "w", format="mp4") as out:
+        with _whole_part(path) as part, av.open(part) as file, av.open(str(target), "w", format="mp4") as out:
             stream = out.add_stream_from_template(file.streams.video[0])
             for number, packet in enumerate(file.demux(video=0)):
                 if copied == count or not packet.size:
@@ -234,6 +240,42 @@ def copy_pictures(path: Path, target: Path, first: int, count: int, fps: int) ->
         raise DatasetError(f"{target} cannot be written: {exc}") from exc
     if copied != count:
         raise DatasetError(f"{path} has {copied} pictures from {first} on, not {count}")
+
+
+class _Part:
+    """The beginning of a file, as PyAV reads it."""
+
+    def __init__(self, file: BinaryIO, length: int) -> None:
+        self._file, self._length = file, length
+        self.tell = file.tell
+        file.seek(0)
+
+    def read(self, count: int) -> bytes:
+        return self._file.read(max(0, min(count, self._length - self._file.tell())))
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        if whence == os.SEEK_END:
+            return self._file.seek(self._length + offset)
+        return self._file.seek(offset, whence)
+
+
+@contextmanager
+def _whole_part(path: Path) -> Iterator[_Part]:
+    """Yield a live video without what is cut at its end.
+
+    FFmpeg may refuse all of a video for it. ISO/IEC 14496-12, 4.2: a box begins with its size and kind; a group is a
+    box ``moof`` and one ``mdat``.
+    """
+    with path.open("rb") as file:
+        total, place, whole = os.fstat(file.fileno()).st_size, 0, 0
+        while len(head := file.read(_BOX.size)) == _BOX.size:
+            size, kind = _BOX.unpack(head)
+            if size < _BOX.size or place + size > total:
+                break
+            place = file.seek(place + size)
+            if kind != b"moof":
+                whole = place
+        yield _Part(file, whole)
 
 
 def decoded(jpeg: bytes) -> NDArray[np.uint8]:
