@@ -118,6 +118,21 @@ def test_dataset_of_other_names_or_rate_is_refused(tmp_path: Path) -> None:
     assert read_info(tmp_path).episodes == 1
 
 
+def test_dataset_of_other_units_is_refused_and_one_that_states_none_goes_on(tmp_path: Path) -> None:
+    saved(tmp_path, 1)
+
+    def told(*units: str) -> DatasetInfo:
+        return replace(INFO, features={**INFO.features, "action": Feature("float32", (3,), JOINTS, units=units)})
+
+    assert told("degrees", "degrees", "").differences(INFO) == []
+    (said,) = told("degrees", "degrees", "").differences(told("radians", "degrees", ""))
+    assert said.startswith(
+        "action is float32 3 (pan in degrees, lift in degrees, grip) here, not float32 3 (pan in rad"
+    )
+    with pytest.raises(ValidationError, match="units must be 3"):
+        told("degrees")
+
+
 def test_folder_of_other_files_is_not_written_into(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("years")
     with pytest.raises(DatasetError, match=r"not empty: it has thesis\.tex"):

@@ -47,6 +47,16 @@ def test_degrees_are_no_radians(tmp_path: Path) -> None:
     assert said == "pan is 0 to 45, and arm-1 takes -1 to 1; is it of another unit?"
 
 
+def test_units_that_are_stated_are_told_and_no_range_is_guessed_by(tmp_path: Path) -> None:
+    features = {key: Feature("float32", (2,), JOINTS, units=("degrees", "")) for key in ("observation.state", "action")}
+    with Dataset(tmp_path, DatasetInfo(30, features, "arm")) as dataset:
+        rows = np.array([[0.0, 0.0], [45.0, 1.0]], dtype=np.float32)
+        dataset.save(DatasetEpisode("reach", dict.fromkeys(features, rows)))
+        robot = RobotJoints.of("arm-1", {**ARM, "joint_units": {"pan": "radians", "lift": "radians"}})
+        said = [each.said for each in robot_findings(tmp_path, dataset.info, robot)]
+    assert said == ["pan is in degrees, and of arm-1 in radians"] * 2
+
+
 def test_robot_of_a_world_is_named_where_there_are_several() -> None:
     part = {
         "joints": {"pan": [-1, 1], "lift": None},

@@ -13,9 +13,16 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from strands_robots.cli.app import build
-from strands_robots.datasets import tables
+from strands_robots.datasets import Dataset, tables
 from strands_robots.datasets.layout import data_file, read_info
-from strands_robots.datasets.recorded import attempts_of
+from strands_robots.datasets.recorded import (
+    ACTORS,
+    LED_BY_RECORDING,
+    attempts_in,
+    attempts_of,
+    info_of,
+    save_attempt,
+)
 from strands_robots.recording.file import Recorder
 from strands_robots.utils import ValidationError
 
@@ -104,3 +111,60 @@ def test_index_of_the_dataset_is_what_lerobot_states(tmp_path: Path) -> None:
     stated = json.loads((out / "meta/info.json").read_text())
     assert (stated["codebase_version"], stated["robot_type"], stated["splits"]) == ("v3.0", "so101", {"train": "0:1"})
     assert stated["features"]["observation.images.top"]["shape"] == [48, 64, 3]
+
+
+def acted(path: Path) -> Path:
+    """Write an attempt: a policy's steps, a leader's, a planned motion's, an emergency stop, and a refused motion."""
+    with Recorder(path) as recorder:
+        recorder.take("arm-1", "jointUnits", {"units": {"pan": "degrees"}}, BEGAN - 1)
+        for start, policy, led_by in ((0, "mock", ""), (10, "", "hand"), (20, "motion", "")):
+            if policy:
+                recorder.take("arm-1", "taskStarted", {"policy_provider": policy}, BEGAN + start / HZ)
+            for step in range(start, start + 10):
+                row = {"observation": {"pan": 1.0, "lift": 1.0}, "action": {"pan": 1.0}, "led_by": led_by}
+                recorder.take("arm-1", "streamStep", row, BEGAN + step / HZ)
+        recorder.take("arm-1", "taskComplete", {"state": "stopped"}, BEGAN + 1.46)
+        recorder.take("arm-1", "locked", {}, BEGAN + 1.47)
+        recorder.take("arm-1", "motionRefused", {"verb": "execute"}, BEGAN + 1.80)
+        recorder.take("arm-1", "motionRefused", {"verb": "execute"}, BEGAN + 60.0)
+        recorder.take("arm-1", "taskStarted", {"policy_provider": "pi"}, BEGAN + 100)
+        for step in range(5):
+            row = {"observation": {"pan": 1.0, "lift": 1.0}, "action": {"pan": 1.0}}
+            recorder.take("arm-1", "streamStep", row, BEGAN + 100 + step / HZ)
+    return path
+
+
+def test_frames_say_who_acted_and_what_was_refused(tmp_path: Path) -> None:
+    file, out = acted(tmp_path / "a.mcap"), tmp_path / "set"
+    (attempt,) = attempts_in(file, whole=True)[:1]
+    attempt.steps, attempt.led, attempt.actors = attempt.steps[:30], attempt.led[:30], attempt.actors[:30]
+    info = info_of([attempt], 20, "so100")
+    with Dataset(out, info) as dataset:
+        save_attempt(dataset, attempt, "wave", success=False)
+    frames = frames_of(out)
+    assert len(frames["index"]) == 37, "the frames go on to the motion that was refused"
+    assert [ACTORS[code] for code in frames["actor"][[0, 9, 10, 19, 20, 29]]] == [
+        *("policy", "policy", "leader", "leader", "motion", "motion")
+    ]
+    assert frames["intervention"].tolist() == [False] * 10 + [True] * 10 + [False] * 17
+    assert {index: int(code) for index, code in enumerate(frames["stop"]) if code} == {30: 2, 36: 3}
+    assert frames["observation.age_ms.state"][-1] == pytest.approx(350, abs=1), "and say how old their state is"
+    again = read_info(out)
+    assert again.features["action"].units == ("degrees",)
+    assert again.features["observation.state"].units == ("degrees", "")
+    assert again.features["actor"].about == {"codes": list(ACTORS)}
+
+
+def test_lockout_is_of_the_task_that_it_ended_not_of_the_next_one(tmp_path: Path) -> None:
+    stopped, after = attempts_in(acted(tmp_path / "a.mcap"))[-2:]
+    assert [code for _, code in stopped.stops] == [1, 2, 3]
+    assert (after.stops, after.actors) == ([], [1] * 5)
+
+
+def test_recording_that_leads_is_told_from_a_person(tmp_path: Path) -> None:
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        recorder.take("arm-1", LED_BY_RECORDING, {}, BEGAN)
+        recorder.take("arm-1", "taskStarted", {"policy_provider": "teleoperation"}, BEGAN)
+        recorder.take("arm-1", "streamStep", {"observation": {"pan": 1.0}, "action": {"pan": 1.0}}, BEGAN)
+    (attempt,) = attempts_in(tmp_path / "a.mcap")
+    assert (ACTORS[attempt.actors[0]], attempt.led) == ("recording", [False])

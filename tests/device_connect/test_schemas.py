@@ -33,7 +33,7 @@ def test_every_function_event_and_parameter_is_described(driver: Any) -> None:
             assert len(prop.get("description", "")) > 2, (part.name, name)
 
 
-CONTROL_EVENTS = ("controlTaken", "controlExpired")
+CONTROL_EVENTS = ("controlTaken", "controlExpired", "motionRefused")
 COMMON_EVENTS = {"turnChanged", "emergencyStop", *CONTROL_EVENTS}
 
 

@@ -270,3 +270,31 @@ def test_what_comes_after_a_halt_never_takes_its_place(
     second.join(20)
     assert gate.generation == newest[0], "the older halt is stored after the newer"
     assert not permit.valid, "a halt is lost"
+
+
+def test_refusals_of_a_locked_robot_are_told_and_no_flood_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[tuple[str, str]] = []
+
+    class Lock(Latch):
+        def refusal(self, verb: str) -> Envelope | None:
+            return error(f"{verb} is locked.", locked=True) if self.locked else None
+
+    gate = MotionGate(lock := Lock())
+    unwatch = gate.watch_refusals(lambda verb, why: told.append((verb, why)))
+    gate.watch_refusals(lambda verb, why: 1 / 0)
+    for _ in range(50):
+        with pytest.raises(MotionRefused):
+            gate.permit("a")
+    assert told == [("a", "a is locked.")], "a caller that asks on and on"
+    monkeypatch.setattr(module, "REFUSED_EVERY_S", 0.0)
+    with pytest.raises(MotionRefused):
+        gate.permit("b")
+    lock.locked = False
+    gate.attach(Latch())
+    with pytest.raises(MotionRefused):
+        gate.permit("c")
+    unwatch()
+    lock.locked = True
+    with pytest.raises(MotionRefused):
+        gate.permit("d")
+    assert [verb for verb, _ in told] == ["a", "b"], "what refuses for another reason is no lockout"

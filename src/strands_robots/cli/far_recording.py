@@ -10,14 +10,14 @@ import base64
 import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from typing import Any
 
 from strands_robots.cli.far_hand import HandLeader
 from strands_robots.cli.output import CliError, Screen
 from strands_robots.cli.record import NO_CAMERAS
-from strands_robots.datasets.recorded import LED_BY_PERSON
+from strands_robots.datasets.recorded import LED_BY_PERSON, LED_BY_RECORDING
 from strands_robots.errors import NoAnswerError, RefusalError, RobotError, UnreachableError
 from strands_robots.fleet.adapter import Detail, RobotEvent
 from strands_robots.fleet.far_lead import LOST_S
@@ -25,7 +25,7 @@ from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.remote_robot import ROBOT_NAME, RemoteRobot
 from strands_robots.fleet.reports import runs, said
 from strands_robots.recording.cameras import OVERVIEW
-from strands_robots.recording.file import STEP, TURN, Pictures, Recorder, beats
+from strands_robots.recording.file import REFUSED, STEP, TURN, UNITS, Pictures, Recorder, beats, units_in
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.utils import DURATION_MAX_S, ValidationError, shown
 
@@ -49,8 +49,13 @@ LEASE_S = 2.0
 
 PICTURE_WIDTH, PICTURE_HEIGHT = 640, 480
 
-TELLING = frozenset({STEP, TURN, "taskStarted", "policyStarted", "taskComplete", "policyComplete", "emergencyStop"})
+TELLING = frozenset(
+    {STEP, TURN, REFUSED, "taskStarted", "policyStarted", "taskComplete", "policyComplete", "emergencyStop"}
+)
 """Events of a robot of which an episode is made."""
+
+_REFUSALS = {"motion_refused": REFUSED}
+"""Safety events of the mesh that tell of a refused motion."""
 
 _ENDS = ("taskComplete", "policyComplete")
 
@@ -120,6 +125,10 @@ class FarRobot:
         self.networks, self._part, self._policy, self._task = networks, part, policy, task
         self._cameras = _cameras_of(world, part, cameras)
         self._hand = hand
+        self._units: dict[str, str] = {}
+        with suppress(RefusalError):
+            # One that states no features states no units.
+            self._units = units_in(world.features(), part)
         self._attempt: FarTask | None = None
         self._recorder: Recorder | None = None
 
@@ -228,14 +237,16 @@ class FarRobot:
     def recorded(self, recorder: Recorder, fps: int, pictures: Pictures | None) -> Iterator[None]:
         """Record its events in the block, and hand the pictures of its cameras over."""
         self._recorder, over = recorder, threading.Event()
+        if self._units:
+            recorder.take(self.name, UNITS, {"units": self._units})
         threads = [
             threading.Thread(
                 target=self._take_pictures, args=(recorder, each, pictures, fps, over), name=f"pictures {each}"
             )
             for each in (() if pictures is None else self._cameras)
         ]
-        if self._hand is not None and self._hand.person and not self._policy:
-            recorder.take(self.name, LED_BY_PERSON, {})
+        if self._hand is not None and not self._policy:
+            recorder.take(self.name, LED_BY_PERSON if self._hand.person else LED_BY_RECORDING, {})
         end = self.networks.subscribe(self.name, lambda event: self._take(recorder, event), Detail.ALL)
         try:
             for thread in threads:
@@ -248,7 +259,10 @@ class FarRobot:
                 thread.join()
 
     def _take(self, recorder: Recorder, event: RobotEvent) -> None:
-        if event.name not in TELLING:
+        name = event.name
+        if name == "safety_event":
+            name = _REFUSALS.get(str(event.payload.get("event")), name)
+        if name not in TELLING:
             return
         named = event.payload.get(ROBOT_NAME)
         if self._part and named not in (None, "", self._part):
@@ -256,7 +270,7 @@ class FarRobot:
         task = self._attempt
         if event.name in _ENDS and task is not None and not task.halting:
             self._ended(task, event.payload)
-        recorder.take(self.name, event.name, event.payload)
+        recorder.take(self.name, name, event.payload)
 
     def _ended(self, task: FarTask, payload: Mapping[str, Any]) -> None:
         """Note the end of a motion of the robot."""

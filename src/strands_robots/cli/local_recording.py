@@ -22,7 +22,7 @@ from strands_robots.cli.leading import (
 )
 from strands_robots.cli.led_robot import LedRobot
 from strands_robots.cli.output import CliError, Screen
-from strands_robots.datasets.recorded import LED_BY_PERSON
+from strands_robots.datasets.recorded import LED_BY_PERSON, LED_BY_RECORDING
 from strands_robots.errors import RefusalError
 from strands_robots.fleet.reports import said
 from strands_robots.policies.rollout import Rollout
@@ -42,12 +42,12 @@ class Driver:
     Args:
         begin: begins one; returns its task.
         turn: closed at the end of each attempt.
-        person: a person leads.
+        led_by: event that tells the leader's kind; empty of a policy.
     """
 
     begin: Callable[[], Any]
     turn: ExitStack
-    person: bool = False
+    led_by: str = ""
 
 
 @contextmanager
@@ -169,7 +169,7 @@ def leader_drives(  # noqa: PLR0917 - one leader, and what is done with it
             begin(screen, led, leader, source, how, publish=False)
             return led.robot.tasks.by_leader[LEADER]
 
-        yield Driver(lead, turn, person=not recorded)
+        yield Driver(lead, turn, LED_BY_RECORDING if recorded else LED_BY_PERSON)
 
 
 class LocalAttempts:
@@ -207,8 +207,8 @@ class LocalAttempts:
     @contextmanager
     def recorded(self, recorder: Recorder, fps: int, pictures: Pictures | None) -> Iterator[None]:
         """Record it in the block, and hand the pictures of its cameras over."""
-        if self._driver.person:
-            recorder.take(self.name, LED_BY_PERSON, {})
+        if self._driver.led_by:
+            recorder.take(self.name, self._driver.led_by, {})
         how: dict[str, Any] = {"frames": self._frames, "cameras_hz": min(fps, CAMERAS_HZ_MAX), "pictures": pictures}
         # An episode has the joints of its steps.
         with self._driver.turn, RobotRecording(self._led.robot, recorder, self.name, joints_hz=1, **how):

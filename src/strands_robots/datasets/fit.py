@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from strands_robots.datasets.check import DatasetFinding
 from strands_robots.datasets.layout import INFO_BYTES, STATS, DatasetError, DatasetInfo
 from strands_robots.datasets.recorded import ACTION, STATE
 from strands_robots.policies.base import Ranges
+from strands_robots.recording.file import units_in
 from strands_robots.utils import ValidationError, shown
 
 OUTSIDE = 0.05
@@ -21,12 +22,13 @@ OUTSIDE = 0.05
 
 @dataclass(frozen=True, slots=True)
 class RobotJoints:
-    """Joints that a robot observes, keys that it is told, and the range of each."""
+    """Joints that a robot observes and is told, their ranges and units."""
 
     name: str
     observed: tuple[str, ...]
     told: tuple[str, ...]
     ranges: Ranges
+    units: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
     def of(cls, name: str, features: Mapping[str, Any], part: str = "") -> RobotJoints:
@@ -40,7 +42,7 @@ class RobotJoints:
         Raises:
             ValidationError: it states no joints, or several robots and none is named.
         """
-        robots = features.get("robots")
+        units, robots = units_in(features, part), features.get("robots")
         if isinstance(robots, Mapping):
             if (part or len(robots) > 1) and part not in robots:
                 known = ", ".join(map(str, robots))
@@ -54,7 +56,7 @@ class RobotJoints:
         if not observed or not told:
             raise ValidationError(f"{name} states no joints or no actions.")
         ranges = {str(key): found for key, value in stated.items() if (found := _range(value)) is not None}
-        return cls(name, observed, told, ranges)
+        return cls(name, observed, told, ranges, units)
 
 
 def robot_findings(folder: Path, info: DatasetInfo, robot: RobotJoints) -> Iterator[DatasetFinding]:
@@ -80,6 +82,10 @@ def robot_findings(folder: Path, info: DatasetInfo, robot: RobotJoints) -> Itera
             yield DatasetFinding(key, f"{robot.name} has no {', '.join(strange)}")
         found = _mapping(statistics.get(key))
         for index, name in enumerate(names):
+            unit, its = (info.features[key].units or ("",) * len(names))[index], robot.units.get(name, "")
+            if unit and its and unit != its:
+                yield DatasetFinding(key, f"{name} is in {unit}, and of {robot.name} in {its}")
+                continue
             bounds, seen = robot.ranges.get(name), _seen(found, index)
             if bounds is None or seen is None:
                 continue

@@ -11,6 +11,7 @@ import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +60,10 @@ class Feature:
     shape: tuple[int, ...] = (1,)
     names: tuple[str, ...] = ()
     about: Mapping[str, Any] = field(default_factory=dict)
-    """Of a video, once there is one: its codec and size as LeRobot states them."""
+    """Of a video, once there is one: its codec and size as LeRobot states them. Of codes: their names."""
+
+    units: tuple[str, ...] = ()
+    """Of a vector's numbers, from the robot; empty where it states none. LeRobot does not read them."""
 
     def __post_init__(self) -> None:
         choice("dtype", self.dtype, DTYPES)
@@ -70,6 +74,8 @@ class Feature:
             whole("shape", side, low=1, high=WIDTH_MAX)
         if self.names and len(self.names) != self.shape[-1]:
             raise ValidationError(f"names must be {self.shape[-1]}, as the shape states, not {len(self.names)}.")
+        if self.units and len(self.units) != len(self.names):
+            raise ValidationError(f"units must be {len(self.names)}, as the names are, not {len(self.units)}.")
         if len(set(self.names)) != len(self.names):
             raise ValidationError(f"names must differ: {', '.join(self.names)}.")
 
@@ -83,7 +89,9 @@ class Feature:
         names: list[str] | None = list(self.names) or None
         if self.video:
             names = ["height", "width", "channels"]
-        stated = {"dtype": self.dtype, "shape": list(self.shape), "names": names}
+        stated: dict[str, Any] = {"dtype": self.dtype, "shape": list(self.shape), "names": names}
+        if self.units:
+            stated["units"] = list(self.units)
         return {**stated, "info": dict(self.about)} if self.about else stated
 
 
@@ -162,6 +170,9 @@ class DatasetInfo:
         ]
         for name in self.features.keys() & other.features.keys():
             mine, its = (replace(each.features[name], about={}) for each in (self, other))
+            if not mine.units or not its.units:
+                # One that states none may be of the same.
+                mine, its = replace(mine, units=()), replace(its, units=())
             if mine != its:
                 found.append(f"{name} is {_told(mine)} here, not {_told(its)}")
         return found
@@ -272,9 +283,12 @@ def _feature(stated: Any) -> Feature:
         names = next(iter(names.values()))
     video = stated["dtype"] == "video"
     kept = tuple(map(str, names)) if isinstance(names, list) and not video else ()
-    return Feature(str(stated["dtype"]), tuple(stated["shape"]), kept, dict(stated.get("info") or {}))
+    units = stated.get("units")
+    told = tuple(map(str, units)) if isinstance(units, list) and len(units) == len(kept) else ()
+    return Feature(str(stated["dtype"]), tuple(stated["shape"]), kept, dict(stated.get("info") or {}), told)
 
 
 def _told(feature: Feature) -> str:
-    names = f" ({', '.join(feature.names)})" if feature.names else ""
+    each = [" in ".join(filter(None, pair)) for pair in zip_longest(feature.names, feature.units, fillvalue="")]
+    names = f" ({', '.join(each)})" if each else ""
     return f"{feature.dtype} {'x'.join(map(str, feature.shape))}{names}"

@@ -6,7 +6,7 @@ put on the grid of the dataset: a frame has what was newest at its moment, and h
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -15,29 +15,54 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from strands_robots.contract import SETTLE, VERB
 from strands_robots.datasets.encoded import EncodedVideo, common_moments
 from strands_robots.datasets.episodes import FRAMES_MAX, Dataset, DatasetEpisode
 from strands_robots.datasets.layout import DatasetInfo, Feature
 from strands_robots.datasets.video import Video, VideoWriter, decoded
 from strands_robots.policies.base import numbers
-from strands_robots.recording.file import STEP, RecordedEvent, RecordedItem, RecordedPicture, read_items
+from strands_robots.recording.file import (
+    REFUSED,
+    STEP,
+    UNITS,
+    RecordedEvent,
+    RecordedPicture,
+    read_items,
+    units_in,
+)
 from strands_robots.utils import ValidationError, shown
 
 STATE, ACTION, SUCCESS, STOP, INTERVENTION = "observation.state", "action", "next.success", "stop", "intervention"
 AGE, SAME, IMAGES = "observation.age_ms.", "observation.same.", "observation.images."
 
-STOPPED, EMERGENCY = 1, 2
-"""Values of the feature ``stop``; 0 is none."""
+STOPPED, EMERGENCY, LOCKED_OUT = 1, 2, 3
+"""Values of the feature ``stop``; 0 is none. The last one is a motion that was refused while the robot was locked."""
+
+AFTER_S = 2.0
+"""Time after the last step in which a stop is of its attempt; its frames go on to a motion that is refused then."""
+
+ACTOR = "actor"
+UNKNOWN, BY_POLICY, BY_LEADER, BY_MOTION, BY_RECORDING = range(5)
+ACTORS = ("unknown", "policy", "leader", "motion", "recording")
+"""Names of the values of the feature ``actor``: who had the robot make its newest step."""
+
+_ACTORS = {"teleoperation": BY_LEADER, "motion": BY_MOTION, SETTLE: BY_MOTION, VERB: BY_MOTION}
 
 SOON_S = 1e-5
 """A reading that comes so soon after a frame's moment, in seconds, is that frame's: times are rounded."""
 
-_STOPS = {"halted": STOPPED, "locked": EMERGENCY, "emergencyStop": EMERGENCY}
+_WEIGHT = (LOCKED_OUT, STOPPED, EMERGENCY)
+"""Of two in one frame the later one here counts: what was refused is of the lockout."""
+
+_STOPS = {"halted": STOPPED, "locked": EMERGENCY, "emergencyStop": EMERGENCY, REFUSED: LOCKED_OUT}
 ATTEMPT_ENDED = "attemptEnded"
 """Event of a recording: the person who records has ended the attempt. What follows is none of it."""
 
 LED_BY_PERSON = "ledByPerson"
 """Event of a recording: from here on a person leads, by an arm, a keyboard or a gamepad."""
+
+LED_BY_RECORDING = "ledByRecording"
+"""The same where the leader is a recording."""
 
 _ENDS = ("taskComplete", "policyComplete")
 _STARTS = ("taskStarted", "policyStarted")
@@ -49,7 +74,8 @@ class Attempt:
 
     ``steps`` are moments in seconds, observations and actions by name; ``pictures`` moments and JPEG by camera.
     ``person`` is True where a person led all of it, and ``led`` of the steps in which a leader had its turn; ``videos``
-    are by camera, where its pictures were encoded as they came.
+    are by camera, where its pictures were encoded as they came. ``actors`` are of the steps, as :data:`ACTORS` counts
+    them; ``units`` are by joint, where the robot states them.
     """
 
     instruction: str = ""
@@ -59,6 +85,8 @@ class Attempt:
     person: bool = False
     videos: Mapping[str, EncodedVideo] = field(default_factory=dict)
     led: list[bool] = field(default_factory=list)
+    actors: list[int] = field(default_factory=list)
+    units: Mapping[str, str] = field(default_factory=dict)
 
 
 def attempts_of(path: Path, robot: str | None = None) -> list[Attempt]:
@@ -97,7 +125,8 @@ def attempts_in(path: Path, robot: str | None = None, *, whole: bool = False) ->
             f"robot must be one of those that were recorded ({', '.join(known)}), not {shown(robot)}."
         )
     chosen = robot or known[0]
-    attempts = list(_attempts(items, chosen, whole=whole))
+    events = (each for each in items if isinstance(each, RecordedEvent))
+    attempts = _AttemptReader(chosen, whole=whole).read(each for each in events if each.robot in _names(chosen))
     for each in items:
         if isinstance(each, RecordedPicture) and chosen.partition("/")[0] == each.device.partition("/")[0]:
             for attempt in attempts:
@@ -105,35 +134,77 @@ def attempts_in(path: Path, robot: str | None = None, *, whole: bool = False) ->
     return attempts
 
 
-def _attempts(items: Sequence[RecordedItem], robot: str, *, whole: bool) -> Iterator[Attempt]:
-    attempt = Attempt()
-    for each in items:
-        if not isinstance(each, RecordedEvent) or each.robot not in (robot, robot.partition("/")[0]):
-            continue
-        if each.event == LED_BY_PERSON:
-            attempt.person = True
-        elif each.event == ATTEMPT_ENDED:
-            if attempt.steps:
-                yield attempt
-            attempt = Attempt()
-        elif each.event in _STARTS or each.event in _ENDS:
-            if attempt.steps and each.event in _STARTS and not whole:
-                yield attempt
-                attempt = Attempt()
-            if each.event in _ENDS and each.payload.get("state") == "stopped":
-                attempt.stops.append((each.at, STOPPED))
-            attempt.instruction = str(each.payload.get("instruction") or attempt.instruction)
-            if each.event in _ENDS and attempt.steps and not whole:
-                yield attempt
-                attempt = Attempt()
-        elif each.event == STEP and each.robot == robot:
-            observation, action = (_numbers(each.payload.get(name)) for name in ("observation", "action"))
-            attempt.steps.append((each.at, observation, action))
-            attempt.led.append(attempt.person or bool(each.payload.get("led_by")))
-        elif (code := _STOPS.get(each.event)) is not None:
-            attempt.stops.append((each.at, code))
-    if attempt.steps:
-        yield attempt
+def _names(robot: str) -> tuple[str, str]:
+    """Return the robot and the world that it is in."""
+    return robot, robot.partition("/")[0]
+
+
+class _AttemptReader:
+    """Attempts of one robot by its events, in the order of their writing."""
+
+    def __init__(self, robot: str, *, whole: bool) -> None:
+        self._robot, self._whole = robot, whole
+        self._found: list[Attempt] = []
+        self._attempt = Attempt()
+        self._before: Attempt | None = None
+        self._actor, self._replayed = UNKNOWN, False
+        self._units: dict[str, str] = {}
+
+    def read(self, events: Iterable[RecordedEvent]) -> list[Attempt]:
+        """Return the attempts."""
+        for each in events:
+            if each.event == STEP and each.robot == self._robot:
+                self._take_step(each)
+            elif each.event in _STARTS or each.event in _ENDS:
+                self._take_task(each)
+            elif (code := _STOPS.get(each.event)) is not None:
+                self._take_stop(each.at, code)
+            elif each.event == ATTEMPT_ENDED:
+                self._end()
+                # What follows is the end itself.
+                self._before = None
+            elif each.event == UNITS:
+                self._units = units_in({"joint_units": each.payload.get("units")})
+            elif each.event == LED_BY_PERSON:
+                self._attempt.person = True
+            elif each.event == LED_BY_RECORDING:
+                self._replayed = True
+        self._end()
+        return self._found
+
+    def _end(self) -> None:
+        if self._attempt.steps:
+            self._found.append(self._attempt)
+            self._before = self._attempt
+        self._attempt = Attempt()
+
+    def _take_step(self, event: RecordedEvent) -> None:
+        attempt, led_by = self._attempt, event.payload.get("led_by")
+        observation, action = (_numbers(event.payload.get(name)) for name in ("observation", "action"))
+        attempt.steps.append((event.at, observation, action))
+        attempt.units = self._units
+        attempt.led.append(attempt.person or (bool(led_by) and not self._replayed))
+        actor = BY_LEADER if led_by or attempt.person else _actor(event.payload.get("policy"), self._actor)
+        attempt.actors.append(BY_RECORDING if self._replayed and actor in (BY_LEADER, UNKNOWN) else actor)
+
+    def _take_task(self, event: RecordedEvent) -> None:
+        begins = event.event in _STARTS
+        if begins and self._attempt.steps and not self._whole:
+            self._end()
+        if begins:
+            self._actor = _actor(event.payload.get("policy_provider"))
+        elif event.payload.get("state") == "stopped":
+            self._take_stop(event.at, STOPPED)
+        self._attempt.instruction = str(event.payload.get("instruction") or self._attempt.instruction)
+        if not begins and self._attempt.steps and not self._whole:
+            self._end()
+
+    def _take_stop(self, at: float, code: int) -> None:
+        # A task's end is told before the stop or the lockout that ended it.
+        if self._attempt.steps:
+            self._attempt.stops.append((at, code))
+        elif self._before is not None and at - self._before.steps[-1][0] <= AFTER_S:
+            self._before.stops.append((at, code))
 
 
 def info_of(attempts: Sequence[Attempt], fps: int, robot_type: str) -> DatasetInfo:
@@ -150,13 +221,15 @@ def info_of(attempts: Sequence[Attempt], fps: int, robot_type: str) -> DatasetIn
     told = {name: None for each in attempts for _, _, action in each.steps for name in action}
     if not state or not told:
         raise ValidationError("the steps state no joints or no actions.")
+    units = {name: unit for each in attempts for name, unit in each.units.items()}
     features: dict[str, Feature] = {
-        STATE: Feature("float32", (len(state),), state),
-        ACTION: Feature("float32", (len(told),), tuple(told)),
+        STATE: _joints(state, units),
+        ACTION: _joints(tuple(told), units),
         f"{AGE}state": Feature("float32"),
         SUCCESS: Feature("bool"),
         STOP: Feature("int64"),
         INTERVENTION: Feature("bool"),
+        ACTOR: Feature("int64", about={"codes": list(ACTORS)}),
     }
     for camera in sorted({*first.pictures, *first.videos}):
         if any(camera not in each.videos and not each.pictures.get(camera) for each in attempts):
@@ -198,6 +271,7 @@ def save_attempt(dataset: Dataset, attempt: Attempt, task: str, *, success: bool
         SUCCESS: np.arange(count) == (count - 1 if success else -1),
         STOP: _stops(moments, attempt.stops),
         INTERVENTION: np.array([attempt.person or attempt.led[index] for index in newest]),
+        ACTOR: np.array([attempt.actors[index] for index in newest]),
     }
     videos: dict[str, Video] = {}
     for name in dataset.info.videos:
@@ -220,6 +294,8 @@ def moments_of(attempt: Attempt, fps: int) -> NDArray[np.float64]:
         ValidationError: they are too many.
     """
     first, last = attempt.steps[0][0], attempt.steps[-1][0]
+    refused = [at for at, code in attempt.stops if code == LOCKED_OUT and at - last <= AFTER_S]
+    last = max([last, *refused])
     if attempt.videos:
         moments = common_moments(attempt.videos, first, last, fps)
     else:
@@ -280,10 +356,21 @@ def _rows(names: Sequence[str], rows: Sequence[Mapping[str, float]]) -> NDArray[
 
 def _stops(moments: NDArray[np.float64], stops: Sequence[tuple[float, int]]) -> NDArray[np.int64]:
     column = np.zeros(len(moments), dtype=np.int64)
-    for at, code in stops:
-        index = min(int(np.searchsorted(moments, at)), len(moments) - 1)
-        column[index] = max(column[index], code)
+    for at, code in sorted(stops, key=lambda stop: _WEIGHT.index(stop[1])):
+        if code == LOCKED_OUT and at - moments[-1] > AFTER_S:
+            continue
+        column[min(int(np.searchsorted(moments, at)), len(moments) - 1)] = code
     return column
+
+
+def _actor(policy: object, otherwise: int = UNKNOWN) -> int:
+    """Return who acts, by the name of a policy; ``otherwise`` without one."""
+    return otherwise if policy in (None, "") else _ACTORS.get(str(policy), BY_POLICY)
+
+
+def _joints(names: tuple[str, ...], units: Mapping[str, str]) -> Feature:
+    stated = tuple(units.get(name, "") for name in names)
+    return Feature("float32", (len(names),), names, units=stated if any(stated) else ())
 
 
 def _numbers(value: object) -> dict[str, float]:

@@ -171,6 +171,7 @@ class RobotDriver(CollectedOnce):
         self._watchers: list[asyncio.Task[None]] = []
         self._unsubscribe: Unsubscribe | None = None
         self._end_control: Callable[[], None] = lambda: None
+        self._end_refusals: Callable[[], None] = lambda: None
 
     # Commands.
 
@@ -331,6 +332,18 @@ class RobotDriver(CollectedOnce):
             epoch: number of the lease
         """
 
+    @emit(labels={"safety": "informational"})
+    async def motionRefused(self, verb: str, reason: str) -> None:
+        """A motion was refused while the robot is locked; at most five a second are told.
+
+        Args:
+            verb: that was asked for
+            reason: who locked it
+        """
+
+    def _on_refused(self, verb: str, why: str) -> None:
+        self._emit_from_thread("motionRefused", {"verb": verb, "reason": why})
+
     def _on_control(self, change: ControlChange) -> None:
         facts: dict[str, Any] = {"robot": change.robot, "holder": change.holder, "epoch": change.epoch}
         if change.event == "taken":
@@ -339,6 +352,9 @@ class RobotDriver(CollectedOnce):
             event = "controlExpired"
         else:
             return
+        self._emit_from_thread(event, facts)
+
+    def _emit_from_thread(self, event: str, facts: dict[str, Any]) -> None:
         try:
             self.runtime.emit_from_thread(event, facts)
         except RuntimeError as exc:
@@ -480,6 +496,7 @@ class RobotDriver(CollectedOnce):
         sweep(settings.number("STRANDS_DC_STATE_HZ")).add(self.reports)
         if self.pipeline.leases is not None:
             self._end_control = self.pipeline.leases.observe(self._on_control)
+        self._end_refusals = self.robot.gate.watch_refusals(self._on_refused)
 
     def watches(self) -> list[Any]:
         """Return the coroutines that run while the device is connected."""
@@ -503,6 +520,7 @@ class RobotDriver(CollectedOnce):
         await asyncio.gather(*watchers, return_exceptions=True)
         self.reports.end()
         self._end_control()
+        self._end_refusals()
         unsubscribe, self._unsubscribe = self._unsubscribe, None
         if unsubscribe is not None:
             try:

@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 from strands_robots.adapted import lacks
@@ -26,7 +26,7 @@ from strands_robots.mesh.session import Context
 from strands_robots.mesh.transport import TransportError
 from strands_robots.mesh.wire import WireError
 from strands_robots.rate_limits import RateLimiter
-from strands_robots.safety.gate import MotionGate
+from strands_robots.safety.gate import MotionGate, gate_of
 from strands_robots.serving.peer_verbs import kind_of
 from strands_robots.threads import BoundedExecutor
 from strands_robots.utils import plain_scalar
@@ -451,6 +451,10 @@ ARRAY_MAX = 100
 WAITING = 8
 
 
+MOTION_REFUSED = "motion_refused"
+"""Safety event of a motion that was refused while the robot is locked."""
+
+
 class StepPublisher:
     """Publishes policy steps: of rollouts, and those that a program hands in.
 
@@ -469,11 +473,15 @@ class StepPublisher:
         self._rollouts = RateLimiter(hz)
         self._executor = BoundedExecutor(f"{context.peer_id}-stream", WAITING)
         self._unsubscribe: Unsubscribe | None = None
+        self._unwatch: Unsubscribe = lambda: None
         self._unpublished = 0
 
     def start(self) -> None:
-        """Subscribe to the robot's rollouts, where it has ``subscribe``."""
-        if self._robot is None or self._hz <= 0:
+        """Subscribe to the robot's rollouts, if it can, and to its refusals."""
+        if self._robot is None:
+            return
+        self._unwatch = gate_of(body_of(self._robot)).watch_refusals(self.on_refused)
+        if self._hz <= 0:
             return
         try:
             self._unsubscribe = self._robot.subscribe(self.on_event)
@@ -484,6 +492,7 @@ class StepPublisher:
 
     def stop(self, timeout: float) -> list[str]:
         """Unsubscribe; names of threads that still publish after ``timeout`` seconds."""
+        self._unwatch()
         unsubscribe, self._unsubscribe = self._unsubscribe, None
         if callable(unsubscribe):
             unsubscribe()
@@ -507,6 +516,15 @@ class StepPublisher:
                 self._put(stamp, event.step, observation, action, **about, **led)
 
             self._executor.submit(publish)
+
+    def on_refused(self, verb: str, why: str) -> None:
+        """Publish that a motion was refused while locked; return at once.
+
+        As of every safety event its reason is a code; the truth is in the local audit.
+        """
+        peer, stamp = self._context.peer_id, self._context.clock()
+        body = {"peer_id": peer, "t": stamp, "event": MOTION_REFUSED, "severity": "info", "reason": MOTION_REFUSED}
+        self._executor.submit(partial(self._send, topics.safety_event(peer), {**body, "verb": verb}))
 
     def publish(
         self, step: int, observation: Mapping[str, Any], action: Mapping[str, Any], instruction: str, policy: str
@@ -532,13 +550,16 @@ class StepPublisher:
             "observation": numbers(observation),
             "action": numbers(action),
         }
+        self._send(topics.stream(peer), body)
+
+    def _send(self, topic: str, body: Mapping[str, Any]) -> None:
         try:
-            self._context.put(topics.stream(peer), body)
+            self._context.put(topic, body)
         except (TransportError, WireError) as exc:
             self._unpublished += 1
             # A link that is down must not fill the log at the rate of a rollout.
             if self._unpublished & (self._unpublished - 1) == 0:
-                logger.warning("%s: %d steps were not published: %s", peer, self._unpublished, exc)
+                logger.warning("%s: %d messages were not published: %s", self._context.peer_id, self._unpublished, exc)
         else:
             self._unpublished = 0
 

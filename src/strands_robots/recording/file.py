@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, Self
 
 from strands_robots.adapted import behind_contract
-from strands_robots.contract import RolloutEvent, Unsubscribe, holds_robots, observe
+from strands_robots.contract import RolloutEvent, Unsubscribe, holds_robots, observe, robots_in
 from strands_robots.envelope import text_of
 from strands_robots.policies.base import numbers
 from strands_robots.policies.decoding import decode_json
@@ -49,9 +49,11 @@ PENDING_MAX = 50_000
 PENDING_PICTURE_BYTES = 64_000_000
 """Most bytes of pictures among them."""
 
-STEP = "streamStep"
-TURN = "turnChanged"
-"""Event that carries a robot's actions."""
+STEP, TURN = "streamStep", "turnChanged"
+"""Event that carries a robot's actions, and that of a change of who drives it."""
+
+REFUSED, UNITS = "motionRefused", "jointUnits"
+"""Events of a motion that was refused while the robot is locked, and of the units of its joints."""
 
 STEADY = frozenset({STEP, "observationUpdate", "stateUpdate", "state"})
 """Events at a steady rate, which write no log line."""
@@ -438,7 +440,11 @@ def _item(schema: str, channel: Any, message: Any) -> RecordedItem | None:
 def _level(item: RecordedEvent) -> int:
     if item.payload.get("state") == "error" or item.payload.get("error"):
         return schemas.ERROR
-    return schemas.WARNING if item.event.lower().startswith(("emergency", "halted", "locked")) else schemas.INFO
+    return (
+        schemas.WARNING
+        if item.event.lower().startswith(("emergency", "halted", "locked", "motionrefused"))
+        else schemas.INFO
+    )
 
 
 def _ns(seconds: float) -> int:
@@ -447,6 +453,20 @@ def _ns(seconds: float) -> int:
 
 def _mcap() -> Any:
     return optional_module("mcap.writer", what="Recording", extra="record")
+
+
+def units_in(features: Mapping[str, Any], part: str = "") -> dict[str, str]:
+    """Return the units of the joints in the answer of ``getFeatures``.
+
+    Of a world they are those of the robot ``part``, which may be left out where there is one.
+    """
+    robots = features.get("robots")
+    stated = features if not isinstance(robots, Mapping) else robots.get(part)
+    if part == "" and isinstance(robots, Mapping) and len(robots) == 1:
+        stated = next(iter(robots.values()))
+    units = stated.get("joint_units") if isinstance(stated, Mapping) else None
+    found = units.items() if isinstance(units, Mapping) else ()
+    return {str(name): unit for name, unit in found if isinstance(unit, str) and unit}
 
 
 def beats(hz: float, over: threading.Event, missed: Callable[[int], None] = lambda count: None) -> Iterator[None]:
@@ -514,9 +534,12 @@ class RobotRecording:
             for source in sources
         ]
         self._unsubscribe: Unsubscribe = lambda: None
+        self._unwatch: Unsubscribe = lambda: None
 
     def __enter__(self) -> Self:
+        self._attempt("units", self._take_units)
         self._unsubscribe = observe(self._robot, self._record)
+        self._unwatch = self._robot.gate.watch_refusals(self._refused)
         for thread in self._threads:
             thread.start()
         return self
@@ -527,12 +550,22 @@ class RobotRecording:
             thread.join()
         # The gate's own thread has ended; two checks at a time would record the same halt twice.
         self._attempt("gate", self._check_gate)
+        self._unwatch()
         self._unsubscribe()
         if self.skipped:
             self._take("samplesSkipped", dict(self.skipped))
 
     def _take(self, event: str, payload: Mapping[str, Any]) -> None:
         self._recorder.take(self._device, event, payload)
+
+    def _take_units(self) -> None:
+        features = self._robot.get_features()
+        for name in robots_in(self._robot) or [""]:
+            if units := units_in(features, name):
+                self._take(UNITS, {"units": units, **({"robot_name": name} if name else {})})
+
+    def _refused(self, verb: str, why: str) -> None:
+        self._take(REFUSED, {"verb": verb, "reason": why})
 
     def _paced(self, source: str, hz: float, sample: Callable[[], None]) -> None:
         for _ in beats(hz, self._stopping, lambda count: self.skipped.update({source: count})):

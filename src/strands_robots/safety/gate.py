@@ -24,10 +24,16 @@ from typing import Any, Literal, NamedTuple, ParamSpec, Protocol, TypeVar
 from strands_robots.envelope import Envelope, error
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.safety.process import AWAKE, AwakeClock
+from strands_robots.stop_log import stop_logger
 from strands_robots.utils import IdentityMap, MissingExtraError, ValidationError
 
 P = ParamSpec("P")
 T = TypeVar("T")
+
+logger = stop_logger(__name__)
+
+REFUSED_EVERY_S = 0.2
+"""Least time between two refusals of a locked robot that are told: a caller may ask without end."""
 
 WAIT_S = 0.005
 """Seconds between two looks of a writer that waits; a halt ends its wait within these."""
@@ -228,6 +234,10 @@ class OrderedStop(NamedTuple):
     verdict: Future[Any]
 
 
+RefusalObserver = Callable[[str, str], object]
+"""Is told the verb and the reason of a motion that was refused while its robot is locked; it returns at once."""
+
+
 class MotionGate:
     """Gate of one robot; thread-safe.
 
@@ -250,6 +260,8 @@ class MotionGate:
         self.given = 0
         self.under_way = VerbsUnderWay()
         self.newest_stop: OrderedStop | None = None
+        self._refusal_observers: tuple[RefusalObserver, ...] = ()
+        self._refusal_told = float("-inf")
 
     @property
     def held(self) -> bool:
@@ -300,6 +312,32 @@ class MotionGate:
                 self._watchers = tuple(each for each in self._watchers if each is not begins)
 
         return unwatch
+
+    def watch_refusals(self, observer: RefusalObserver) -> Callable[[], None]:
+        """Tell ``observer`` of motions that are refused while locked.
+
+        At most one in :data:`REFUSED_EVERY_S` seconds is told. Return a callable that ends that.
+        """
+        with self._attaching:
+            self._refusal_observers = (*self._refusal_observers, observer)
+
+        def unwatch() -> None:
+            with self._attaching:
+                self._refusal_observers = tuple(each for each in self._refusal_observers if each is not observer)
+
+        return unwatch
+
+    def note_refused(self, verb: str, refusal: Envelope) -> None:
+        """Tell the observers that a motion was refused, where it was for a lockout."""
+        now = time.monotonic()
+        if refusal.get("locked") is not True or now - self._refusal_told < REFUSED_EVERY_S:
+            return
+        self._refusal_told = now
+        for observer in self._refusal_observers:
+            try:
+                observer(verb, str(refusal.get("reason", "")))
+            except Exception:
+                logger.exception("An observer of refused motions failed.")
 
     def request(self) -> MotionRequest:
         """Return a request for motion that is made now, for :meth:`permit` later.
@@ -392,6 +430,7 @@ class MotionGate:
         for _ in range(2):
             refusal = self.refusal(verb, dated)
             if refusal is not None:
+                self.note_refused(verb, refusal)
                 raise MotionRefused(refusal)
             # Counted between two looks at the latches: a settling that begins beside this either is a latch that
             # refuses it, or sees that it was given.

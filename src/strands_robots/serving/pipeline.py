@@ -338,6 +338,7 @@ class Pipeline:
         gate = self.robot.gate
         locked = gate.lockout(verb.name)
         if locked is not None:
+            gate.note_refused(verb.name, locked)
             text = str(locked.get("reason", "locked"))
             if verb.instead:
                 text = f"{text} {verb.instead} works while it is locked, with the operator's approval."

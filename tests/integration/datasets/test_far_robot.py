@@ -17,9 +17,13 @@ from fixtures.waiting import eventually, free_port
 from typer.testing import CliRunner
 
 from strands_robots.cli.app import build
+from strands_robots.cli.dataset import served_robot
+from strands_robots.cli.network import Network
+from strands_robots.cli.output import Screen
 from strands_robots.datasets import tables
 from strands_robots.datasets.check import check_dataset
 from strands_robots.datasets.layout import data_file
+from strands_robots.recording.file import Recorder, read_events
 
 
 @contextmanager
@@ -143,6 +147,25 @@ def test_what_others_have_it_do_is_one_episode_and_a_stop_is_in_it(tmp_path: Pat
     frames = tables.read_frames(folder / data_file(0))
     assert frames["stop"][-1] == 2
     assert not frames["next.success"].any()
+
+
+@pytest.mark.parametrize("mesh", [False, True], ids=["device_connect", "mesh"])
+def test_motion_that_a_locked_robot_refuses_is_told_to_the_recorder(tmp_path: Path, mesh: bool) -> None:
+    port = free_port()
+    at = ("--port", str(port), *(["--mesh"] if mesh else []))
+    file = tmp_path / "a.mcap"
+    with (
+        arm(*at),
+        served_robot(Screen(), Network(port=port, mesh=mesh), "arm-1", "", "", ["none"], None) as far,
+        Recorder(file, joints_of_events=False) as recorder,
+        far.recorded(recorder, 30, None),
+    ):
+        on("estop", *at, code=None)
+        on("call", "arm-1", "execute", "instruction=wave", "policy_provider=mock", "duration=3", *at, code=None)
+        eventually(lambda: recorder.counts["/arm-1/motionRefused"] > 0, within=10)
+    told = {each.event: each.payload for each in read_events(file)}
+    assert told["motionRefused"]["verb"] == "execute"
+    assert told["jointUnits"]["units"]["shoulder_pan"] == "radians"
 
 
 @pytest.mark.parametrize(

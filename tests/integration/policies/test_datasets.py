@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from fixtures.episodes import CAMERA, FPS, HEIGHT, INFO, JOINTS, WIDTH, episode
 
-from strands_robots.datasets import Dataset, DatasetEpisode
+from strands_robots.datasets import Dataset, DatasetEpisode, Feature
+from strands_robots.datasets.recorded import ACTOR, ACTORS
 from strands_robots.datasets.video import Video, VideoWriter, about_video, copy_pictures
 
 if importlib.util.find_spec("torch") is None or importlib.util.find_spec("lerobot") is None:
@@ -28,10 +29,12 @@ def without_videos(tmp_path: Path) -> Path:
     """A dataset of joints alone, which every LeRobot reads without a decoder."""
     folder = tmp_path / "joints"
     features = {name: each for name, each in INFO.features.items() if name != CAMERA}
+    features["action"] = replace(features["action"], units=("degrees", "degrees", ""))
+    features[ACTOR] = Feature("int64", about={"codes": list(ACTORS)})
     with Dataset(folder, replace(INFO, features=features)) as dataset:
         for number in range(EPISODES):
             made = episode(dataset, FRAMES, f"task {number % 2}")
-            dataset.save(DatasetEpisode(made.task, made.columns))
+            dataset.save(DatasetEpisode(made.task, {**made.columns, ACTOR: np.full(FRAMES, number)}))
     return folder
 
 
@@ -66,6 +69,7 @@ def test_lerobot_reads_each_frame_with_its_task_and_names(without_videos: Path) 
     assert (dataset.num_episodes, dataset.num_frames, dataset.fps) == (EPISODES, EPISODES * FRAMES, FPS)
     frame = dataset[FRAMES + 3]
     assert frame["observation.state"].tolist() == [3.0, 4.0, 5.0]
+    assert int(frame["actor"]) == 1
     assert (frame["task"], int(frame["episode_index"]), int(frame["frame_index"])) == ("task 1", 1, 3)
     assert bool(dataset[FRAMES - 1]["next.success"]) is True
     assert dataset.meta.features["action"]["names"] == list(JOINTS)
