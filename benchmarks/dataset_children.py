@@ -34,7 +34,7 @@ from strands_robots.cli.output import Screen
 from strands_robots.contract import RolloutEvent
 from strands_robots.datasets import tables
 from strands_robots.datasets.layout import data_file, read_info, video_file
-from strands_robots.datasets.recorded import IMAGES, SAME
+from strands_robots.datasets.recorded import IMAGES, LED_BY_PERSON, SAME
 from strands_robots.datasets.session import RecordingSession
 from strands_robots.datasets.video import pictures_of
 from strands_robots.recording.cameras import Frames
@@ -107,7 +107,7 @@ class RecordedArm:
 
     def attempts(self, frames: Frames | None, begin: Callable[[], Any]) -> LocalAttempts:
         """Return it as the product's loop for attempts takes it."""
-        return LocalAttempts(self.led, frames, Driver(begin, ExitStack(), person=True))
+        return LocalAttempts(self.led, frames, Driver(begin, ExitStack(), LED_BY_PERSON))
 
     def periods(self) -> list[float]:
         """Return the times between its beats, in ms."""

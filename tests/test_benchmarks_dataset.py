@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from benchmarks.dataset import beat_row, kills_row, stops_row, writer_rows
+from benchmarks.dataset_children import RecordedArm
 from benchmarks.dataset_train import paired_interval, train_row
+from benchmarks.dataset_writers import device
 from fixtures.killed_recorders import Kill, missing_s
 from fixtures.replayed_cameras import ReplayedCamera, stamp, stamped
+
+from strands_robots.datasets.layout import read_info
+from strands_robots.hardware import HardwareRobot
 
 EACH = [Kill("recorder", 0.2, ""), Kill("encoder", None, ""), Kill("robot", 0.9, "")]
 
@@ -47,6 +54,18 @@ def test_stops_count_where_something_was_recorded_meanwhile() -> None:
     assert stops_row([3.0] * 100, [2.0] * 100, {"frames": 50}).ok
     assert not stops_row([3.0] * 98 + [20.5] * 2, [2.0] * 100, {"frames": 50}).ok
     assert not stops_row([3.0] * 100, [2.0] * 100, {"frames": 0}).ok
+
+
+def test_arm_of_the_benchmark_is_led_and_recorded(tmp_path: Path) -> None:
+    robot = HardwareRobot(device(), "arm")
+    robot.connect()
+    try:
+        arm = RecordedArm(robot, tmp_path / "set")
+        arm.record_for(0.3, None)
+    finally:
+        robot.cleanup()
+    assert len(arm.periods()) > 5
+    assert read_info(arm.folder).episodes == 1
 
 
 def test_cut_of_an_attempt_is_what_its_episode_lacks_of_the_actions() -> None:
