@@ -24,6 +24,9 @@ if TYPE_CHECKING:
     from strands_robots.datasets.encoder import CameraEncoder
     from strands_robots.datasets.session import RecordingSession
 
+FIRST_PICTURE_S = 10.0
+"""Longest wait for the cameras before an attempt: the first picture of a simulation may take seconds."""
+
 
 class Said(Enum):
     """Word of a person on an attempt, by the key before Enter."""
@@ -232,6 +235,10 @@ def _attempt(
         progress = AttemptProgress(recorder, attempts.fps, encoder)
         pictures = None if encoder is None else progress.take_picture
         recorded.enter_context(led.recorded(recorder, attempts.fps, pictures))
+        if encoder is not None and not encoder.wait_for_pictures(FIRST_PICTURE_S):
+            raise CliError(
+                f"No camera delivered a picture within {FIRST_PICTURE_S:g} s; --cameras none records without."
+            )
         task, began = attempts.begin(), time.monotonic()
         if attempts.keys is not None:
             screen.say(KEYBOARD if attempts.keys.leading else KEYS)
@@ -285,8 +292,7 @@ def _save(screen: Screen, session: RecordingSession, *, success: bool) -> str:
     try:
         kept = session.keep(success=success)
     except NoPictureError as problem:
-        lacking = f"{problem}."
-        lacking = lacking[0].upper() + lacking[1:]
+        kept, lacking = None, f"No episode: {problem}."
     else:
         lacking = "The robot made no step: there is nothing to save."
     if kept is None:

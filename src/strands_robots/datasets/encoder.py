@@ -62,6 +62,7 @@ class CameraEncoder:
 
         self._failed, self._running = "", False
         self._begun = self._ended = False
+        self._delivered = threading.Event()
         self._cameras: dict[str, _Camera] = {}
         self._lock = threading.Lock()
         self._process: subprocess.Popen[bytes] | None = None
@@ -132,12 +133,22 @@ class CameraEncoder:
             known = self._cameras.get(camera) or self._made(camera, sides)
             if sides != known.sides:
                 raise ValidationError(f"pictures of {camera} must be {known.sides} as its first one, not {sides}.")
+            known.offered += 1
+            if known.offered > 1:
+                self._delivered.set()
             slot = -1 if self._failed else known.put(pixels)
             if slot < 0:
                 self.dropped[camera] += 1
                 return False
             self._send({"picture": camera, "slot": slot, "length": pixels.size, "at": moment})
             return not self._failed
+
+    def wait_for_pictures(self, longest_s: float) -> bool:
+        """Wait until the cameras of the running attempt deliver; False where none does.
+
+        Cameras that are read in turn have all delivered once one of them has twice.
+        """
+        return self._delivered.wait(longest_s)
 
     def close(self) -> None:
         """End the process. Twice is once."""
@@ -156,6 +167,7 @@ class CameraEncoder:
         with self._lock:
             self._forget()
             self.dropped.clear()
+            self._delivered.clear()
             self._failed, self._begun, self._ended, self._running = "", False, False, True
             self._send({"begin": str(folder.absolute()), "fps": self._fps})
         if not self._wait(lambda: self._begun, BEGIN_S):
@@ -257,6 +269,7 @@ class _Camera:
     """Memory of one camera's pictures, which the other process reads."""
 
     def __init__(self, sides: tuple[int, int] | None) -> None:
+        self.offered = 0
         self.sides, self.size = sides, JPEG_BYTES if sides is None else sides[0] * sides[1] * 3
         self.descriptor = _shared(memory_bytes(self.size))
         self._memory = mmap.mmap(self.descriptor, memory_bytes(self.size))

@@ -1,0 +1,71 @@
+"""Attempts whose cameras fail: named, and never an episode without them."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from strands_robots.cli import dataset_recording
+from strands_robots.cli.dataset_recording import Attempts, record_attempts
+from strands_robots.cli.output import CliError, Screen
+from strands_robots.datasets.session import RecordingSession
+from strands_robots.recording.file import Pictures, Recorder
+
+
+class FilmedRobot:
+    """A robot of one step, which its camera shows in pictures of some width; none for 0."""
+
+    name, stopped, stopped_by, has_cameras = "arm-1", False, "", True
+
+    def __init__(self, width: int) -> None:
+        self._width = width
+        self.begun = False
+
+    @contextmanager
+    def recorded(self, recorder: Recorder, fps: int, pictures: Pictures | None) -> Iterator[None]:
+        recorder.take(self.name, "streamStep", {"observation": {"pan": 0}, "action": {"pan": 0}})
+        for _ in range(2 if self._width else 0):
+            assert pictures is not None
+            pictures("top", np.zeros((48, self._width, 3), dtype=np.uint8), None)
+        yield
+
+    def begin(self) -> Any:
+        self.begun = True
+        return SimpleNamespace(voided=False, running=True, error="")
+
+    def halt(self, reason: str) -> Any:
+        return SimpleNamespace(stopped=True)
+
+
+def recorded(robot: Any, folder: Path) -> str:
+    """Record an attempt of it, and return why that failed."""
+    screen = Screen(console=Console(file=io.StringIO()))
+    with (
+        RecordingSession(folder, 30, "wave", "so100", lambda said: None) as session,
+        pytest.raises(CliError) as failed,
+    ):
+        record_attempts(screen, robot, session, Attempts(1, robot.begin, 30, 20.0, 0.0, success=True))
+    assert not (folder / "meta").exists()
+    return str(failed.value)
+
+
+def test_camera_whose_pictures_cannot_be_encoded_ends_the_attempt_by_name(tmp_path: Path) -> None:
+    why = recorded(FilmedRobot(63), tmp_path)
+    assert "The attempt failed: camera top: width must be even, not 63" in why
+    assert "No episode: the attempt has no picture of top" in why
+    assert (tmp_path / ".running" / "aside-000000.mcap").exists()
+
+
+def test_nothing_is_led_where_no_camera_delivers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dataset_recording, "FIRST_PICTURE_S", 0.05)
+    robot = FilmedRobot(0)
+    assert "No camera delivered a picture within 0.05 s" in recorded(robot, tmp_path)
+    assert not robot.begun
