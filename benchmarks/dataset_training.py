@@ -66,7 +66,7 @@ def record_ours(folder: Path, seeds: range) -> None:
     screen = Screen(console=Console(file=StringIO()))
     with ExitStack() as stack:
         arm = stack.enter_context(Child("benchmarks.dataset_expert", {"link": asdict(loopback_config(port))}))
-        far = stack.enter_context(served_robot(screen, Network(port=port), PEER, "", TASK, ["none"]))
+        far = stack.enter_context(served_robot(screen, Network(port=port), PEER, "", TASK, ["none"], None))
         session = stack.enter_context(RecordingSession(folder, FPS, TASK, "so100", lambda said: None))
         for seed in seeds:
 
