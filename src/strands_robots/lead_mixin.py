@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -33,6 +33,10 @@ LEAD_S = 3600.0
 
 PICTURE_MAX_MS = 300.0
 """Age of the operator's newest picture beyond which the robot holds."""
+
+
+SESSIONS_MAX = 64
+"""Last sessions of leaders that are kept; those of leaders elsewhere make room."""
 
 
 class LeadMixin:
@@ -98,7 +102,8 @@ class LeadMixin:
             return error(f"lead: {problem}.")
         # The leader begins from where the robot is.
         lead.seen.wait(START_S)
-        self._leads = {**{each.id: each for each in self._leads.values() if each.state != "over"}, lead.id: lead}
+        self._leads[lead.id] = lead
+        self._forget(ended=[each for each in list(self._leads.values()) if each.state == "over"])
         return success(
             f"{name} leads {body.name}.",
             lead_id=lead.id,
@@ -151,11 +156,21 @@ class LeadMixin:
             age = None if picture_age_ms is None else picture_age_ms / 1000
             lead.take(LeaderCommand(seq, turn, leads, targets or {}, made, told, told_ago, age), received)
         session = self.tasks.by_leader.get(lead.leader)
-        if session is not None and not end and (session.voided or not session.running):
-            why = lead.why or session.error or "it was stopped"
-            facts = {**lead.facts(), "state": "over", "halted": session.voided}
+        if not end and (session is None or session.voided or not session.running):
+            why = lead.why or (session.error if session is not None else "") or "it was stopped"
+            facts = {**lead.facts(), "state": "over", "halted": session is not None and session.voided}
             return error(f"The lead of {lead.leader} is over: {why}.", **facts)
         return success(f"{lead.leader}: {lead.state}.", **lead.facts())
+
+    def _forget(self, *, ended: Sequence[Lead]) -> None:
+        """Forget leads that are over, and their sessions where there are many."""
+        for lead in ended:
+            self._leads.pop(lead.id, None)
+            session = self.tasks.by_leader.get(lead.leader)
+            if session is not None and not session.running and len(self._teleop_policies) > SESSIONS_MAX:
+                # A reader of the sessions has them before it looks for their policies.
+                self.tasks.by_leader.pop(lead.leader, None)
+                self._teleop_policies.pop(lead.leader, None)
 
     @cached_property
     def _leads(self) -> dict[str, Lead]:

@@ -168,7 +168,9 @@ class TeleopMixin(LeadMixin):
     def _teleop_rows(self, sessions: Mapping[str, Rollout]) -> dict[str, dict[str, Any]]:
         rows = {}
         for name, rollout in sessions.items():
-            policy = self._teleop_policies[name]
+            policy = self._teleop_policies.get(name)
+            if policy is None:
+                continue
             rows[name] = {
                 **rollout.row(),
                 "state": rollout.state,

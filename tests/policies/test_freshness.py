@@ -6,7 +6,7 @@ import random
 
 import pytest
 
-from strands_robots.policies.freshness import SPARE_S, CommandAges
+from strands_robots.policies.freshness import MEASURED_S, SPARE_S, CommandAges
 
 SET_APART = 1234.5
 """What the leader's clock is behind the robot's."""
@@ -41,7 +41,30 @@ def test_age_is_the_way_of_the_link_and_what_came_on_top() -> None:
 def test_steady_link_with_jitter_has_no_stale_command_in_ten_minutes() -> None:
     link, draw = Link(0.07), random.Random(3).uniform
     late = [link.send(number / 50, draw(0.0, 0.01)) > link.ages.limit_s for number in range(30_000)]
-    assert not any(late)
+    measured = int(MEASURED_S * 50) + 2
+    assert not any(late[measured:])
+    assert any(late[:measured]), "a round trip this long proves nothing before"
+
+
+def test_first_commands_of_a_link_that_queued_them_are_stale() -> None:
+    link = Link(0.0)
+    queued = [link.send(number / 50, 0.5 - number / 50) > link.ages.limit_s for number in range(26)]
+    young = int(SPARE_S * 50) + 1
+    assert all(queued[:-young])
+    assert not any(queued[-young + 1 :])
+
+
+def test_what_queued_while_the_robots_computer_slept_is_stale_and_the_link_is_measured_anew() -> None:
+    link = Link(0.025)
+    for number in range(200):
+        link.send(number / 50)
+    slept_s = 5.0
+    queued = [link.send(4.0 + number / 50, -slept_s) > link.ages.limit_s for number in range(10)]
+    assert all(queued), "its clock stood still, so they seem to come before they were made"
+    link.way_s, link.back_s = link.way_s - slept_s, link.back_s + slept_s
+    link.answers = [(-0.9, 4.125)]
+    later = [link.send(4.2 + number / 50) > link.ages.limit_s for number in range(20)]
+    assert not any(later)
 
 
 @pytest.mark.parametrize("outage_s", [0.5, 3.0, 60.0])

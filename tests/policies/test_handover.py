@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 import pytest
@@ -169,3 +170,66 @@ def test_stationary_policy_without_a_leader_waits_for_its_first_command() -> Non
     assert seat.beat() == {"pan": 0.1}
     seat.beat(2.5)
     assert seat.lead.state == "held"
+
+
+def test_turn_that_was_begun_in_the_silence_is_no_answer_to_the_hold() -> None:
+    seat = Seat()
+    seat.led(1, pan=0.1)
+    seat.at += 5.0
+    seat.send(2, pan=0.9)
+    assert seat.beat() == seat.joints
+    assert seat.lead.state == "held", "it was gripped before anybody could know of the hold"
+    assert "has come for 50" in seat.lead.why
+    seat.led(3, pan=0.9)
+    assert seat.lead.state == "led"
+
+
+def test_policy_is_not_given_the_robot_by_somebody_who_was_cut_off() -> None:
+    seat = Seat(ScriptedPolicy([], always={"pan": 0.5}))
+    seat.send(0, leads=False)
+    seat.beat()
+    seat.led(1, pan=0.5)
+    seat.at += 1.0
+    seat.send(2, leads=False)
+    seat.beat()
+    assert seat.lead.state == "held"
+
+
+def test_answer_of_a_policy_that_took_longer_than_its_leader_waited_moves_nothing() -> None:
+    def late() -> dict[str, float]:
+        seat.send(1, pan=0.05)
+        return {"pan": 0.9}
+
+    seat = Seat(ScriptedPolicy([late, None]))
+    assert seat.beat() == []
+    assert seat.beat() == {"pan": 0.05, "lift": 0.0}
+
+    def silent() -> None:
+        seat.at += 5.0
+
+    seat = Seat(ScriptedPolicy([{"pan": 0.1}, silent]))
+    seat.send(0, leads=False)
+    seat.beat()
+    assert seat.beat() == [], "the end of a policy whose leader is gone is no completed task"
+    assert seat.lead.state == "held"
+
+
+def test_joint_that_the_robot_does_not_tell_is_bounded_from_where_it_was_sent() -> None:
+    seat = Seat()
+    seat.led(1, pan=0.0)
+    seat.policy.wrote({"pan": 0.0, "lift": 0.0})
+    del seat.joints["pan"]
+    seat.policy.lead.hold("test")
+    assert seat.beat() == {"lift": 0.0}
+    assert seat.led(2, pan=0.9)["pan"] == pytest.approx(STEP)
+
+
+def test_lead_that_is_over_keeps_no_policy() -> None:
+    inner = ScriptedPolicy([], always={"pan": 0.1})
+    seat = Seat(inner)
+    before = sys.getrefcount(inner)
+    seat.policy.close()
+    assert inner.closed == 1
+    assert sys.getrefcount(inner) < before
+    seat.policy.close()
+    assert inner.closed == 1

@@ -163,8 +163,20 @@ class Lead:
                 self.counts.stale += 1
                 return
             self.counts.fresh += 1
+            silent = self._silent(received)
             self._fresh_at = received
+            if silent > self._ages.limit_s and (self._turn or self._of_policy):
+                # A turn that was begun in the silence was begun by somebody who had not seen the hold.
+                self._turn = max(self._turn, command.turn)
+                self._hold(self._silence(silent))
             self._judge(command, age)
+
+    def _silent(self, now: float) -> float:
+        """Return the seconds since the newest fresh command, 0 before the first."""
+        return 0.0 if self._fresh_at is None else now - self._fresh_at
+
+    def _silence(self, silent_s: float) -> str:
+        return f"no fresh command of {self.leader} has come for {1000 * silent_s:.0f} ms"
 
     def _judge(self, command: LeaderCommand, age: float) -> None:
         if self._state == "over":
@@ -202,6 +214,13 @@ class Lead:
         with self._lock:
             self._hold(why)
 
+    def is_still(self, state: State) -> bool:
+        """Return True where nothing has changed since a control step began in that state."""
+        with self._lock:
+            if self._state != "over":
+                self._watch(self._now())
+            return self._state == state
+
     def end(self, why: str) -> None:
         """End the lead; nothing is taken any more."""
         with self._lock:
@@ -223,7 +242,7 @@ class Lead:
         if silent > LOST_S:
             self._state, self.why = "over", f"{self.leader} has been silent for {LOST_S:g} s"
         elif silent > (FIRST_S if self._fresh_at is None else self._ages.limit_s):
-            self._hold(f"no fresh command of {self.leader} has come for {1000 * silent:.0f} ms")
+            self._hold(self._silence(silent))
 
     def saw(self, joints: Mapping[str, float]) -> None:
         """Note what a control step has read."""
@@ -282,8 +301,10 @@ class LedPolicy:
         self._max_speed, self._period = max_speed, period
         self._instruction, self._ranges = "", dict[str, tuple[float, float]]()
         self._speeds: dict[str, float] = {}
+        self._last_counts: dict[str, float] = {}
         self._chunk: list[Action] = []
         self._last: Action = {}
+        self._wrote: Action = {}
         self._from: dict[str, float] = {}
         self._place: Action = {}
 
@@ -310,7 +331,8 @@ class LedPolicy:
     def counts(self) -> dict[str, float]:
         """Return the figures of the lead, and of the policy."""
         own = {f"leader_{name}": float(value) for name, value in vars(self.lead.counts).items()}
-        return {**own, **(self._policy.counts() if isinstance(self._policy, Counted) else {})}
+        policy: object = self._policy
+        return {**own, **(policy.counts() if isinstance(policy, Counted) else self._last_counts)}
 
     def reset(self, instruction: str, ranges: Ranges) -> None:
         self._instruction, self._ranges = instruction, dict(ranges)
@@ -349,16 +371,22 @@ class LedPolicy:
 
     def wrote(self, action: Mapping[str, float]) -> None:
         """Tell the leader what was written; see :class:`Noting`."""
+        self._wrote = {**self._wrote, **action}
         self.lead.wrote(action)
 
     def interrupt(self) -> None:
-        if self._policy is not None:
-            self._policy.interrupt()
+        policy = self._policy
+        if policy is not None:
+            policy.interrupt()
 
     def close(self) -> None:
         self.lead.end("")
-        if self._policy is not None:
-            self._policy.close()
+        policy = self._policy
+        if policy is not None:
+            self._last_counts = dict(policy.counts()) if isinstance(policy, Counted) else {}
+            # The leader's last session is kept, and its policy may be large.
+            self._policy = self._paced = self._restartable = None
+            policy.close()
 
     def _held(self, observation: Mapping[str, Any]) -> Action:
         """Return the action that keeps the robot where it is."""
@@ -385,6 +413,9 @@ class LedPolicy:
                 self._policy.reset(self._instruction, self._ranges)
         if not self._chunk:
             answer = self._policy.act(observation)
+            if not self.lead.is_still("policy"):
+                # It took its time, and its answer comes too late.
+                return []
             if answer is None:
                 return None
             self._chunk = [dict(answer)] if isinstance(answer, Mapping) else [dict(each) for each in answer]
@@ -395,7 +426,8 @@ class LedPolicy:
         if beat.begins:
             # Joints that it does not lead keep the place that they have now.
             self._place = self._held(observation)
-            self._last, self._from = dict(self._place), {}
+            # Those that the robot does not tell are bounded from where they were sent.
+            self._last, self._from = {**self._wrote, **self._place}, {}
         if self._guide == "differences":
             wanted = self._moved(wanted)
         target = checked_action(wanted, self._ranges)
@@ -410,7 +442,7 @@ class LedPolicy:
             if is_velocity(key):
                 moved[key] = value
                 continue
-            if key not in self._last:
+            if key not in self._place:
                 raise ValidationError(f"{shown(key)} cannot be led by differences: the robot does not tell it.")
             low, high = self._ranges[key]
             apart = self._from.setdefault(key, value - self._last[key])

@@ -1,0 +1,45 @@
+"""A robot that is led from elsewhere: what it keeps of the leads that are over."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from fixtures.devices import RecordingDevice
+from fixtures.waiting import eventually
+
+from strands_robots import lead_mixin
+from strands_robots.envelope import is_error, text_of
+from strands_robots.hardware import HardwareRobot
+
+
+@pytest.fixture
+def arm() -> Iterator[Any]:
+    robot: Any = HardwareRobot(RecordingDevice(), "arm-1")
+    robot.connect()
+    yield robot
+    robot.cleanup()
+
+
+def led_once(arm: Any, name: str) -> str:
+    """Lead it, and end that; return the id of the lead."""
+    opened = arm.lead(name)
+    assert not is_error(opened), opened
+    arm.lead_to(opened["lead_id"], 1, end=True)
+    eventually(lambda: name not in arm.tasks.leading(), every=0.002)
+    return str(opened["lead_id"])
+
+
+def test_leads_that_are_over_do_not_add_up(arm: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lead_mixin, "SESSIONS_MAX", 3)
+    ids = [led_once(arm, f"hand-{number}") for number in range(12)]
+    assert len(arm.tasks.by_leader) <= 4
+    assert len(arm.teleop_status()["leaders"]) <= 4
+    assert "is none" in text_of(arm.lead_to(ids[0], 2))
+
+
+def test_command_of_a_lead_that_is_over_is_refused(arm: Any) -> None:
+    answer = arm.lead_to(led_once(arm, "hand"), 2, targets={"pan.pos": 90.0})
+    assert is_error(answer)
+    assert answer["state"] == "over"
