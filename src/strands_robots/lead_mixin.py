@@ -158,7 +158,9 @@ class LeadMixin:
         session = self.tasks.by_leader.get(lead.leader)
         if not end and (session is None or session.voided or not session.running):
             why = lead.why or (session.error if session is not None else "") or "it was stopped"
-            facts = {**lead.facts(), "state": "over", "halted": session is not None and session.voided}
+            # A lead that has completed was not stopped, though its permit is void.
+            halted = session is not None and (session.state == "stopped" or (session.running and session.voided))
+            facts = {**lead.facts(), "state": "over", "halted": halted}
             return error(f"The lead of {lead.leader} is over: {why}.", **facts)
         return success(f"{lead.leader}: {lead.state}.", **lead.facts())
 

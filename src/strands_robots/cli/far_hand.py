@@ -18,12 +18,16 @@ from strands_robots.leader_thread import LeaderSilentError, LeaderThread
 from strands_robots.policies.base import Ranges, numbers
 from strands_robots.recording.file import beats
 from strands_robots.teleoperators import GIVE_UP_S, LeaderFinished, RecordedLeader
+from strands_robots.utils import DURATION_MAX_S
 
 if TYPE_CHECKING:
     from strands_robots.cli.dataset_recording import Keys
 
 LEAD_HZ = 50
 """Commands a second."""
+
+SPARE_S = 60.0
+"""Seconds that a lead may last beyond the time of its attempt."""
 
 MOVED_ARM, MOVED_MANUAL = 0.04, 0.01
 """Part of a joint's range by which a leader arm, or a key or stick, takes over from a policy."""
@@ -213,20 +217,23 @@ class HandLeader:
             stack.callback(self.end)
             yield
 
-    def begin(self, robot: Leadable, policy: str, task: str, how: dict[str, Any], ended: Ended) -> None:
+    def begin(self, robot: Leadable, policy: str, task: str, seconds: float | None, ended: Ended, **how: Any) -> None:
         """Lead the robot, or let its policy have the first turn.
 
         Args:
             robot: elsewhere, or of this process.
             policy: its name; empty for none.
             task: told to the policy.
-            how: further options of the lead.
+            seconds: its longest time; None for as long as one may take.
             ended: as of :class:`Hand`.
+            how: further options of the lead.
 
         Raises:
             RefusalError: the robot refused it.
             ValidationError: the leader leads joints that it does not have.
         """
+        # The end of the attempt comes from here, not from the robot at the same moment.
+        how = {**how, "duration": min((seconds or DURATION_MAX_S) + SPARE_S, DURATION_MAX_S)}
         if policy:
             how = {"policy_provider": policy, "instruction": task, "guide": "differences", **how}
         lead = self._attempt.enter_context(robot.lead(self.leader_id, **how))

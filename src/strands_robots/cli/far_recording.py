@@ -186,11 +186,10 @@ class FarRobot:
 
     def _start(self, task: FarTask, seconds: float | None) -> None:
         """Start the policy, the leader or both."""
-        duration = min(seconds or DURATION_MAX_S, DURATION_MAX_S)
         if self._hand is not None:
-            how = {"duration": duration}
-            self._hand.begin(self.remote, self._policy, self._task, how, partial(self._hand_ended, task))
+            self._hand.begin(self.remote, self._policy, self._task, seconds, partial(self._hand_ended, task))
             return
+        duration = min(seconds or DURATION_MAX_S, DURATION_MAX_S)
         # By its name on the network that motions go to.
         starts = self.networks.of(self.name, moves=True).starts
         self.remote.call(starts, instruction=self._task, policy_provider=self._policy, duration=duration)

@@ -30,7 +30,6 @@ from strands_robots.recording.cameras import Frames
 from strands_robots.recording.file import Pictures, Recorder, RobotRecording
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.teleoperators import RecordedLeader
-from strands_robots.utils import DURATION_MAX_S
 
 CAMERAS_HZ_MAX = 60
 
@@ -85,10 +84,9 @@ def turns_drive(  # noqa: PLR0917 - one leader, one policy, and what is done wit
     def begun() -> Any:
         load_policy(screen, policy)
         turn.callback(hand.end)
-        how = {"duration": min(seconds or DURATION_MAX_S, DURATION_MAX_S)}
         failures = list[str]()
         try:
-            hand.begin(LeadableHere(led.robot), policy, task, how, lambda why, _: failures.append(why))
+            hand.begin(LeadableHere(led.robot), policy, task, seconds, lambda why, _: failures.append(why))
         except RefusalError as refused:
             raise CliError(said(refused)) from refused
         return TurnsTask(led.robot.tasks.by_leader[hand.leader_id], failures)

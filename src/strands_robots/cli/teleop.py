@@ -36,7 +36,7 @@ from strands_robots.errors import NoAnswerError, NoSuchRobotError, RefusalError
 from strands_robots.policies.rollout import STOP_JOIN_S
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.teleoperators import FULL_RANGES_PER_S, LeaderPolicy
-from strands_robots.utils import DURATION_MAX_S, ValidationError, identifier, number
+from strands_robots.utils import ValidationError, identifier, number
 
 if TYPE_CHECKING:
     from strands_robots.fleet import RemoteRobot
@@ -356,9 +356,8 @@ def _lead_served(screen: Screen, network: Network, hand: HandLeader, follower: s
     """
     ends = list[tuple[str, bool]]()
     with served_follower(screen, network, follower) as robot, hand.connected(), halted_first(robot):
-        how = {"max_speed": options.max_speed, "duration": options.seconds or DURATION_MAX_S}
         with _refused():
-            hand.begin(robot, "", "", how, lambda why, halted: ends.append((why, halted)))
+            hand.begin(robot, "", "", options.seconds, lambda *end: ends.append(end), max_speed=options.max_speed)
         verdicts = list[StopVerdict]()
 
         def stop() -> None:
