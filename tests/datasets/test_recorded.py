@@ -73,7 +73,7 @@ def test_each_task_is_an_episode_on_the_grid_with_its_ages(tmp_path: Path) -> No
     assert frames["observation.age_ms.state"][:4] == pytest.approx([0, 25, 0, 25], abs=0.1)
     assert frames["action"][4].tolist() == [3.0, 2.0], "lift keeps what it was told"
     assert frames["observation.age_ms.top"][19] == pytest.approx(475, abs=0.1)
-    assert frames["observation.same.top"].tolist() == [number not in (0, 20) for number in range(39)]
+    assert frames["same.top"].tolist() == [number not in (0, 20) for number in range(39)]
     assert frames["next.success"].tolist() == [False] * 38 + [True]
     assert tables.read_tasks(out / "meta/tasks.parquet") == ["wave"]
     assert run("check", str(out)).exit_code == 0

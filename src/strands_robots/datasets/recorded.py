@@ -33,7 +33,8 @@ from strands_robots.recording.file import (
 from strands_robots.utils import ValidationError, shown
 
 STATE, ACTION, SUCCESS, STOP, INTERVENTION = "observation.state", "action", "next.success", "stop", "intervention"
-AGE, SAME, IMAGES = "observation.age_ms.", "observation.same.", "observation.images."
+AGE, SAME, IMAGES = "observation.age_ms.", "same.", "observation.images."
+"""Beginnings of features. LeRobot normalizes each observation for a policy, and cannot do that with a truth value."""
 
 STOPPED, EMERGENCY, LOCKED_OUT = 1, 2, 3
 """Values of the feature ``stop``; 0 is none. The last one is a motion that was refused while the robot was locked."""
