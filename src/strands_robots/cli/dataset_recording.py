@@ -252,7 +252,7 @@ def _attempt(
                 return "time"
             if task.voided:
                 return "voided"
-            if encoder is not None and encoder.failed:
+            if recorder.failed or (encoder is not None and encoder.failed):
                 return "failed"
             return "" if task.running else "ended"
 

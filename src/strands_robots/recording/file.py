@@ -237,6 +237,11 @@ class Recorder:
         writing = self._writing
         return self._late_s if writing is None else max(self._late_s, time.time() - writing)
 
+    @property
+    def failed(self) -> bool:
+        """True once it cannot be written any more; the end of the context raises why."""
+        return self._failure is not None
+
     def take(self, device: str, event: str, payload: Mapping[str, Any], at: float | None = None) -> None:
         """Record one event, of now or of ``at`` (s since the epoch); returns at once."""
         moment = time.time() if at is None else at

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import resource
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -43,6 +44,42 @@ class FilmedRobot:
 
     def halt(self, reason: str) -> Any:
         return SimpleNamespace(stopped=True)
+
+
+class ChattyRobot(FilmedRobot):
+    """A robot without a camera, whose steps take some space."""
+
+    has_cameras, halted = False, False
+
+    @contextmanager
+    def recorded(self, recorder: Recorder, fps: int, pictures: Pictures | None) -> Iterator[None]:
+        for row in np.random.default_rng(1).random((1000, 8)).tolist():
+            recorder.take(self.name, "streamStep", {"observation": {"pan": 0}, "action": {"pan": 0}, "more": row})
+        yield
+
+    def halt(self, reason: str) -> Any:
+        self.halted = True
+        return super().halt(reason)
+
+
+@pytest.fixture
+def small_files() -> Iterator[None]:
+    """No file of this process grows beyond 30 kB."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (30_000, before[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.mark.usefixtures("small_files")
+def test_attempt_ends_where_its_recording_cannot_be_written(tmp_path: Path) -> None:
+    robot: Any = ChattyRobot(0)
+    screen = Screen(console=Console(file=io.StringIO()))
+    with RecordingSession(tmp_path, 30, "wave", "so100", lambda said: None) as session:
+        with pytest.raises(OSError, match="File too large"):
+            record_attempts(screen, robot, session, Attempts(1, robot.begin, 30, 600.0, 0.0, success=True))
+        assert robot.halted
+        assert session.recording.stat().st_size > 10_000, "what was written is still there"
 
 
 def recorded(robot: Any, folder: Path) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -24,7 +25,7 @@ from strands_robots.datasets.encoded import ROW, cameras_folder, encoded_videos
 from strands_robots.datasets.encoder import CameraEncoder
 from strands_robots.datasets.layout import data_file, video_file
 from strands_robots.datasets.session import NoPictureError, RecordingSession
-from strands_robots.datasets.video import pictures_of
+from strands_robots.datasets.video import copy_pictures, pictures_of
 from strands_robots.recording.file import Recorder
 from strands_robots.utils import ValidationError
 
@@ -217,6 +218,27 @@ def test_picture_that_cannot_be_encoded_is_told_by_its_camera(encoder: CameraEnc
         with pytest.raises(ValidationError, match="must be height x width x 3 of uint8"):
             encoder.offer(WRIST, np.zeros((48, 64, 3)))  # type: ignore[arg-type]
     assert encoder.offer(TOP, picture(0)) is False, "no attempt runs"
+
+
+def test_video_that_can_grow_no_more_ends_by_name_with_what_it_has(tmp_path: Path) -> None:
+    path, dice = tmp_path / "attempt-000000.mcap", np.random.default_rng(1)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    # Of the process of the encoder as well, which begins in it.
+    resource.setrlimit(resource.RLIMIT_FSIZE, (120_000, before[1]))
+    try:
+        with CameraEncoder(FPS) as limited, limited.attempt(path):
+            limited.offer(TOP, picture(0))
+            beat = threading.Event()
+            while not limited.failed:
+                limited.offer(TOP, dice.integers(0, 255, (48, 64, 3), dtype=np.uint8))
+                beat.wait(1 / FPS)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert limited.failed.startswith("camera top: ")
+    assert "cannot be written" in limited.failed
+    pictures = len(encoded_videos(path, FPS)[TOP].rows)
+    copy_pictures(cameras_folder(path) / f"{TOP}.mp4", tmp_path / "copy.mp4", 0, pictures, FPS)
+    assert len(list(pictures_of(tmp_path / "copy.mp4"))) == pictures > 2
 
 
 def test_jpeg_is_decoded_in_the_process(encoder: CameraEncoder, tmp_path: Path) -> None:
