@@ -11,7 +11,8 @@ from typer.testing import CliRunner
 
 from strands_robots.cli.app import build
 from strands_robots.datasets import Dataset, DatasetEpisode, DatasetInfo, Feature
-from strands_robots.datasets.fit import RobotJoints, robot_findings
+from strands_robots.datasets.fit import RobotJoints, profile_rows, robot_findings
+from strands_robots.policies.profiles import CameraMap, Profile
 from strands_robots.utils import ValidationError
 
 JOINTS = ("pan", "lift")
@@ -74,6 +75,44 @@ def test_robot_of_a_world_is_named_where_there_are_several() -> None:
     for features in ({}, {"robots": {"left": 3}}, {"observation_features": 3, "action_features": None}):
         with pytest.raises(ValidationError, match="states no joints"):
             RobotJoints.of("arm-1", features)
+
+
+def profile(**changed: Any) -> Profile:
+    keys: dict[str, Any] = {"state": JOINTS, "action": JOINTS, "units": {"": "degrees"}, "rate": 30.0}
+    cameras = (CameraMap("arm/top", "observation.images.front", (48, 64)),)
+    return Profile("pick", "lerobot_local", **{**keys, "cameras": cameras, **changed})
+
+
+@pytest.mark.parametrize(
+    ("changed", "refused"),
+    [
+        ({}, []),
+        ({"state": ("lift", "pan")}, ["names of observation.state"]),
+        ({"action": ("pan",)}, ["names of action"]),
+        ({"units": {"": "radians"}}, ["units of observation.state", "units of action"]),
+        ({"rate": 50.0}, ["rate of the dataset"]),
+        ({"rate": None, "units": {}}, []),
+        ({"cameras": (CameraMap("wrist", "observation.images.wrist"),)}, ["pictures of wrist"]),
+    ],
+)
+def test_profile_is_held_against_names_units_rate_and_cameras(changed: dict[str, Any], refused: list[str]) -> None:
+    joints = {key: Feature("float32", (2,), JOINTS, units=("degrees",) * 2) for key in ("observation.state", "action")}
+    info = DatasetInfo(30, {**joints, "observation.images.arm.top": Feature("video", (48, 64, 3))}, "arm")
+    assert [row.question for row in profile_rows(profile(**changed), info) if row.outcome == "refused"] == refused
+
+
+def test_command_holds_a_profile_against_a_dataset(tmp_path: Path) -> None:
+    findings(tmp_path / "set", ARM, np.zeros((20, 2)))
+    file = tmp_path / "policies.toml"
+    entries = 'provider = "remote"\nurl = "ws://localhost:9"\nstate = ["pan", "lift"]\naction = ["pan", "lift"]\n'
+    for rate, code in ((30, 0), (50, 1)):
+        file.write_text(f'[pick]\n{entries}units = "radians"\nrate = {rate}\n')
+        words = ["policy", "check", "pick", "--policies", str(file), "--dataset", str(tmp_path / "set")]
+        done = CliRunner().invoke(build("policy"), words)
+        assert done.exit_code == code, done.output
+    assert "does not fit" in done.output + done.stderr
+    done = CliRunner().invoke(build("policy"), words[:-2])
+    assert (done.exit_code, "give --robot, --dataset" in done.output + done.stderr) == (2, True)
 
 
 def test_command_holds_a_dataset_against_a_simulated_robot(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from strands_robots import settings
 from strands_robots.cli.app import assignments
 from strands_robots.cli.output import CliError, Screen, label, table
 from strands_robots.policies.base import PolicyError
-from strands_robots.policies.check import PolicyCheck, check_policy, statements_of
+from strands_robots.policies.check import CheckRow, PolicyCheck, check_policy, statements_of
 from strands_robots.policies.profiles import Profile, load_profiles
 from strands_robots.utils import ValidationError, duration, missing_extra, number, shown, whole
 
@@ -31,7 +31,10 @@ def check(
     screen: Screen,
     *,
     name: Annotated[str, typer.Argument(help="The profile.")],
-    robot: Annotated[str, typer.Option("--robot", help="Such as so101, or an MJCF or URDF file.")],
+    robot: Annotated[str | None, typer.Option("--robot", help="Such as so101, or an MJCF or URDF file.")] = None,
+    dataset: Annotated[
+        Path | None, typer.Option("--dataset", help="Also, or alone, against a dataset.", metavar="DIR")
+    ] = None,
     policies: PoliciesFile = None,
     mode: Annotated[str, typer.Option("--mode", help="sim or real.")] = "sim",
     options: Annotated[
@@ -39,19 +42,31 @@ def check(
         typer.Option("--set", help="An option of the robot, such as port=/dev/ttyACM0.", metavar="KEY=VALUE"),
     ] = None,
 ) -> None:
-    """Compare a policy with a robot that keeps still. Exits with 1 on a mismatch."""
-    profile = _profile(name, policies)
-    from strands_robots.robot import Robot  # noqa: PLC0415 - heavy, and needed by this command alone
+    """Compare a policy with a still robot, or a dataset. Exits with 1 on a mismatch."""
+    if robot is None and dataset is None:
+        raise ValidationError("give --robot, --dataset, or both: what the policy is compared with.")
+    profile, rows, others = _profile(name, policies), list[CheckRow](), list[str]()
+    if robot is not None:
+        from strands_robots.robot import Robot  # noqa: PLC0415 - heavy, and needed by this command alone
 
-    body = Robot(robot, mode=mode, **assignments(options or []))
-    try:
-        facts = body.policy_facts()
-    finally:
-        body.cleanup()
-    found = check_policy(profile, statements_of(profile), facts)
+        body = Robot(robot, mode=mode, **assignments(options or []))
+        try:
+            facts = body.policy_facts()
+        finally:
+            body.cleanup()
+        rows += check_policy(profile, statements_of(profile), facts).rows
+        others.append(f"may not move {facts.name}")
+    if dataset is not None:
+        from strands_robots.datasets.fit import profile_rows  # noqa: PLC0415 - an extra
+        from strands_robots.datasets.layout import read_info  # noqa: PLC0415 - as above
+
+        rows += profile_rows(profile, read_info(dataset))
+        others.append(f"does not fit {dataset}")
+    found = PolicyCheck(name, tuple(rows))
     show(screen, found)
     if not found.passed:
-        raise CliError(f"{name} may not move {facts.name}: {len(found.failures)} of {len(found.rows)} rows fail.")
+        what = " or ".join(others)
+        raise CliError(f"{name} {what}: {len(found.failures)} of {len(found.rows)} rows fail.")
     if found.unanswered:
         screen.say(
             f"{len(found.unanswered)} rows are unverified: no source states them. They keep nothing from moving."

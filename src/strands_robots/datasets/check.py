@@ -1,4 +1,4 @@
-"""Check of a dataset against itself: counts, grid, videos, ages, jumps."""
+"""Check of a dataset against itself: counts, grid, videos, ages, gaps, jumps."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from strands_robots.datasets import tables
+from strands_robots.datasets.doubles import EVERY, SAMPLES_MAX, Doubles, Look, cells_of
 from strands_robots.datasets.layout import (
     INDEX,
     STATS,
@@ -22,6 +23,7 @@ from strands_robots.datasets.layout import (
     read_info,
     video_file,
 )
+from strands_robots.datasets.recorded import IMAGES, SAME, STATE
 from strands_robots.datasets.video import pictures_of
 from strands_robots.utils import number
 
@@ -30,6 +32,9 @@ OLDEST_MS = 500.0
 
 FROZEN_S = 1.0
 """Seconds for which pictures may stay the same."""
+
+GAP_TIMES, GAP_S = 10.0, 0.1
+"""A gap between two readings is so many times their median distance, and at least so many seconds."""
 
 JUMP_SHARE = 0.5
 """Part of a joint's whole range that it may go in one frame."""
@@ -53,12 +58,15 @@ class DatasetFinding:
     wrong: bool = True
 
 
-def check_dataset(folder: Path, *, oldest_ms: float = OLDEST_MS) -> tuple[DatasetInfo, list[DatasetFinding]]:
+def check_dataset(
+    folder: Path, *, oldest_ms: float = OLDEST_MS, doubles: bool = True
+) -> tuple[DatasetInfo, list[DatasetFinding]]:
     """Check each episode of a dataset; read, never written.
 
     Args:
         folder: of the dataset.
         oldest_ms: age of a reading from which it is told.
+        doubles: also look for pictures that are there twice; not where they are replayed.
 
     Raises:
         DatasetError: it has no index that can be read.
@@ -67,7 +75,7 @@ def check_dataset(folder: Path, *, oldest_ms: float = OLDEST_MS) -> tuple[Datase
     number("oldest_ms", oldest_ms, above=0, high=60_000)
     info = read_info(folder)
     found = list(_whole(folder, info))
-    start = 0
+    start, seen = 0, Doubles()
     for episode in range(info.episodes):
         where = f"episode {episode}"
         try:
@@ -77,8 +85,16 @@ def check_dataset(folder: Path, *, oldest_ms: float = OLDEST_MS) -> tuple[Datase
             found += [DatasetFinding(where, said) for said in _index(info, episode, start, frames, row)]
             found += [DatasetFinding(where, said, wrong=False) for said in _ages(frames, oldest_ms)]
             found += [DatasetFinding(where, said, wrong=False) for said in _jumps(info, frames)]
+            found += [DatasetFinding(where, said, wrong=False) for said in _gaps(info, frames)]
+            looks = {}
             for name in info.videos:
-                found += _video(folder / video_file(name, episode), info.fps, count, f"{where}, {name}")
+                same = frames.get(SAME + name.removeprefix(IMAGES), np.zeros(0, dtype=bool))
+                cells: list[NDArray[np.float32]] = []
+                found += _video(folder / video_file(name, episode), info.fps, count, f"{where}, {name}", same, cells)
+                looks[name] = Look(np.array(cells))
+            state = np.asarray(frames.get(STATE, np.zeros(count)), dtype=np.float64).reshape(count, -1)
+            if doubles:
+                found += [DatasetFinding(where, said, wrong) for said, wrong in seen.add(episode, looks, state)]
             start += count
         except DatasetError as exc:
             found.append(DatasetFinding(where, str(exc)))
@@ -157,12 +173,41 @@ def _jumps(info: DatasetInfo, frames: dict[str, NDArray[Any]]) -> Iterator[str]:
             yield f"{feature.names[column]} of {key} jumps by {steps[at - 1, column]:.3g} at frame {at}"
 
 
-def _video(path: Path, fps: int, count: int, where: str) -> Iterator[DatasetFinding]:
-    """Count the pictures of a video, and how long they stay the same."""
+def _gaps(info: DatasetInfo, frames: dict[str, NDArray[Any]]) -> Iterator[str]:
+    """Tell of a reading that came much later after the one before than most do."""
+    for name, ages in frames.items():
+        if ".age_ms." not in name or len(ages) < 3:
+            continue
+        read_at = np.arange(len(ages)) / info.fps - np.asarray(ages, dtype=np.float64) / 1000
+        moments = read_at[np.concatenate([[True], np.diff(read_at) > _GRID_S])]
+        apart = np.diff(moments)
+        usual = float(np.median(apart)) if len(apart) else 0.0
+        long = apart > max(GAP_TIMES * usual, GAP_S)
+        if long.any():
+            at = int(np.searchsorted(read_at, moments[int(apart.argmax()) + 1] - _GRID_S))
+            said = f"no {name.rpartition('.')[2]} was read for {apart.max():.2f} s before frame {at}"
+            yield f"{said}, and usually for {usual:.3f} s" + (f"; {long.sum()} such gaps" if long.sum() > 1 else "")
+
+
+def _longest(same: NDArray[Any]) -> int:
+    """Return the length of the longest run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], np.asarray(same, dtype=np.int8), [0]])))
+    return int((edges[1::2] - edges[::2]).max(initial=0))
+
+
+def _video(  # noqa: PLR0917 - one video, and what its frames say
+    path: Path, fps: int, count: int, where: str, marked: NDArray[Any], cells: list[NDArray[np.float32]]
+) -> Iterator[DatasetFinding]:
+    """Count the pictures of a video, and how long they stay the same.
+
+    ``marked`` are the frames that say so themselves; ``cells`` takes what the pictures are told by.
+    """
     seen = same = longest = 0
     before: NDArray[np.uint8] | None = None
     try:
         for picture in pictures_of(path):
+            if seen % EVERY == 0 and len(cells) < SAMPLES_MAX:
+                cells.append(cells_of(picture))
             seen += 1
             same = same + 1 if before is not None and np.array_equal(before, picture) else 0
             longest, before = max(longest, same), picture
@@ -171,5 +216,6 @@ def _video(path: Path, fps: int, count: int, where: str) -> Iterator[DatasetFind
         return
     if seen != count:
         yield DatasetFinding(where, f"it has {seen} pictures, and the episode {count} frames")
+    longest = max(longest, _longest(marked))
     if longest >= FROZEN_S * fps:
         yield DatasetFinding(where, f"its picture stays the same for {longest / fps:.1f} s", wrong=False)

@@ -1,4 +1,4 @@
-"""Check of a dataset against a robot: its names, and values it cannot have."""
+"""Check of a dataset against a robot or a policy's profile."""
 
 from __future__ import annotations
 
@@ -10,9 +10,11 @@ from typing import Any
 
 from strands_robots.bounded_json import json_object
 from strands_robots.datasets.check import DatasetFinding
-from strands_robots.datasets.layout import INFO_BYTES, STATS, DatasetError, DatasetInfo
-from strands_robots.datasets.recorded import ACTION, STATE
+from strands_robots.datasets.layout import INFO_BYTES, STATS, DatasetError, DatasetInfo, Feature
+from strands_robots.datasets.recorded import ACTION, IMAGES, STATE
 from strands_robots.policies.base import Ranges
+from strands_robots.policies.check import PROFILE, CheckRow, compared, of, unanswered
+from strands_robots.policies.profiles import Profile
 from strands_robots.recording.file import units_in
 from strands_robots.utils import ValidationError, shown
 
@@ -57,6 +59,66 @@ class RobotJoints:
             raise ValidationError(f"{name} states no joints or no actions.")
         ranges = {str(key): found for key, value in stated.items() if (found := _range(value)) is not None}
         return cls(name, observed, told, ranges, units)
+
+
+DATASET = "dataset"
+"""Owner of values of a dataset, in the rows of a check."""
+
+
+def profile_rows(profile: Profile, info: DatasetInfo) -> Iterator[CheckRow]:
+    """Yield the rows of a policy's profile against a dataset: names, units, rate, cameras.
+
+    Args:
+        profile: of the policy.
+        info: of the dataset.
+    """
+    for key, names in ((STATE, profile.state), (ACTION, profile.action)):
+        feature = info.features.get(key, Feature("float32"))
+        mine, its = (
+            of(", ".join(each) or "none", owner) for each, owner in ((names, PROFILE), (feature.names, DATASET))
+        )
+        change = f"name the joints of {key} as the dataset does, in its order"
+        yield compared(f"names of {key}", mine, its, tuple(names) == feature.names, change)
+        yield _units_row(profile, key, dict(zip(feature.names, feature.units, strict=False)))
+    if profile.rate is None:
+        yield unanswered("rate of the dataset", robot=of(f"{info.fps} Hz", DATASET), change=f"set rate = {info.fps}")
+    else:
+        rates = of(f"{profile.rate:g} Hz", PROFILE), of(f"{info.fps} Hz", DATASET)
+        yield compared("rate of the dataset", *rates, profile.rate == info.fps, f"set rate = {info.fps}")
+    yield from _camera_rows(profile, info)
+
+
+def _units_row(profile: Profile, key: str, units: Mapping[str, str]) -> CheckRow:
+    keys = profile.state if key == STATE else profile.action
+    pairs = [(name, profile.unit(name) or "", units.get(name, "")) for name in keys]
+    both = [(name, mine, its) for name, mine, its in pairs if mine and its]
+    if not both:
+        return unanswered(f"units of {key}", robot=of("not stated", DATASET), change="look at its ranges")
+    other = [each for each in both if each[1] != each[2]]
+    shown_rows = other or both[:1]
+    mine, its = (", ".join(f"{each[0]} in {each[side]}" for each in shown_rows) for side in (1, 2))
+    return compared(f"units of {key}", of(mine, PROFILE), of(its, DATASET), not other, "state the units of the data")
+
+
+def _camera_rows(profile: Profile, info: DatasetInfo) -> Iterator[CheckRow]:
+    seen = set()
+    for each in profile.cameras:
+        names = (each.key, IMAGES + each.camera.replace("/", "."))
+        name = next((name for name in names if name in info.videos), "")
+        question, have = f"pictures of {each.camera}", of(", ".join(info.videos) or "no pictures", DATASET)
+        if not name:
+            yield compared(question, of(each.key, PROFILE), have, fits=False, change="name a camera of the dataset")
+            continue
+        seen.add(name)
+        size, its = each.size, info.videos[name].shape[:2]
+        if size is not None and each.crop is None and size != its:
+            change = "look whether it was trained on pictures that were resized so"
+            mine, theirs = (f"{height}x{width}" for height, width in (size, its))
+            yield unanswered(question, of(mine, PROFILE), of(theirs, DATASET), change)
+        else:
+            yield compared(question, of(each.key, PROFILE), of(name, DATASET), fits=True, change="")
+    for name in sorted(info.videos.keys() - seen):
+        yield unanswered(f"pictures of {name}", of("no such picture", PROFILE), of(name, DATASET), "it sees none of it")
 
 
 def robot_findings(folder: Path, info: DatasetInfo, robot: RobotJoints) -> Iterator[DatasetFinding]:

@@ -60,7 +60,8 @@ def lead(encoder: CameraEncoder, path: Path, *cameras: str, frames: int = 20) ->
 
 
 def wrong(folder: Path) -> list[str]:
-    return [each.said for each in check_dataset(folder)[1] if each.wrong]
+    # The cameras here are given the same pictures.
+    return [each.said for each in check_dataset(folder, doubles=False)[1] if each.wrong]
 
 
 def test_episode_has_the_pictures_of_each_camera_at_its_moments(encoder: CameraEncoder, tmp_path: Path) -> None:
