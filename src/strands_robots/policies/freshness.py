@@ -33,7 +33,7 @@ BACKWARDS_S = 0.01
 """A round trip that took less than none by so much: one of the clocks stood still, as in a suspended computer."""
 
 
-class _Least:
+class Least:
     """Least of the values of the last :data:`WINDOW_S`, by the time of arrivals."""
 
     def __init__(self) -> None:
@@ -59,7 +59,7 @@ class CommandAges:
         """Forget what is known of the link."""
         self._flowed = 0.0
         self._received: float | None = None
-        self._ways, self._trips = _Least(), _Least()
+        self._ways, self._trips = Least(), Least()
         self._one_way = 0.0
 
     @property
