@@ -1,4 +1,4 @@
-"""Age of the newest picture that an operator sees, for each command of :class:`FarLead`."""
+"""Age of the newest picture that an operator of a far lead sees."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ REMEMBERED = 64
 
 
 class PictureAge:
-    """Age of the newest changed picture of one camera; of several cameras the greatest counts.
+    """Age of the newest changed picture of one camera.
+
+    Of several cameras the greatest counts.
 
     A picture that came before, byte for byte, is no new one, so a camera that freezes ages while it goes on to send.
     Thread-safe.
