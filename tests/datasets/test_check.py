@@ -10,6 +10,7 @@ import pytest
 
 from strands_robots.datasets import Dataset, DatasetEpisode, DatasetInfo, Feature
 from strands_robots.datasets.check import check_dataset
+from strands_robots.datasets.recorded import SAME
 from strands_robots.datasets.video import Video, VideoWriter
 
 FPS, FRAMES = 30, 60
@@ -80,7 +81,7 @@ def test_camera_that_sees_nothing_move_is_no_double(tmp_path: Path) -> None:
 
 def test_frames_that_say_themselves_that_their_picture_froze_are_told(tmp_path: Path) -> None:
     same = (np.arange(FRAMES) >= 10) & (np.arange(FRAMES) < 55)
-    found = saved(tmp_path, ({TOP: rising}, 1.0), **{"observation.same.top": same})
+    found = saved(tmp_path, ({TOP: rising}, 1.0), **{f"{SAME}top": same})
     assert found == [(f"episode 0, {TOP}: its picture stays the same for 1.5 s", False)]
 
 
