@@ -72,7 +72,7 @@ def policy_drives(screen: Screen, policy: str, task: str, seconds: float | None,
 def turns_drive(  # noqa: PLR0917 - one leader, one policy, and what is done with them
     screen: Screen, policy: str, task: str, seconds: float | None, hand: HandLeader, led: LedRobot
 ) -> Iterator[Driver]:
-    """Have a policy drive the robot in each attempt of the block, and a leader take over from it.
+    """Have a policy drive in each attempt of the block, and a leader take over.
 
     Raises:
         ConnectionError: a leader arm cannot be connected.
