@@ -1,0 +1,213 @@
+"""Attempts of a served robot: whose stop it was, and what is no clean end. The robot here is a double."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from fixtures.waiting import eventually
+
+from strands_robots.cli import far_recording
+from strands_robots.cli.far_recording import FarRobot, FarTask
+from strands_robots.cli.output import CliError
+from strands_robots.errors import NoAnswerError
+from strands_robots.fleet.adapter import RobotEvent
+from strands_robots.recording.file import Recorder
+
+STOPPED = {"state": "stopped"}
+
+
+class ServedArm:
+    """A served robot without cameras, and its network.
+
+    Attributes:
+        answers: returns its status, or raises.
+        start: called with each start.
+        halts: reasons of its halts from here.
+    """
+
+    id = address = "arm-1"
+    verbs: tuple[str, ...] = ()
+    has_lease, model = True, "so100"
+
+    def __init__(self) -> None:
+        self.answers: Callable[[], Mapping[str, Any]] = lambda: {"task_status": "running"}
+        self.start: Callable[[], object] = lambda: None
+        self.halts: list[str] = []
+        self.stands = True
+        self.robots: dict[str, Any] = {}
+        self._tell: Callable[[RobotEvent], None] = lambda event: None
+
+    def features(self) -> dict[str, Any]:
+        return {"joint_units": {"pan": "radians"}}
+
+    def status(self) -> Mapping[str, Any]:
+        return self.answers()
+
+    def call(self, verb: str, **arguments: Any) -> dict[str, Any]:
+        self.start()
+        return {}
+
+    def halt(self, reason: str) -> Any:
+        self.halts.append(reason)
+        return SimpleNamespace(stopped=self.stands)
+
+    def of(self, name: str, *, moves: bool) -> Any:
+        return SimpleNamespace(starts="execute")
+
+    def subscribe(self, name: str, tell: Callable[[RobotEvent], None], detail: Any) -> Callable[[], None]:
+        self._tell = tell
+        return lambda: None
+
+    def tells(self, name: str, payload: Mapping[str, Any]) -> None:
+        """Send an event, on the network's thread."""
+        self._tell(RobotEvent("arm-1", name, payload))
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(far_recording, "LOOK_S", 0.01)
+    monkeypatch.setattr(far_recording, "SILENT_S", 0.05)
+
+
+@pytest.fixture
+def arm() -> ServedArm:
+    return ServedArm()
+
+
+@pytest.fixture
+def recorder(tmp_path: Path) -> Iterator[Recorder]:
+    with Recorder(tmp_path / "attempt.mcap", joints_of_events=False) as made:
+        yield made
+
+
+@pytest.fixture
+def robot(arm: ServedArm, recorder: Recorder) -> Iterator[FarRobot]:
+    world: Any = arm
+    made = FarRobot(world, world, "", "mock", "wave", None)
+    with made.recorded(recorder, 30, None):
+        yield made
+        made.halt("test ended")
+
+
+def ended(task: FarTask) -> None:
+    eventually(lambda: not task.running, within=5)
+
+
+def test_stop_that_comes_just_before_the_end_is_that_of_others(arm: ServedArm, robot: FarRobot) -> None:
+    arm.answers = lambda: {"task_status": "stopped"}
+    task = robot.begin(30)
+    arm.tells("taskComplete", STOPPED)
+    # Asked before the watcher has looked: the attempt ends by its time at this moment.
+    assert (robot.stopped, robot.stopped_by) == (True, "arm-1 was stopped.")
+    ended(task)
+    assert (task.voided, task.error) == (True, "")
+
+
+def test_end_of_an_attempt_is_no_stop_of_others(arm: ServedArm, robot: FarRobot) -> None:
+    task = robot.begin(30)
+    robot.halt("attempt ended")
+    arm.tells("taskComplete", STOPPED)
+    assert (robot.stopped, robot.stopped_by, task.voided, task.error) == (False, "", False, "")
+
+
+def test_answer_that_comes_late_says_nothing_of_the_next_attempt(arm: ServedArm, robot: FarRobot, file: Path) -> None:
+    asked, let = threading.Event(), threading.Event()
+
+    def late() -> Mapping[str, Any]:
+        asked.set()
+        assert let.wait(5)
+        return {"locked": True}
+
+    arm.answers = late
+    first = robot.begin(30)
+    assert asked.wait(5)
+    watcher = next(each for each in threading.enumerate() if each.name == "attempt arm-1")
+    robot.halt("attempt ended")
+    arm.answers = lambda: {"task_status": "running"}
+    second = robot.begin(30)
+    let.set()
+    watcher.join(5)
+    assert (robot.stopped, second.running, first.stopped_by) == (False, True, "")
+    assert "locked" not in recorder.arrived
+
+
+def test_robot_that_is_locked_ends_the_attempt_and_the_lockout_is_recorded(
+    arm: ServedArm, robot: FarRobot, recorder: Recorder
+) -> None:
+    arm.answers = lambda: {"locked": True}
+    task = robot.begin(30)
+    ended(task)
+    assert (task.voided, robot.stopped_by) == (True, "arm-1 is locked by an emergency stop.")
+    assert "locked" in recorder.arrived
+
+
+def test_watcher_that_cannot_read_the_robot_ends_the_attempt(arm: ServedArm, robot: FarRobot) -> None:
+    def broken() -> Mapping[str, Any]:
+        raise TypeError("its status is a list")
+
+    arm.answers = broken
+    task = robot.begin(30)
+    ended(task)
+    assert task.error == "arm-1 can be watched no more: TypeError: its status is a list"
+
+
+def test_silent_robot_ends_the_attempt(arm: ServedArm, robot: FarRobot) -> None:
+    def silent() -> Mapping[str, Any]:
+        raise NoAnswerError("no answer")
+
+    arm.answers = silent
+    task = robot.begin(30)
+    ended(task)
+    assert task.error.startswith("arm-1 is out of reach: ")
+
+
+@pytest.mark.parametrize(
+    ("payload", "error"),
+    [
+        ({"state": "completed"}, ""),
+        ({"state": "error"}, "its policy ended as 'error'"),
+        ({"state": "error", "error": "out of memory"}, "out of memory"),
+        ({"state": "completed", "error": "late"}, "late"),
+    ],
+)
+def test_policy_that_failed_without_a_word_is_no_clean_end(
+    arm: ServedArm, robot: FarRobot, payload: Mapping[str, Any], error: str
+) -> None:
+    task = robot.begin(30)
+    arm.tells("taskComplete", payload)
+    ended(task)
+    assert (task.error, task.voided, robot.stopped) == (error, False, False)
+
+
+def test_policy_whose_end_nobody_tells_is_no_success(arm: ServedArm, robot: FarRobot) -> None:
+    task = robot.begin(30)
+    looked = threading.Event()
+    arm.answers = lambda: (looked.set(), {"task_status": "running"})[1]
+    assert looked.wait(5)
+    eventually(lambda: task.running, within=1)
+    arm.answers = lambda: {"task_status": "idle"}
+    ended(task)
+    assert (task.voided, robot.stopped) == (True, False)
+
+
+def test_start_that_is_not_answered_halts_the_robot(arm: ServedArm, robot: FarRobot) -> None:
+    def unanswered() -> None:
+        raise NoAnswerError("no answer")
+
+    arm.start, arm.stands = unanswered, False
+    with pytest.raises(CliError, match="arm-1 did not confirm its stop and may move"):
+        robot.begin(30)
+    assert arm.halts == ["its start was not answered"]
+
+
+def test_refused_motion_of_the_mesh_is_recorded_as_that_of_device_connect(
+    arm: ServedArm, robot: FarRobot, recorder: Recorder
+) -> None:
+    arm.tells("safety_event", {"event": "motion_refused", "verb": "execute"})
+    arm.tells("safety_event", {"event": "emergency_stop"})
+    assert set(recorder.arrived) == {"jointUnits", "motionRefused"}
