@@ -115,7 +115,9 @@ def test_end_of_an_attempt_is_no_stop_of_others(arm: ServedArm, robot: FarRobot)
     assert (robot.stopped, robot.stopped_by, task.voided, task.error) == (False, "", False, "")
 
 
-def test_answer_that_comes_late_says_nothing_of_the_next_attempt(arm: ServedArm, robot: FarRobot, file: Path) -> None:
+def test_answer_that_comes_late_says_nothing_of_the_next_attempt(
+    arm: ServedArm, robot: FarRobot, recorder: Recorder
+) -> None:
     asked, let = threading.Event(), threading.Event()
 
     def late() -> Mapping[str, Any]:
