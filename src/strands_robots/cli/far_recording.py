@@ -32,6 +32,9 @@ from strands_robots.utils import DURATION_MAX_S, ValidationError, shown
 LOOK_S = 0.25
 """Pause between two looks at the robot's status."""
 
+LOADING_S = 300.0
+"""Longest wait for a policy that the robot is loading."""
+
 SILENT_S = 3.0
 """Time without an answer of the robot after which an attempt ends."""
 
@@ -172,7 +175,7 @@ class FarRobot:
         task = self._attempt = FarTask()
         if self._policy or self._hand is not None:
             try:
-                self._start(task, seconds)
+                self._start_loaded(task, seconds)
             except RefusalError as refused:
                 why = said(refused)
                 task.end(why)
@@ -183,6 +186,19 @@ class FarRobot:
                 raise CliError(why) from refused
         threading.Thread(target=self._watch, args=(task,), name=f"attempt {self.name}", daemon=True).start()
         return task
+
+    def _start_loaded(self, task: FarTask, seconds: float | None) -> None:
+        """Start, also where the robot has yet to load its policy."""
+        until = time.monotonic() + LOADING_S
+        while True:
+            try:
+                self._start(task, seconds)
+            except RefusalError as refused:
+                if refused.envelope.get("loading") is not True or time.monotonic() > until:
+                    raise
+                time.sleep(LOOK_S)
+            else:
+                return
 
     def _start(self, task: FarTask, seconds: float | None) -> None:
         """Start the policy, the leader or both."""
