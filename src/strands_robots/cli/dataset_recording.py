@@ -180,8 +180,11 @@ def _record(
             return
         ended = _attempt(screen, led, session, attempts, encoder)
         if ended.stopped_by:
-            _save(screen, session, success=False)
-            led.hold(screen)
+            try:
+                _save(screen, session, success=False)
+            finally:
+                # Also where the disk is full: a locked robot is resumed on its network.
+                led.hold(screen)
             raise CliError(f"Stopped from the network: {ended.stopped_by}")
         if ended.verdict is None or not ended.verdict.stopped:
             raise CliError("The follower did not confirm its stop; the attempt is saved at the next start.")
@@ -286,13 +289,23 @@ def _with_pictures(screen: Screen, encoder: CameraEncoder, ended: _Ended) -> _En
 
 
 def _save(screen: Screen, session: RecordingSession, *, success: bool) -> str:
-    """Save the attempt; return why it is none, else nothing."""
-    from strands_robots.datasets.session import NoPictureError  # noqa: PLC0415 - an extra
+    """Save the attempt; return why it is none, else nothing.
+
+    Raises:
+        CliError: it cannot be written; the text says what is saved and where the attempt is.
+    """
+    from strands_robots.datasets.layout import DatasetError  # noqa: PLC0415 - an extra
+    from strands_robots.datasets.session import NoPictureError  # noqa: PLC0415 - as above
 
     try:
         kept = session.keep(success=success)
     except NoPictureError as problem:
         kept, lacking = None, f"No episode: {problem}."
+    except DatasetError as problem:
+        kept_in = f"The attempt is in {session.recording}; the next start makes an episode of it."
+        raise CliError(
+            f"{str(problem).rstrip('.')}. Episodes that are saved: {session.episodes}. {kept_in}"
+        ) from problem
     else:
         lacking = "The robot made no step: there is nothing to save."
     if kept is None:

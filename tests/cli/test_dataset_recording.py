@@ -1,0 +1,112 @@
+"""Attempts of a robot whose disk is full: what is saved stays, and what was recorded is kept by name."""
+
+from __future__ import annotations
+
+import errno
+import io
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from strands_robots.cli.dataset_recording import Attempts, record_attempts
+from strands_robots.cli.output import CliError, Screen
+from strands_robots.datasets import tables
+from strands_robots.datasets.check import check_dataset
+from strands_robots.datasets.session import RecordingSession
+from strands_robots.recording.file import Pictures, Recorder
+
+FPS = 30
+
+
+class Arm:
+    """A robot without cameras, of ten steps an attempt."""
+
+    name, has_cameras, stopped_by = "arm-1", False, "stop by alice."
+
+    def __init__(self) -> None:
+        self.stopped, self.held = False, 0
+
+    @contextmanager
+    def recorded(self, recorder: Recorder, fps: int, pictures: Pictures | None) -> Iterator[None]:
+        for step in range(10):
+            row = {"observation": {"pan": step}, "action": {"pan": step}}
+            recorder.take(self.name, "streamStep", row, 1000.0 + step / FPS)
+        yield
+
+    def halt(self, reason: str) -> Any:
+        return SimpleNamespace(stopped=True)
+
+    def hold(self, screen: Screen) -> None:
+        self.held += 1
+
+
+@pytest.fixture
+def arm() -> Arm:
+    return Arm()
+
+
+def session(folder: Path, said: list[str] | None = None) -> RecordingSession:
+    return RecordingSession(folder, FPS, "wave", "so100", ([] if said is None else said).append)
+
+
+def record(arm: Arm, recording: RecordingSession, count: int) -> None:
+    task = SimpleNamespace(voided=False, running=False, error="")
+    screen = Screen(console=Console(file=io.StringIO()))
+    record_attempts(screen, arm, recording, Attempts(count, lambda: task, FPS, 1.0, 0.0, True))
+
+
+def fill(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the disk be full from now on, as it looks to what writes the row of an episode."""
+
+    def full(*arguments: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(tables, "write_episode", full)
+
+
+def test_full_disk_ends_it_by_name_and_the_attempt_is_an_episode_later(
+    tmp_path: Path, arm: Arm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[str] = []
+    with session(tmp_path) as recording:
+        record(arm, recording, 2)
+        with monkeypatch.context() as patch:
+            fill(patch)
+            with pytest.raises(CliError) as failed:
+                record(arm, recording, 1)
+    reason = failed.value.reason
+    assert (
+        f"{tmp_path} cannot be written: No space left on device. The disk is full. Episodes that are saved: 2."
+        in reason
+    )
+    assert "attempt-000002.mcap; the next start makes an episode of it" in reason
+    assert [each for each in check_dataset(tmp_path)[1] if each.wrong] == []
+    with session(tmp_path, said) as again:
+        assert again.episodes == 3
+    assert said[-1].startswith("episode 2 is the attempt that was running")
+
+
+def test_robot_that_was_stopped_stays_on_its_network_also_where_the_disk_is_full(
+    tmp_path: Path, arm: Arm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    arm.stopped = True
+    fill(monkeypatch)
+    with session(tmp_path) as recording, pytest.raises(CliError, match="The disk is full"):
+        record(arm, recording, 1)
+    assert arm.held == 1
+
+
+def test_leader_that_failed_costs_no_saved_episode(tmp_path: Path, arm: Arm) -> None:
+    with session(tmp_path) as recording:
+        record(arm, recording, 1)
+        task = SimpleNamespace(voided=False, running=False, error="the leader's cable is out")
+        attempts = Attempts(3, lambda: task, FPS, 1.0, 0.0, True)
+        with pytest.raises(CliError, match="cable is out"):
+            record_attempts(Screen(console=Console(file=io.StringIO())), arm, recording, attempts)
+        assert recording.episodes == 2
+    assert tables.read_frames(tmp_path / "data/chunk-000/file-001.parquet")["next.success"].tolist() == [False] * 10
