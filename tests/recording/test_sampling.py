@@ -27,6 +27,7 @@ from strands_robots.recording.file import (
     read_events,
     read_items,
 )
+from strands_robots.safety.lockout import LockoutLatch
 from strands_robots.simulation import Simulation
 from strands_robots.utils import ValidationError
 
@@ -106,6 +107,24 @@ def test_task_halt_and_lock_are_recorded_in_their_order(arm: HardwareRobot, tmp_
     assert names[0] == "taskStarted"
     assert set(names[1:-1]) == {"taskComplete", "halted", "locked"}
     assert names[-1] == "unlocked"
+
+
+def test_units_and_a_motion_that_is_refused_while_locked_are_recorded(tmp_path: Path) -> None:
+    path, lockout = tmp_path / "run.mcap", LockoutLatch("so100")
+    simulation = Simulation()
+    simulation.add_robot("so100")
+    try:
+        with recording(simulation, path):
+            lockout.engage("0" * 32, "bob", "smoke")
+            simulation.gate.attach(lockout)
+            assert simulation.start_policy("so100", "wave", "mock")["locked"] is True
+    finally:
+        simulation.cleanup()
+    told = {event.event: event for event in read_events(path)}
+    assert told["jointUnits"].payload["units"]["gripper"] == "radians"
+    assert told["jointUnits"].robot == "arm-1/so100"
+    assert told["motionRefused"].payload["verb"] == "start_policy"
+    assert "emergency stop of bob" in str(told["motionRefused"].payload["reason"])
 
 
 def test_teleoperation_is_recorded_like_a_task(arm: HardwareRobot, tmp_path: Path) -> None:
