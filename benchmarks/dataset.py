@@ -24,6 +24,7 @@ from rich.console import Console
 from benchmarks.dataset_children import FPS, HZ
 from benchmarks.dataset_stops import stops_ms
 from benchmarks.dataset_writers import SAVED
+from benchmarks.safety import Hiccups
 from benchmarks.table import Row
 
 ROOT = Path(__file__).parents[1]
@@ -75,7 +76,9 @@ def run(*, quick: bool = False, sizes: Sizes | None = None, rows: Sequence[str] 
         "writers": beside_lerobot,
         "stops": stopped,
     }
-    return [row for name, measure in parts.items() if not rows or name in rows for row in measure(size)]
+    with Hiccups() as machine:
+        found = [row for name, measure in parts.items() if not rows or name in rows for row in measure(size)]
+    return [*found, machine.row()]
 
 
 def killed(size: Sizes) -> list[Row]:
