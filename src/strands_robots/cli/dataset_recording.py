@@ -8,8 +8,8 @@ import sys
 import termios
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager, ExitStack, nullcontext
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from enum import Enum
 from typing import TYPE_CHECKING, Any, Protocol
@@ -226,13 +226,37 @@ def _ready(screen: Screen, attempts: Attempts, saved: int) -> bool:
     return True
 
 
+@contextmanager
+def _recording(screen: Screen, led: AttemptRobot, session: RecordingSession) -> Iterator[Recorder]:
+    """Yield the recorder of an attempt.
+
+    Raises:
+        CliError: it could not be written to its end; the text says what is saved and where the attempt is.
+    """
+    recorder = Recorder(session.recording, joints_of_events=False)
+    try:
+        with recorder:
+            yield recorder
+    except OSError as problem:
+        if not recorder.failed:
+            raise
+        if led.stopped:
+            led.hold(screen)
+        raise _unwritten(session, f"{session.folder} cannot be written: {problem.strerror}") from problem
+
+
+def _unwritten(session: RecordingSession, why: str) -> CliError:
+    kept_in = f"The attempt is in {session.recording}; the next start makes an episode of it."
+    return CliError(f"{why.rstrip('.')}. Episodes that are saved: {session.episodes}. {kept_in}")
+
+
 def _attempt(
     screen: Screen, led: AttemptRobot, session: RecordingSession, attempts: Attempts, encoder: CameraEncoder | None
 ) -> _Ended:
     """Lead and record one attempt, and halt the robot."""
     said, ends = list[Said](), list[tuple[str, StopVerdict | None]]()
     with ExitStack() as recorded:
-        recorder = recorded.enter_context(Recorder(session.recording, joints_of_events=False))
+        recorder = recorded.enter_context(_recording(screen, led, session))
         if encoder is not None:
             recorded.enter_context(encoder.attempt(recorder.path))
         progress = AttemptProgress(recorder, attempts.fps, encoder)
@@ -302,10 +326,7 @@ def _save(screen: Screen, session: RecordingSession, *, success: bool) -> str:
     except NoPictureError as problem:
         kept, lacking = None, f"No episode: {problem}."
     except DatasetError as problem:
-        kept_in = f"The attempt is in {session.recording}; the next start makes an episode of it."
-        raise CliError(
-            f"{str(problem).rstrip('.')}. Episodes that are saved: {session.episodes}. {kept_in}"
-        ) from problem
+        raise _unwritten(session, str(problem)) from problem
     else:
         lacking = "The robot made no step: there is nothing to save."
     if kept is None:

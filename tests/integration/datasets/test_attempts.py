@@ -76,7 +76,9 @@ def test_attempt_ends_where_its_recording_cannot_be_written(tmp_path: Path) -> N
     robot: Any = ChattyRobot(0)
     screen = Screen(console=Console(file=io.StringIO()))
     with RecordingSession(tmp_path, 30, "wave", "so100", lambda said: None) as session:
-        with pytest.raises(OSError, match="File too large"):
+        with pytest.raises(
+            CliError, match=r"cannot be written: File too large\. Episodes that are saved: 0\. The attempt is in"
+        ):
             record_attempts(screen, robot, session, Attempts(1, robot.begin, 30, 600.0, 0.0, success=True))
         assert robot.halted
         assert session.recording.stat().st_size > 10_000, "what was written is still there"
