@@ -40,6 +40,7 @@ PARTS = {
     "recording": "Recording where robots are served",
     "dataset": "Recording of datasets",
     "dataset-train": "Training on a recorded dataset",
+    "takeover": "Taking over from a policy",
     "dashboard": "The operator's page in Chromium",
     "ros": "Robots on ROS graphs",
     "arm": "A real arm (in the environment of `make real-arm`)",

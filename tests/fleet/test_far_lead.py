@@ -68,6 +68,7 @@ def test_turns_are_numbered_and_a_policy_has_the_first() -> None:
     robot = Robot()
     with robot.lead(policy=True) as lead:
         for number, change in enumerate((lambda: None, lead.grip, lead.give_back, lead.grip)):
+            robot.at += 1.0
             change()
             lead.send({"pan": 0.0})
             eventually(lambda most=number + 1: len(robot.commands) == most)
@@ -95,3 +96,16 @@ def test_command_without_an_answer_is_counted_and_a_silent_robot_is_given_up() -
         robot.at = LOST_S + 1
         with pytest.raises(NoAnswerError, match="answered no command for 10 s"):
             lead.send({"pan": 0.0})
+
+
+def test_turn_begins_at_once_with_what_the_leader_has_just_sent() -> None:
+    robot = Robot()
+    with robot.lead(policy=True) as lead:
+        lead.send({"pan": 0.3}, picture_age_s=0.1)
+        eventually(lambda: lead.state.state == "led")
+        robot.at = 0.02
+        lead.grip()
+        eventually(lambda: len(robot.commands) == 2)
+    taken = robot.commands[1]
+    assert (taken["turn"], taken["leads"], taken["targets"], taken["seq"]) == (2, True, {"pan": 0.3}, 2)
+    assert (taken["made"], taken["picture_age_ms"]) == (0.0, 100.0), "it is no younger than it was"

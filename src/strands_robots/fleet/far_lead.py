@@ -29,6 +29,9 @@ ANSWER_S = 1.0
 LOST_S = 10.0
 """Seconds without an answer after which the lead is given up, as the robot gives up a silent leader."""
 
+RECENT_S = 0.05
+"""Seconds in which a command is still the leader's place: a new turn begins with it at once."""
+
 END_S = 2.0
 """Seconds in which the end of the lead has to be answered."""
 
@@ -59,6 +62,15 @@ class LeadState:
     dropped: int = 0
 
 
+@dataclass(frozen=True)
+class _Sent:
+    """Last action of the leader."""
+
+    action: Mapping[str, float]
+    made: float
+    picture_age_s: float | None
+
+
 class FarLead:
     """The lead of a robot, as its leader has it; made by :meth:`RemoteRobot.lead`.
 
@@ -86,6 +98,7 @@ class FarLead:
         self._lead_id = str(opened["lead_id"])
         self._changed = threading.Condition()
         self._waiting: dict[str, Any] | None = None
+        self._newest: _Sent | None = None
         self._idle = self._senders = 0
         self._seq = 0
         self._turn, self._leads = (0, False) if policy else (1, True)
@@ -116,11 +129,14 @@ class FarLead:
         return self._turn
 
     def grip(self) -> None:
-        """Take over with the next command: from the policy, or after a hold."""
+        """Take over, from the policy or after a hold.
+
+        From a policy at once where a command was sent just now, else with the next one.
+        """
         self._begin(leads=True)
 
     def give_back(self) -> None:
-        """Leave the robot to its policy with the next command; without one it holds."""
+        """Leave the robot to its policy, as :meth:`grip` takes over; else it holds."""
         self._begin(leads=False)
 
     def send(self, action: Mapping[str, float], *, picture_age_s: float | None = None) -> dict[str, float]:
@@ -140,26 +156,8 @@ class FarLead:
                 self._refusal = NoAnswerError(why, robot=self.robot, verb="leadTo")
             if self._refusal is not None:
                 raise self._refusal
-            self._seq += 1
-            command = {
-                "lead_id": self._lead_id,
-                "seq": self._seq,
-                "turn": self._turn,
-                "leads": self._leads,
-                "targets": dict(action),
-                "made": made,
-                "told": self._told,
-                "told_ago": max(made - self._told_at, 0.0),
-            }
-            if picture_age_s is not None:
-                command["picture_age_ms"] = 1000 * picture_age_s
-            self._waiting = command
-            if self._idle:
-                self._changed.notify()
-            elif self._senders < SENDERS_MAX:
-                self._senders += 1
-                name = f"lead {self.robot} {self._senders}"
-                threading.Thread(target=self._run, name=name, daemon=True).start()
+            self._newest = _Sent(dict(action), made, picture_age_s)
+            self._post(self._newest)
         return dict(self._state.written)
 
     def close(self) -> None:
@@ -188,6 +186,37 @@ class FarLead:
     def _begin(self, *, leads: bool) -> None:
         with self._changed:
             self._turn, self._leads = max(self._turn, self._state.turn) + 1, leads
+            newest = self._newest
+            if newest is None or self._refusal is not None or self._over or self._now() - newest.made > RECENT_S:
+                return
+            if self._state.state == "held":
+                # What was sent before may be what it holds for.
+                return
+            # The turn does not wait for the caller's next beat.
+            self._post(newest)
+
+    def _post(self, sent: _Sent) -> None:
+        """Hand a command to a sender; called with the lock held."""
+        self._seq += 1
+        command = {
+            "lead_id": self._lead_id,
+            "seq": self._seq,
+            "turn": self._turn,
+            "leads": self._leads,
+            "targets": dict(sent.action),
+            "made": sent.made,
+            "told": self._told,
+            "told_ago": max(sent.made - self._told_at, 0.0),
+        }
+        if sent.picture_age_s is not None:
+            command["picture_age_ms"] = 1000 * sent.picture_age_s
+        self._waiting = command
+        if self._idle:
+            self._changed.notify()
+        elif self._senders < SENDERS_MAX:
+            self._senders += 1
+            name = f"lead {self.robot} {self._senders}"
+            threading.Thread(target=self._run, name=name, daemon=True).start()
 
     def _run(self) -> None:
         while True:
