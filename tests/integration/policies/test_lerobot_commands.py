@@ -1,0 +1,228 @@
+"""LeRobot's own commands on a served robot, and the blocks of docs/lerobot.md. Run by `make lerobot`."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import json
+import re
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from fixtures.command_line import Machine
+from fixtures.waiting import eventually
+
+if importlib.util.find_spec("torch") is None or importlib.util.find_spec("lerobot_robot_strands") is None:
+    pytest.skip("LeRobot with the plug-ins is not installed; `make lerobot` runs this", allow_module_level=True)
+
+from fixtures import lerobot_checkpoints as tiny
+from lerobot_robot_strands import StrandsRobot, StrandsRobotConfig
+from lerobot_robot_strands.ending import RobotEndedError
+from lerobot_robot_strands.newest import Newest
+from lerobot_robot_strands.served import feature
+
+ROOT = Path(__file__).parents[3]
+PAGE = (ROOT / "docs" / "lerobot.md").read_text("utf-8")
+WITHIN_S = 200.0
+JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
+
+
+def commands(name: str) -> list[str]:
+    """Return the words of the page's command of that name."""
+    (line,) = re.findall(rf"^\$ ({name} .*)$", PAGE, re.MULTILINE)
+    words = shlex.split(line)
+    return [str(Path(sys.executable).with_name(words[0])), *words[1:]]
+
+
+@pytest.fixture(scope="module")
+def machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
+    """A machine with the two robots of the page, whose settings this process has as well."""
+    folder = tmp_path_factory.mktemp("lerobot")
+    there = Machine(folder / "state", HF_LEROBOT_HOME=str(folder / "home"), HF_HUB_OFFLINE="1")
+    with pytest.MonkeyPatch.context() as patch, there.serving("arm-1"), there.serving("leader-1"):
+        for name in ("STRANDS_STATE_DIR", "STRANDS_DC_PORT", "STRANDS_MESH_PORT"):
+            patch.setenv(name, there.environment[name])
+        yield there
+
+
+@pytest.fixture(scope="module")
+def folder(machine: Machine, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder in which the page's recording has been made."""
+    made = tmp_path_factory.mktemp("recorded")
+    run(machine, made, commands("lerobot-record"))
+    return made
+
+
+def run(machine: Machine, folder: Path, line: list[str]) -> None:
+    done = subprocess.run(
+        line, cwd=folder, env=machine.environment, capture_output=True, text=True, timeout=WITHIN_S, check=False
+    )
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
+
+
+@contextmanager
+def recording(machine: Machine, folder: Path, *more: str) -> Iterator[tuple[subprocess.Popen[bytes], Path]]:
+    """Run the page's recording in the block, from its second episode on; yield its process and what it says."""
+    said = folder / "said.txt"
+    line = [*commands("lerobot-record"), "--dataset.num_episodes=9", *more]
+    with said.open("w") as out:
+        process = subprocess.Popen(line, cwd=folder, env=machine.environment, stdout=out, stderr=out)
+    try:
+        eventually(
+            lambda: "Recording episode 1" in said.read_text() or process.poll() is not None, within=WITHIN_S, every=0.1
+        )
+        assert process.poll() is None, said.read_text()[-4000:]
+        yield process, said
+    finally:
+        process.kill()
+        process.wait()
+
+
+def joints(machine: Machine, peer: str) -> dict[str, float]:
+    measured: dict[str, float] = machine.json("call", peer, "getStatus")[1]["robots"]["so100"]
+    return measured
+
+
+@contextmanager
+def robot(**options: Any) -> Iterator[StrandsRobot]:
+    made = StrandsRobot(StrandsRobotConfig(peer_id="arm-1", **options))
+    made.connect()
+    try:
+        yield made
+    finally:
+        made.disconnect()
+
+
+def test_two_episodes_are_recorded_from_a_served_leader(folder: Path) -> None:
+    info = json.loads((folder / "far" / "meta" / "info.json").read_text())
+    assert info["total_episodes"] == 2
+    assert info["total_frames"] > 200
+    assert info["features"]["action"]["names"] == [f"{joint}.pos" for joint in JOINTS]
+    assert info["features"]["observation.images.wrist"]["shape"] == [480, 640, 3]
+
+
+def test_a_recording_is_replayed_and_a_robot_is_led(machine: Machine, folder: Path) -> None:
+    run(machine, folder, commands("lerobot-replay"))
+    answer = machine.json("call", "leader-1", "moveJoints", 'joints={"wrist_roll": 40}', "wait=true")[1]
+    assert answer["status"] == "success", answer
+    run(machine, folder, commands("lerobot-teleoperate"))
+    assert joints(machine, "leader-1")["wrist_roll"] > 0.6
+    assert joints(machine, "arm-1")["wrist_roll"] == pytest.approx(joints(machine, "leader-1")["wrist_roll"], abs=0.05)
+
+
+@pytest.mark.skipif(version("lerobot").startswith("0.4."), reason="lerobot-rollout is of LeRobot 0.6.1")
+def test_a_policy_drives_a_served_robot(machine: Machine, tmp_path: Path) -> None:
+    tiny.act(tmp_path / "checkpoint", images={"observation.images.wrist": (480, 640)}, joints=len(JOINTS))
+    before = joints(machine, "arm-1")
+    run(machine, tmp_path, [*commands("lerobot-rollout"), "--return_to_initial_position=false"])
+    assert joints(machine, "arm-1") != pytest.approx(before, abs=0.01)
+
+
+def test_a_stop_ends_a_recording_with_one_sentence_and_its_first_episode(machine: Machine, tmp_path: Path) -> None:
+    with recording(machine, tmp_path, "--dataset.root=stopped") as (process, said):
+        assert machine.run("stop", "arm-1").returncode == 0
+        assert process.wait(WITHIN_S) == 1
+    assert "Traceback" not in said.read_text()
+    assert "strands: arm-1/so100: The lead of lerobot is over: " in said.read_text().splitlines()[-1]
+    assert json.loads((tmp_path / "stopped" / "meta" / "info.json").read_text())["total_episodes"] == 1
+
+
+def test_a_killed_recording_leaves_the_arm_still(machine: Machine, tmp_path: Path) -> None:
+    with recording(machine, tmp_path, "--dataset.root=killed") as (process, _):
+        start = joints(machine, "arm-1")["shoulder_pan"]
+        begun = machine.json(
+            "call", "leader-1", "moveJoints", 'joints={"shoulder_pan": 100}', "speed=0.05", "wait=false"
+        )
+        assert begun[1]["status"] == "success", begun
+        eventually(lambda: abs(joints(machine, "arm-1")["shoulder_pan"] - start) > 0.05, within=30)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        time.sleep(0.3)
+        here = joints(machine, "arm-1")["shoulder_pan"]
+        leader = joints(machine, "leader-1")["shoulder_pan"]
+        eventually(lambda: abs(joints(machine, "leader-1")["shoulder_pan"] - leader) > 0.05, within=30)
+        assert joints(machine, "arm-1")["shoulder_pan"] == pytest.approx(here, abs=0.01)
+    assert machine.run("stop", "arm-1").returncode == machine.run("stop", "leader-1").returncode == 0
+    eventually(
+        lambda: not machine.json("call", "arm-1", "getStatus")[1]["control"]["held"], within=30, what="the lease"
+    )
+
+
+def test_another_holder_is_named_and_its_robot_left_alone(machine: Machine) -> None:
+    with robot(camera_names=[]), pytest.raises(RobotEndedError, match=r"strands-robots .* holds control"):
+        StrandsRobot(StrandsRobotConfig(peer_id="arm-1", camera_names=[])).connect()
+
+
+def test_an_action_goes_on_after_a_pause_and_returns_what_was_written(machine: Machine) -> None:
+    with robot(camera_names=["overview", "so100/wrist"], camera_width=320, camera_height=240) as arm:
+        assert set(arm.observation_features) == {*(f"{joint}.pos" for joint in JOINTS), "overview", "wrist"}
+        seen = arm.get_observation()
+        assert seen["wrist"].shape == arm.observation_features["wrist"] == (240, 320, 3)
+        assert seen["wrist"].dtype == np.uint8
+        start = seen["gripper.pos"]
+        for goal in (start + 0.1, start - 0.1):
+
+            def written(goal: float = goal) -> bool:
+                sent = arm.send_action({"gripper.pos": goal})["gripper.pos"]
+                at = arm.get_observation()["gripper.pos"]
+                return sent == pytest.approx(goal) and at == pytest.approx(goal, abs=0.02)
+
+            eventually(written, within=20, every=0.03)
+            time.sleep(3 * arm.config.pause_s)
+        with pytest.raises(ValueError, match=r"no joint elbow\.pos"):
+            arm.send_action({"elbow.pos": 1.0})
+
+
+def test_an_unknown_camera_and_an_unknown_robot_are_named(machine: Machine) -> None:
+    with pytest.raises(RobotEndedError, match=r"camera_names must be of .*so100/wrist.*, not attic"):
+        StrandsRobot(StrandsRobotConfig(peer_id="arm-1", camera_names=["attic"])).connect()
+    with pytest.raises(RobotEndedError, match="arm-9"):
+        StrandsRobot(StrandsRobotConfig(peer_id="arm-9")).connect()
+    with pytest.raises(ValueError, match="peer_id must name a robot"):
+        StrandsRobot(StrandsRobotConfig(peer_id=""))
+
+
+def test_what_is_too_old_is_refused_by_name() -> None:
+    values = iter([(7, 0.0)])
+
+    def read() -> tuple[int, float]:
+        for value in values:
+            return value
+        raise ValueError("the lens is covered.")
+
+    newest = Newest("the picture of arm-1's camera front", read, 100.0, 0.2)
+    try:
+        assert newest.first() == 7
+        eventually(lambda: newest.age_s > 0.2)
+        with pytest.raises(RobotEndedError, match=r"camera front is \d+ ms old and may be 200: the lens is covered\.$"):
+            newest.take()
+    finally:
+        newest.close()
+
+
+def test_joints_have_lerobots_names() -> None:
+    assert [feature(name) for name in ("gripper", "gripper.pos", "x.vel")] == ["gripper.pos", "gripper.pos", "x.vel"]
+
+
+def test_the_page_names_each_option() -> None:
+    own = {name for each in ("robot", "teleoperator") for name in _options(each)}
+    assert own == set(re.findall(r"`(\w+)`", PAGE.partition("## Options")[2].partition("- **Names")[0])) - {
+        "listCameras",
+        "WORLD",
+    }
+
+
+def _options(kind: str) -> list[str]:
+    module = importlib.import_module(f"lerobot_{kind}_strands")
+    config = getattr(module, "StrandsRobotConfig" if kind == "robot" else "StrandsTeleoperatorConfig")
+    return [name for name in config.__dataclass_fields__ if name not in {"id", "calibration_dir"}]
