@@ -63,6 +63,7 @@ class LeadMixin:
         instruction: str = "",
         max_speed: float = FULL_RANGES_PER_S,
         robot_name: str = "",
+        spare_s: float | None = None,
         request: MotionRequest | None = None,
         **policy: Any,
     ) -> Envelope:
@@ -77,12 +78,13 @@ class LeadMixin:
             instruction: the policy's task, 1 to 2000 characters.
             max_speed: whole joint ranges a second that the follower may cross, above 0, at most 20.
             robot_name: body to drive; empty for the first.
+            spare_s: seconds that a command may be older than its link's shortest way; 0.1 by default.
             request: what it begins for; made now by default.
             policy: what that policy's constructor takes besides.
         """
         name, rate = identifier("leader", leader), self.tasks.rate()
         far_s = number("stale_ms", stale_ms, low=20, high=10_000) / 1000
-        lead = Lead(name, policy=bool(policy_provider), picture_max_s=far_s)
+        lead = Lead(name, policy=bool(policy_provider), picture_max_s=far_s, spare_s=spare_s)
         meant = choice("guide", guide, GUIDES)
         fastest = number("max_speed", max_speed, above=0, high=20)
 

@@ -59,6 +59,12 @@ def world() -> Iterator[Simulation]:
     made.cleanup()
 
 
+@pytest.fixture(autouse=True)
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A busy machine is no silent leader here."""
+    monkeypatch.setattr("strands_robots.cli.far_hand.GIVE_UP_S", 10.0)
+
+
 POLICY = {"policy_provider": "mock", "instruction": "wave", "guide": "differences"}
 
 
@@ -113,21 +119,19 @@ def test_leader_that_ends_has_no_reason_and_one_that_fails_names_it(world: Simul
 
 
 @pytest.mark.parametrize("asked", [True, False])
-def test_hold_waits_for_a_person_and_is_the_end_where_nobody_is(world: Simulation, asked: bool) -> None:
+def test_hold_waits_for_a_person_and_a_leader_alone_goes_on(world: Simulation, asked: bool) -> None:
     desk = Desk(world, asked=asked)
     desk.until("led")
 
     def blind() -> bool:
         # The leader's own commands go on, and the newest wins.
         desk.lead.send({"shoulder_pan": 0.1}, picture_age_s=5.0)
-        return desk.told[-1] == "held"
+        return "held" in desk.told
 
     eventually(blind)
     if asked:
+        assert desk.told[-1] == "held"
         desk.hand.turn()
-        desk.until("led")
-        assert desk.ends == []
-    else:
-        eventually(lambda: desk.ends)
-        assert desk.ends == [("the newest picture of hand is 5000 ms old", False)]
+    desk.until("led")
+    assert desk.ends == []
     desk.hand.close()

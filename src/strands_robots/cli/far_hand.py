@@ -82,7 +82,8 @@ class LeadableHere:
 
     def lead(self, leader: str, **options: Any) -> FarLead:
         """Begin a lead; raises :class:`RefusalError`."""
-        opened = self._answer("lead", self._robot.lead(leader, **options))
+        # No network is between them: it may pause as any leader of this machine.
+        opened = self._answer("lead", self._robot.lead(leader, spare_s=GIVE_UP_S, **options))
         return FarLead(self.id, self._call, opened, policy=bool(options.get("policy_provider")))
 
     def _call(self, verb: str, arguments: Mapping[str, Any], timeout: float) -> Envelope:
@@ -104,7 +105,7 @@ class Hand:
         moved: part of a joint's range by which it takes over from a policy.
         ended: called once at the end, with the reason of a failure or nothing, and True where others stopped the robot.
         told: called with the state and the reason when who drives has changed.
-        asked: True where a person can take over after a hold; else a hold is the end.
+        asked: True where a person goes on after a hold; else the leader does so by itself, at bounded speed.
     """
 
     def __init__(
@@ -157,8 +158,9 @@ class Hand:
                     driver = state.state
                     self._told(driver, state.why)
                 if driver == "held" and not self._asked:
-                    why = state.why
-                    break
+                    # A leader without a grip goes on by itself, from where the robot is.
+                    driver = ""
+                    (self._lead.grip if self._lead.leads else self._lead.give_back)()
         except LeaderFinished:
             why = ""
         except RefusalError as exc:
@@ -273,6 +275,6 @@ class HandLeader:
 
     def _tell(self, driver: str, why: str) -> None:
         self._screen.data({"event": "turn", "state": driver, "why": why})
-        key = "" if self._keys is None else f" {'v' if self._keys.leading else 't Enter'} goes on."
+        key = " It goes on." if self._keys is None else f" {'v' if self._keys.leading else 't Enter'} goes on."
         line = _DRIVERS.get(driver, f"Held: {why}.{key}")
         self._screen.say(line, "bold" if driver in _DRIVERS else "bold yellow")

@@ -50,9 +50,15 @@ class Least:
 
 
 class CommandAges:
-    """Judges the age of each command of one leader. All times are seconds."""
+    """Judges the age of each command of one leader. All times are seconds.
 
-    def __init__(self) -> None:
+    Args:
+        spare_s: a command may be so much older than the shortest way; a leader of the robot's own process may pause
+            longer than one behind a network.
+    """
+
+    def __init__(self, spare_s: float | None = None) -> None:
+        self._spare_s = SPARE_S if spare_s is None else spare_s
         self._begin()
 
     def _begin(self) -> None:
@@ -70,7 +76,7 @@ class CommandAges:
     @property
     def limit_s(self) -> float:
         """Greatest age of a command, and longest silence before a hold."""
-        return min(self._one_way, ONE_WAY_MAX_S) + SPARE_S
+        return min(self._one_way, ONE_WAY_MAX_S) + self._spare_s
 
     def age_s(self, made: float, received: float, told: float, told_ago_s: float) -> float:
         """Return how old a command is at its arrival; infinite where that is not known.

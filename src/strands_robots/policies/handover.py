@@ -113,6 +113,7 @@ class Lead:
         leader: its name.
         policy: True where a policy drives until the leader takes over.
         picture_max_s: greatest age of the operator's newest picture.
+        spare_s: as of :class:`CommandAges`.
         now: the robot's clock, in seconds.
     """
 
@@ -122,6 +123,7 @@ class Lead:
         *,
         policy: bool = False,
         picture_max_s: float = 0.3,
+        spare_s: float | None = None,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
         self.leader = leader
@@ -132,7 +134,7 @@ class Lead:
         self.seen = threading.Event()
         """Set once a control step has read the robot."""
         self._now = now
-        self._ages = CommandAges()
+        self._ages = CommandAges(spare_s)
         self._lock = threading.Lock()
         self._picture_max_s = picture_max_s
         self._of_policy = policy

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import subprocess
 import sys
 import time
@@ -65,11 +64,21 @@ def led(robot: RemoteRobot, **how: Any) -> Iterator[FarLead]:
         assert robot.halt().stopped
 
 
-def beat(lead: FarLead, action: Mapping[str, float], until: Any, within: float = 20.0) -> None:
-    """Send a command fifty times a second until a condition is true."""
+def beat(lead: FarLead, action: Mapping[str, float], until: Any, within: float = 20.0, *, holds: bool = False) -> None:
+    """Send a command fifty times a second until a condition is true.
+
+    Args:
+        lead: of the robot.
+        action: sent each time.
+        until: the condition.
+        within: seconds.
+        holds: False to go on after the hold of a busy machine.
+    """
     deadline = time.monotonic() + within
     while not until():
         assert time.monotonic() < deadline, lead.state
+        if not holds and lead.state.state == "held" and lead.state.turn >= lead.turn:
+            (lead.grip if lead.leads else lead.give_back)()
         lead.send(action)
         time.sleep(BEAT_S)
 
@@ -88,7 +97,7 @@ def test_arm_goes_where_its_leader_is_and_holds_in_its_silence(robot: RemoteRobo
         assert lead.state.written["shoulder_pan"] == pytest.approx(target["shoulder_pan"])
         far = {**start, "shoulder_pan": -1.5}
         time.sleep(0.5)
-        beat(lead, far, lambda: lead.state.state == "held")
+        beat(lead, far, lambda: lead.state.state == "held", holds=True)
         assert "no fresh command of hand" in lead.state.why
         assert lead.state.joints["shoulder_pan"] == pytest.approx(target["shoulder_pan"], abs=0.02)
         lead.grip()
@@ -129,7 +138,8 @@ def test_policy_and_leader_drive_in_turns(site: Site) -> None:
         lead.give_back()
         beat(lead, still, lambda: lead.state.state == "policy" and lead.state.written != here)
         told = (each.payload["state"] for each in events if each.name == "turnChanged")
-        assert site.mesh or list(itertools.islice(told, 3)) == ["policy", "led", "policy"]
+        # A busy machine may have held it between two of them.
+        assert site.mesh or all(state in told for state in ("policy", "led", "policy"))
 
 
 KILLED = """
