@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import json
+import os
 import re
 import shlex
 import signal
@@ -20,6 +21,8 @@ from typing import Any
 import numpy as np
 import pytest
 from fixtures.command_line import Machine
+from fixtures.feetech_bus import write_calibration
+from fixtures.feetech_bus.process import BusProcess
 from fixtures.waiting import eventually
 
 if importlib.util.find_spec("torch") is None or importlib.util.find_spec("lerobot_robot_strands") is None:
@@ -181,6 +184,39 @@ def test_an_action_goes_on_after_a_pause_and_returns_what_was_written(machine: M
             time.sleep(3 * arm.config.pause_s)
         with pytest.raises(ValueError, match=r"no joint elbow\.pos"):
             arm.send_action({"elbow.pos": 1.0})
+
+
+def test_a_real_arm_is_led_once_its_lease_and_its_lead_are_approved(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    there = Machine(
+        tmp_path / "state", PYTHONPATH=os.pathsep.join([*filter(None, [os.getenv("PYTHONPATH")]), str(ROOT)])
+    )
+    for name in ("STRANDS_STATE_DIR", "STRANDS_DC_PORT", "STRANDS_MESH_PORT"):
+        monkeypatch.setenv(name, there.environment[name])
+    calibration = write_calibration(tmp_path / "calibration.json")
+    with BusProcess(tmp_path / "ttyACM0") as bus:
+        words = ["so101", "--peer-id", "arm-1", "--port", bus.port, "--rpc-allow", "strands-robots", "--json"]
+        options = ["--set", f"calibration={calibration}", "--set", f"calibration_dir={tmp_path}"]
+        line = [sys.executable, "-m", "fixtures.feetech_bus.patient", "strands_robots.cli", "serve", *words, *options]
+        with subprocess.Popen(line, env=there.environment, stdout=subprocess.PIPE, text=True) as served:
+            try:
+                assert served.stdout is not None
+                assert "serving" in served.stdout.readline()
+                with pytest.raises(RobotEndedError, match="needs operator approval"), robot():
+                    pass
+                for verb in ("acquireControl", "lead"):
+                    assert there.run("grant", f"{verb}@arm-1").returncode == 0
+                with robot() as arm:
+                    goal = arm.get_observation()["wrist_roll.pos"] + 5.0
+
+                    def there_now() -> bool:
+                        arm.send_action({"wrist_roll.pos": goal})
+                        return bool(arm.get_observation()["wrist_roll.pos"] == pytest.approx(goal, abs=1.0))
+
+                    eventually(there_now, within=30, every=0.03)
+            finally:
+                served.terminate()
 
 
 def test_an_unknown_camera_and_an_unknown_robot_are_named(machine: Machine) -> None:
