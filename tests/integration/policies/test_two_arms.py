@@ -154,6 +154,7 @@ def lines(block: str) -> Sequence[str]:
     return [line[2:] for line in block.splitlines() if line.startswith("$ ")]
 
 
+@pytest.mark.timeout(500)
 def test_two_arms_become_a_policy_that_is_corrected_by_hand(desk: Desk) -> None:
     (serve,), (record, check, show, train), (serve_again,), (correct,) = map(lines, blocks("console"))
     with desk.served(serve):
