@@ -228,7 +228,8 @@ def info_of(attempts: Sequence[Attempt], fps: int, robot_type: str) -> DatasetIn
         ACTION: _joints(tuple(told), units),
         f"{AGE}state": Feature("float32"),
         SUCCESS: Feature("bool"),
-        STOP: Feature("int64"),
+        # Rerun draws numbers of this kind alone.
+        STOP: Feature("float32"),
         INTERVENTION: Feature("bool"),
         ACTOR: Feature("int64", about={"codes": list(ACTORS)}),
     }
@@ -355,8 +356,8 @@ def _rows(names: Sequence[str], rows: Sequence[Mapping[str, float]]) -> NDArray[
     return table[:, 0] if len(names) == 1 else table
 
 
-def _stops(moments: NDArray[np.float64], stops: Sequence[tuple[float, int]]) -> NDArray[np.int64]:
-    column = np.zeros(len(moments), dtype=np.int64)
+def _stops(moments: NDArray[np.float64], stops: Sequence[tuple[float, int]]) -> NDArray[np.float32]:
+    column = np.zeros(len(moments), dtype=np.float32)
     for at, code in sorted(stops, key=lambda stop: _WEIGHT.index(stop[1])):
         if code == LOCKED_OUT and at - moments[-1] > AFTER_S:
             continue
