@@ -143,6 +143,20 @@ def test_a_replayed_motion_is_carried_out_once(peers: Fleet) -> None:
     assert world.steps == 2
 
 
+def test_the_commands_of_a_leader_push_no_turn_of_others_out(peers: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("strands_robots.mesh.commands.REPLAYS_MAX", 4)
+    world = World("left")
+    peers.join(world, "sim-1", "sim")
+    stranger = peers.stranger()
+    body = {"command": {"action": "step", "steps": 2}}
+    assert "result" in ask(peers, stranger, "sim-1", body)[0]
+    for number in range(8):
+        lead = {"command": {"action": "leadTo", "lead_id": "x", "seq": number}, "turn_id": f"lead-{number}"}
+        assert "result" in ask(peers, stranger, "sim-1", lead)[0]
+    assert ask(peers, stranger, "sim-1", body)[0]["error"] == "replay rejected"
+    assert world.steps == 2
+
+
 @pytest.mark.parametrize("shift", [-61.0, 6.0])
 def test_a_motion_that_is_stale_or_ahead_is_refused(peers: Fleet, shift: float) -> None:
     world = World("left")
