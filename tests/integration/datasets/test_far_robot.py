@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from unittest import mock
 
 import pytest
 from fixtures.command_line import COMMAND
@@ -24,6 +26,13 @@ from strands_robots.datasets import tables
 from strands_robots.datasets.check import check_dataset
 from strands_robots.datasets.layout import data_file
 from strands_robots.recording.file import Recorder, read_events
+
+
+@pytest.fixture(autouse=True)
+def environment() -> Iterator[None]:
+    """The settings of before: the commands that run here put theirs into this process."""
+    with mock.patch.dict(os.environ):
+        yield
 
 
 @contextmanager
