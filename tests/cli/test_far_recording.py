@@ -213,3 +213,15 @@ def test_refused_motion_of_the_mesh_is_recorded_as_that_of_device_connect(
     arm.tells("safety_event", {"event": "motion_refused", "verb": "execute"})
     arm.tells("safety_event", {"event": "emergency_stop"})
     assert set(recorder.arrived) == {"jointUnits", "motionRefused"}
+
+
+def test_robot_is_stopped_before_anything_of_its_leader_is_waited_for(arm: ServedArm) -> None:
+    hand = SimpleNamespace(
+        begin=lambda *given, **more: None,
+        cease=lambda: arm.halts.append("no more commands"),
+        end=lambda: arm.halts.append("the leader is let go"),
+    )
+    robot: Any = FarRobot(arm, arm, "", "", "wave", None, hand)  # type: ignore[arg-type]
+    robot.begin(1.0)
+    assert robot.halt("attempt ended").stopped
+    assert arm.halts == ["no more commands", "attempt ended", "the leader is let go"]

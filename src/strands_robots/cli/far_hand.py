@@ -135,9 +135,13 @@ class Hand:
         else:
             self._lead.grip()
 
+    def cease(self) -> None:
+        """Send no more; waits for nothing."""
+        self._over.set()
+
     def close(self) -> None:
         """End the commands, and the lead."""
-        self._over.set()
+        self.cease()
         self._reading.interrupt()
         self._thread.join(2 * GIVE_UP_S)
         self._reading.close()
@@ -203,6 +207,7 @@ class HandLeader:
         self._screen, self._options, self._keys = screen, options, keys
         self._manual = name in MANUAL
         self._lasting: Any = source
+        self._hand: Hand | None = None
         self._attempt = ExitStack()
 
     @property
@@ -250,7 +255,7 @@ class HandLeader:
         announce(self._screen, self.name, robot.id, source)
         moved = MOVED_MANUAL if self._manual else MOVED_ARM
         asked = self._keys is not None
-        hand = Hand(lead, source, moved=moved, ended=ended, told=self._tell, asked=asked)
+        hand = self._hand = Hand(lead, source, moved=moved, ended=ended, told=self._tell, asked=asked)
         self._attempt.callback(hand.close)
         if self._keys is not None:
             self._keys.turn = hand.turn
@@ -261,8 +266,13 @@ class HandLeader:
                 self._keys.leading = True
                 self._attempt.callback(setattr, self._keys, "leading", False)
 
+    def cease(self) -> None:
+        """Send no more commands; waits for nothing, as a stop may follow."""
+        if self._hand is not None:
+            self._hand.cease()
+
     def end(self) -> None:
-        """End the attempt; the robot holds."""
+        """End the attempt; the robot holds. It waits for the leader."""
         if self._keys is not None:
             self._keys.turn = lambda: None
         self._attempt.close()

@@ -223,9 +223,14 @@ class FarRobot:
         if self._attempt is not None:
             self._attempt.halting = True
             self._attempt.end()
-        if self._hand is not None:
+        if self._hand is None:
+            return self.remote.halt(reason)
+        self._hand.cease()
+        try:
+            return self.remote.halt(reason)
+        finally:
+            # After the stop: it waits for the leader and for the robot's answer.
             self._hand.end()
-        return self.remote.halt(reason)
 
     def hold(self, screen: Screen) -> None:
         """Tell who stopped it; its own process keeps it on the network."""

@@ -85,8 +85,14 @@ def turns_drive(  # noqa: PLR0917 - one leader, one policy, and what is done wit
         load_policy(screen, policy)
         turn.callback(hand.end)
         failures = list[str]()
+
+        def ended(why: str, halted: bool) -> None:
+            # The session tells of a stop itself, which may be the end of the attempt.
+            if not halted:
+                failures.append(why)
+
         try:
-            hand.begin(LeadableHere(led.robot), policy, task, seconds, lambda why, _: failures.append(why))
+            hand.begin(LeadableHere(led.robot), policy, task, seconds, ended)
         except RefusalError as refused:
             raise CliError(said(refused)) from refused
         return TurnsTask(led.robot.tasks.by_leader[hand.leader_id], failures)

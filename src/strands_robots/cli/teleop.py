@@ -361,8 +361,9 @@ def _lead_served(screen: Screen, network: Network, hand: HandLeader, follower: s
         verdicts = list[StopVerdict]()
 
         def stop() -> None:
-            hand.end()
+            hand.cease()
             verdicts.append(robot.halt("teleop ended"))
+            hand.end()
 
         over = options.timed(lambda: ends[0][0] or "The leader has finished." if ends else "")
         why = wait_until(screen, over, at_end=stop)
