@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from strands_robots.envelope import Envelope, error, success
 from strands_robots.policies.base import Policy
-from strands_robots.policies.handover import GUIDES, Guide, Lead, LeaderCommand, LedPolicy
+from strands_robots.policies.handover import GUIDES, LEAD_S, PICTURE_MAX_MS, Guide, Lead, LeaderCommand, LedPolicy
 from strands_robots.policies.rollout import START_S, Body, Rollout
 from strands_robots.policies.task_engine import NewTask, TaskEngine
 from strands_robots.safety.gate import MotionRequest, Permit, answered
@@ -26,13 +26,6 @@ class PolicyChoice(NamedTuple):
     provider: str
     instruction: str
     options: dict[str, Any]
-
-
-LEAD_S = 3600.0
-"""Longest lead, in seconds, where no other is asked for."""
-
-PICTURE_MAX_MS = 300.0
-"""Age of the operator's newest picture beyond which the robot holds."""
 
 
 SESSIONS_MAX = 64

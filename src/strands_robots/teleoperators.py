@@ -37,7 +37,15 @@ from typing import Any, Protocol, Self, TextIO, cast
 from strands_robots.errors import StrandsRobotsError
 from strands_robots.leader_thread import LeaderSilentError, LeaderThread
 from strands_robots.plug_ins import PlugIns
-from strands_robots.policies.base import Action, Ranges, checked_action, limited, numbers, speeds_across
+from strands_robots.policies.base import (
+    LEADER_UNBOUNDED_PER_S,
+    Action,
+    Ranges,
+    checked_action,
+    limited,
+    numbers,
+    speeds_across,
+)
 from strands_robots.policies.decoding import read_json
 from strands_robots.utils import ValidationError, mapping, missing_extra, number, shown
 
@@ -51,9 +59,6 @@ GIVE_UP_S = 0.5
 
 FULL_RANGES_PER_S = 2.0
 """Speed bound of a joint with a range, in whole ranges a second."""
-
-UNBOUNDED_PER_S = 1440.0
-"""Speed bound of a joint without a range, in its unit a second (two turns a second in degrees, twice)."""
 
 MAGNITUDE_MAX = 720.0
 """Largest target of a joint without a range, in its unit."""
@@ -136,7 +141,7 @@ class LeaderPolicy:
             key: (max(low, -MAGNITUDE_MAX) if low == -math.inf else low, MAGNITUDE_MAX if high == math.inf else high)
             for key, (low, high) in ranges.items()
         }
-        self._speeds = speeds_across(ranges, self._max_speed, UNBOUNDED_PER_S)
+        self._speeds = speeds_across(ranges, self._max_speed, LEADER_UNBOUNDED_PER_S)
         self._last = {}
         self._usable_at = self._now()
 
@@ -162,7 +167,7 @@ class LeaderPolicy:
         self._usable_at = now
         if not self._last:
             self._last = {key: value for key, value in numbers(observation).items() if key in self._ranges}
-        speeds = self._speeds or speeds_across(self._ranges, self._max_speed, UNBOUNDED_PER_S)
+        speeds = self._speeds or speeds_across(self._ranges, self._max_speed, LEADER_UNBOUNDED_PER_S)
         self._last = {**self._last, **limited(target, self._last, speeds, dt)}
         self._publish(frame)
         return {key: self._last[key] for key in target}

@@ -16,7 +16,7 @@ from strands_robots import settings
 from strands_robots.cli.far_hand import HandLeader
 from strands_robots.cli.leading import arm_options, is_own, made_follower
 from strands_robots.cli.led_robot import Serving, halted_first
-from strands_robots.cli.network import Network, answering, say_missing
+from strands_robots.cli.network import Network, answering, reached
 from strands_robots.cli.output import CliError, Screen
 from strands_robots.cli.policy import PoliciesFile
 from strands_robots.cli.record import NO_CAMERAS
@@ -103,10 +103,6 @@ def record(
         raise ValidationError("--policies goes with --policy and a robot of this command; a served one has its own.")
     if leader in (None, PAGE) and of_leader:
         raise ValidationError("--leader-id and --leader-calibration go with a leader arm.")
-    if (leader or "").startswith(MESH_PREFIX) or robot.startswith(MESH_PREFIX):
-        raise ValidationError(
-            "--leader must be of this machine, and --robot one of this command or the id of a served one."
-        )
     if leader == PAGE or not (no_network or is_own(robot)):
         if no_network or any(each is not None for each in (follower_id, calibration, peer_id)):
             raise ValidationError(
@@ -194,14 +190,11 @@ def served_robot(  # noqa: PLR0917 - one robot, and what is asked of it
         ValidationError: no id, or a camera that it does not have.
     """
     from strands_robots.cli.far_recording import FarRobot  # noqa: PLC0415 - loaded when a network is used
-    from strands_robots.fleet import Fleet  # noqa: PLC0415 - as above
 
     peer, part = _served_name(robot)
-    with network.joined(stays=True) as there:
-        there.settled()
-        say_missing(screen, there)
+    with reached(screen, network, peer) as (there, world):
         with answering(there, peer, ""):
-            far = FarRobot(Fleet(there)[peer], there, part, policy, task, cameras, hand)
+            far = FarRobot(world, there, part, policy, task, cameras, hand)
         with nullcontext() if hand is None else hand.connected():
             yield far
 

@@ -20,10 +20,10 @@ from strands_robots.cli.record import NO_CAMERAS
 from strands_robots.datasets.recorded import LED_BY_PERSON, LED_BY_RECORDING
 from strands_robots.errors import NoAnswerError, RefusalError, RobotError, UnreachableError
 from strands_robots.fleet.adapter import Detail, RobotEvent
-from strands_robots.fleet.far_lead import LOST_S
 from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.remote_robot import ROBOT_NAME, RemoteRobot
 from strands_robots.fleet.reports import runs, said
+from strands_robots.policies.handover import LOST_S
 from strands_robots.recording.cameras import OVERVIEW
 from strands_robots.recording.file import REFUSED, STEP, TURN, UNITS, Pictures, Recorder, beats, units_in
 from strands_robots.safety.stopping import StopVerdict

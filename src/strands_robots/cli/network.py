@@ -34,6 +34,7 @@ from strands_robots.utils import ValidationError, near, port, redacted
 if TYPE_CHECKING:
     from strands_robots.device_connect.backends import LinkConfig
     from strands_robots.fleet.networks import Networks
+    from strands_robots.fleet.remote_robot import RemoteRobot
     from strands_robots.mesh import Mesh
 
 logger = logging.getLogger(__name__)
@@ -254,6 +255,23 @@ def say_missing(screen: Screen, networks: Networks) -> None:
     """Name the networks that were asked for and cannot be reached."""
     for name, why in networks.missing.items():
         screen.say(plain(f"Not reached: {name}, {why}", 2000), "yellow")
+
+
+@contextmanager
+def reached(screen: Screen, network: Network, robot: str) -> Iterator[tuple[Networks, RemoteRobot]]:
+    """Join the networks to stay; yield them with the robot or world of that id.
+
+    Raises:
+        CliError: there is none, as :func:`answering` says.
+    """
+    from strands_robots.fleet import Fleet  # noqa: PLC0415 - loaded when a network is used
+
+    with network.joined(stays=True) as there:
+        there.settled()
+        say_missing(screen, there)
+        with answering(there, robot, ""):
+            found = Fleet(there)[robot]
+        yield there, found
 
 
 @contextmanager

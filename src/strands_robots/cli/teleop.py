@@ -29,7 +29,7 @@ from strands_robots.cli.leading import (
     recorded_leader,
 )
 from strands_robots.cli.led_robot import LedRobot, Serving, halted_first
-from strands_robots.cli.network import Network, answering, mesh_peer, say_missing
+from strands_robots.cli.network import Network, answering, mesh_peer, reached
 from strands_robots.cli.output import POLL_S, CliError, Exit, Screen, table, wait_until
 from strands_robots.envelope import text_of
 from strands_robots.errors import NoAnswerError, NoSuchRobotError, RefusalError
@@ -382,15 +382,9 @@ def served_follower(screen: Screen, network: Network, name: str) -> Iterator[Rem
     Raises:
         CliError: there is no such robot, or it does not answer.
     """
-    from strands_robots.fleet import Fleet  # noqa: PLC0415 - as above
-
     peer, _, part = name.partition("/")
-    identifier("FOLLOWER", peer)
-    with network.joined(stays=True) as there:
-        there.settled()
-        say_missing(screen, there)
+    with reached(screen, network, identifier("FOLLOWER", peer)) as (there, world):
         with answering(there, peer, ""):
-            world = Fleet(there)[peer]
             robots = world.robots if part else {}
         if part and part not in robots:
             known = ", ".join(f"{peer}/{each}" for each in robots) or peer

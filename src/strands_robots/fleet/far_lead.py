@@ -13,6 +13,7 @@ from typing import Any, Self
 from strands_robots.envelope import Envelope
 from strands_robots.errors import BusyError, NoAnswerError, NoSuchRobotError, RefusalError, UnreachableError
 from strands_robots.policies.base import plain_numbers
+from strands_robots.policies.handover import LOST_S
 from strands_robots.stop_log import stop_logger
 
 logger = stop_logger(__name__)
@@ -25,9 +26,6 @@ SENDERS_MAX = 16
 
 ANSWER_S = 1.0
 """Seconds in which a command has to be answered; nothing waits for it."""
-
-LOST_S = 10.0
-"""Seconds without an answer after which the lead is given up, as the robot gives up a silent leader."""
 
 RECENT_S = 0.05
 """Seconds in which a command is still the leader's place: a new turn begins with it at once."""

@@ -25,6 +25,10 @@ Ranges = Mapping[str, tuple[float, float]]
 """Lowest and highest target of every action key of a body; infinite where the body declares none."""
 
 
+LEADER_UNBOUNDED_PER_S = 1440.0
+"""Speed bound of a leader for a joint without a range, in its unit a second (two turns a second in degrees, twice)."""
+
+
 class PolicyError(StrandsRobotsError, RuntimeError):
     """A policy cannot go on; the message is logged without a traceback."""
 

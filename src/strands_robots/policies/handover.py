@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from strands_robots.policies.base import (
+    LEADER_UNBOUNDED_PER_S,
     Action,
     Counted,
     Paced,
@@ -41,14 +42,17 @@ Guide = Literal["positions", "differences"]
 
 GUIDES: tuple[Guide, ...] = ("positions", "differences")
 
+LEAD_S = 3600.0
+"""Longest lead, in seconds, where no other is asked for."""
+
+PICTURE_MAX_MS = 300.0
+"""Age of the operator's newest picture beyond which the robot holds."""
+
 FIRST_S = 2.0
 """Seconds from the start in which the first command has to come."""
 
 LOST_S = 10.0
-"""Seconds of silence after which a leader is given up."""
-
-UNBOUNDED_PER_S = 1440.0
-"""Speed bound of a key without a range, in its unit a second."""
+"""Seconds of silence after which a leader gives its robot up, and a robot its leader."""
 
 
 @dataclass(frozen=True)
@@ -338,7 +342,7 @@ class LedPolicy:
 
     def reset(self, instruction: str, ranges: Ranges) -> None:
         self._instruction, self._ranges = instruction, dict(ranges)
-        self._speeds = speeds_across(ranges, self._max_speed, UNBOUNDED_PER_S)
+        self._speeds = speeds_across(ranges, self._max_speed, LEADER_UNBOUNDED_PER_S)
         if self._policy is not None:
             self._policy.reset(instruction, ranges)
 

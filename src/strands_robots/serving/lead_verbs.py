@@ -10,10 +10,12 @@ from typing import Any
 
 from strands_robots.contract import body_of, for_request
 from strands_robots.envelope import Envelope, error
+from strands_robots.policies.handover import GUIDES, LEAD_S, PICTURE_MAX_MS
 from strands_robots.safety.gate import MotionRequest
 from strands_robots.serving.arm_verbs import JOINTS_MAX, optional, within
 from strands_robots.serving.policy_arguments import known_provider
 from strands_robots.serving.verbs import DURATION, Arguments, Kind, Verb, between, table
+from strands_robots.teleoperators import FULL_RANGES_PER_S
 from strands_robots.utils import DURATION_MAX_S, ValidationError, choice, flag, identifier, mapping, number, shown, text
 from strands_robots.verb_parameters import Parameter
 
@@ -22,8 +24,6 @@ VALUE_MAX = 1e6
 
 SEQ_MAX = 2**53
 """Largest number of a command or turn that every reader of JSON keeps exact."""
-
-GUIDES = ("positions", "differences")
 
 
 def _targets(name: str, value: object) -> dict[str, float]:
@@ -43,7 +43,7 @@ def _provider(name: str, value: object) -> str:
 
 
 def _begins(robot: Any, arguments: Arguments, request: MotionRequest | None) -> object:
-    """Begin a lead; a policy's task is left out where there is none."""
+    """Begin a lead."""
     lead = getattr(body_of(robot), "lead", None)
     if not callable(lead):
         return error("lead: this robot follows no leader elsewhere.")
@@ -76,7 +76,7 @@ LEAD_VERBS = table(
             "Let a leader elsewhere drive the robot by leadTo, alone or in turns with a policy; it holds until then.",
             (
                 Parameter("leader", str, "Name of the leader", identifier, default="leader"),
-                Parameter("duration", float, DURATION.meaning, DURATION.check, default=min(3600.0, DURATION_MAX_S)),
+                Parameter("duration", float, DURATION.meaning, DURATION.check, default=LEAD_S),
                 Parameter(
                     "guide",
                     str,
@@ -89,7 +89,7 @@ LEAD_VERBS = table(
                     float,
                     "Age of the operator's newest picture beyond which the robot holds, 20 to 10000",
                     within(20, 10_000),
-                    default=300.0,
+                    default=PICTURE_MAX_MS,
                 ),
                 Parameter(
                     "policy_provider",
@@ -110,7 +110,7 @@ LEAD_VERBS = table(
                     float,
                     "Whole joint ranges a second that the leader may cross, above 0, at most 20",
                     lambda name, value: number(name, value, above=0, high=20),
-                    default=2.0,
+                    default=FULL_RANGES_PER_S,
                 ),
             ),
             returns="lead_id, leader, robot, hz, ranges, state, why, turn, seq, joints, written, one_way_ms, now",

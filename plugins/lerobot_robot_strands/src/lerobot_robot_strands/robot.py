@@ -13,7 +13,7 @@ from lerobot.robots import Robot
 from lerobot_robot_strands.config_strands import StrandsRobotConfig
 from lerobot_robot_strands.ending import RobotEndedError
 from lerobot_robot_strands.newest import Newest
-from lerobot_robot_strands.served import ServedRobot, told
+from lerobot_robot_strands.served import MadeElsewhere, ServedRobot, told
 from strands_robots.errors import RefusalError
 
 LEADER = "lerobot"
@@ -34,7 +34,7 @@ TELLS_S = 1.0
 """Longest wait for the reason of an end."""
 
 
-class StrandsRobot(Robot):  # type: ignore[misc]
+class StrandsRobot(MadeElsewhere, Robot):  # type: ignore[misc]
     """A robot of another process, which this command holds the lease of and leads.
 
     It stands still until the first :meth:`send_action`, and holds as soon as the commands cease.
@@ -80,17 +80,6 @@ class StrandsRobot(Robot):  # type: ignore[misc]
     @property
     def is_connected(self) -> bool:
         return self._opened is not None
-
-    @property
-    def is_calibrated(self) -> bool:
-        """True: it is calibrated where it is served."""
-        return True
-
-    def calibrate(self) -> None:
-        """Do nothing: it is calibrated where it is served."""
-
-    def configure(self) -> None:
-        """Do nothing: it is configured where it is served."""
 
     def connect(self, calibrate: bool = True) -> None:
         """Take the robot's lease, and lead it from where it stands.

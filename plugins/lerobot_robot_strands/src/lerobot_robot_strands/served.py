@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cached_property
@@ -12,6 +11,7 @@ from lerobot_robot_strands.ending import RobotEndedError, at_end, one_sentence
 from strands_robots import connect
 from strands_robots.errors import RefusalError, StrandsRobotsError
 from strands_robots.fleet import Fleet, RemoteRobot
+from strands_robots.policies.base import plain_numbers
 
 OVERVIEW = "overview"
 """The camera of a simulated world that shows all of it."""
@@ -20,16 +20,6 @@ OVERVIEW = "overview"
 def feature(joint: str) -> str:
     """Return a joint as LeRobot names it: as it is where it ends as ``.pos`` or ``.vel`` do, else with ``.pos``."""
     return joint if "." in joint else f"{joint}.pos"
-
-
-def numbers(value: object) -> dict[str, float]:
-    """Return what is a finite number in a mapping of a stranger."""
-    given = value if isinstance(value, Mapping) else {}
-    return {
-        str(key): float(each)
-        for key, each in given.items()
-        if isinstance(each, int | float) and not isinstance(each, bool) and math.isfinite(each)
-    }
 
 
 @contextmanager
@@ -41,6 +31,21 @@ def told(robot: str) -> Iterator[None]:
         raise RobotEndedError(f"strands: {refused}") from refused
     except StrandsRobotsError as exc:
         raise RobotEndedError(f"strands: {robot}: {exc}") from exc
+
+
+class MadeElsewhere:
+    """What LeRobot asks of a device and a served robot has where it is served."""
+
+    @property
+    def is_calibrated(self) -> bool:
+        """True: it is calibrated where it is served."""
+        return True
+
+    def calibrate(self) -> None:
+        """Do nothing: it is calibrated where it is served."""
+
+    def configure(self) -> None:
+        """Do nothing: it is configured where it is served."""
 
 
 class ServedRobot:
@@ -117,7 +122,7 @@ class ServedRobot:
             RefusalError: it does not answer.
         """
         answer = self.remote.state()
-        return numbers(answer.get("joints")), numbers({"age": answer.get("joints_age_s")}).get("age", 0.0)
+        return plain_numbers(answer.get("joints")), plain_numbers({"age": answer.get("joints_age_s")}).get("age", 0.0)
 
     def cameras(self, names: Sequence[str] | None) -> dict[str, str]:
         """Return the cameras that are used: LeRobot's name, and the robot's own.

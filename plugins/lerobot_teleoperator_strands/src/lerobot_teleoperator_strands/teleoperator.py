@@ -7,14 +7,14 @@ from typing import Any
 from lerobot.teleoperators import Teleoperator
 from lerobot_robot_strands.ending import RobotEndedError
 from lerobot_robot_strands.newest import Newest
-from lerobot_robot_strands.served import ServedRobot
+from lerobot_robot_strands.served import MadeElsewhere, ServedRobot
 
 from lerobot_teleoperator_strands.config_strands import StrandsTeleoperatorConfig
 
 STATE_HZ = 60.0
 
 
-class StrandsTeleoperator(Teleoperator):  # type: ignore[misc]
+class StrandsTeleoperator(MadeElsewhere, Teleoperator):  # type: ignore[misc]
     """A served robot whose measured joints are the actions. It is only read, and moved by whoever else moves it.
 
     Args:
@@ -42,17 +42,6 @@ class StrandsTeleoperator(Teleoperator):  # type: ignore[misc]
     @property
     def is_connected(self) -> bool:
         return self._state is not None
-
-    @property
-    def is_calibrated(self) -> bool:
-        """True: it is calibrated where it is served."""
-        return True
-
-    def calibrate(self) -> None:
-        """Do nothing: it is calibrated where it is served."""
-
-    def configure(self) -> None:
-        """Do nothing: it is configured where it is served."""
 
     def connect(self, calibrate: bool = True) -> None:
         """Begin to read it.

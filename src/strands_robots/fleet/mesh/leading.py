@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 from strands_robots.envelope import Envelope, is_error, text_of
 from strands_robots.errors import NoAnswerError, NoSuchRobotError, RefusalError, RobotError, UnreachableError
 from strands_robots.fleet.mesh.network import MeshNetwork
-from strands_robots.policies.base import Ranges, checked_action, limited, numbers, speeds_across
+from strands_robots.policies.base import LEADER_UNBOUNDED_PER_S, Ranges, checked_action, limited, numbers, speeds_across
 from strands_robots.serving.control_leases import leases_of
-from strands_robots.teleoperators import UNBOUNDED_PER_S, BoundedLeader, LeaderFinished, LeaderPolicy
+from strands_robots.teleoperators import BoundedLeader, LeaderFinished, LeaderPolicy
 from strands_robots.utils import ValidationError, mapping, number, plain_text, shown, text
 
 if TYPE_CHECKING:
@@ -121,7 +121,7 @@ class LimitedFollower:
     def __init__(self, body: Any, max_speed: float, now: Callable[[], float] = time.monotonic) -> None:
         self._bounds: Ranges = dict(body.bounds)
         speed = number("max_speed", max_speed, above=0, high=20)
-        self._speeds = speeds_across(self._bounds, speed, UNBOUNDED_PER_S)
+        self._speeds = speeds_across(self._bounds, speed, LEADER_UNBOUNDED_PER_S)
         self._last = {key: value for key, value in body.get_joints().items() if key in self._bounds}
         self._now = now
         self._at = now()
