@@ -134,6 +134,11 @@ def profile(name: str, url: str) -> str:
     )
 
 
+def note(done: str) -> None:
+    """Say what is over and when, as all of it takes hours."""
+    print(time.strftime("%H:%M:%S"), done, file=sys.stderr, flush=True)
+
+
 def main() -> None:
     """Record, train, serve and evaluate both, and print their successes."""
     # Both import what this environment alone has.
@@ -145,16 +150,19 @@ def main() -> None:
     folder, (recordings, steps, seeds) = Path(sys.argv[1]), map(int, sys.argv[2:5])
     chosen = range(FIRST_SEED, FIRST_SEED + recordings)
     record_ours(folder / "ours", chosen)
-    print(f"recorded ours {time.process_time():.0f}", file=sys.stderr, flush=True)
+    note("our recording")
     record_theirs(folder / "theirs", chosen)
+    note("LeRobot's recording")
     found: dict[str, list[bool]] = {}
     for name in ("ours", "theirs"):
         train(split(folder / name, name), folder / f"{name}-act", steps)
+        note(f"the training on {name}")
         with serve_checkpoint(folder / f"{name}-act", state=len(JOINTS)) as url:
             file = folder / f"{name}.toml"
             file.write_text(profile(f"{name}-act", url))
             os.environ["STRANDS_POLICIES"] = str(file)
             found[name] = [run_episode(f"{name}-act", TASK, seed).success for seed in range(seeds)]
+        note(f"{sum(found[name])} of {seeds} episodes of {name}")
     print(json.dumps(found), flush=True)
 
 

@@ -10,6 +10,7 @@ import itertools
 import json
 import logging
 import math
+import random
 import sys
 import threading
 import time
@@ -31,7 +32,7 @@ from strands_robots.policies.profiles import Profile
 PEER = "arm-1"
 BEAT_S = 0.02
 LATENCY_S = 0.1
-"""Time of one inference of the policy."""
+"""Time of one inference of the policy, which varies by a fifth of it either way."""
 
 STEPS = 100
 RANGES_PER_S = 2.0
@@ -44,8 +45,10 @@ class Computed:
     """Policy that answers after its latency with a sweep from where the robot was."""
 
     uses_cameras = False
-    took: ClassVar[list[float]] = []
-    """Seconds of each inference of this process."""
+    took: ClassVar[list[tuple[float, float]]] = []
+    """Beginning of each inference of this process, in monotonic seconds, and the seconds that it took."""
+
+    draw: ClassVar[random.Random] = random.Random(7)
 
     def __init__(self) -> None:
         self._chunks = itertools.count()
@@ -54,8 +57,8 @@ class Computed:
 
     def act(self, observation: Mapping[str, Any]) -> list[Action]:
         began = time.monotonic()
-        time.sleep(LATENCY_S)
-        self.took.append(time.monotonic() - began)
+        time.sleep(LATENCY_S * self.draw.uniform(0.8, 1.2))
+        self.took.append((began, time.monotonic() - began))
         present, way = numbers(observation), 0.2 if next(self._chunks) % 2 else -0.2
         return [{key: present[key] + way * step for key in JOINTS} for step in range(1, STEPS + 1)]
 
@@ -109,8 +112,8 @@ class ServedRobot:
             apart = (abs(event.action[key] - event.observation.get(key, math.inf)) for key in event.action)
             self._steps.append(Step(time.monotonic(), event.led_by, max(apart, default=0.0)))
 
-    def inferences(self) -> list[float]:
-        """Return the seconds of each inference."""
+    def inferences(self) -> list[tuple[float, float]]:
+        """Return the beginning and the seconds of each inference."""
         # This module runs under another name than the one that the entry point has.
         policies: Any = import_module("benchmarks.takeover_children")
         return list(policies.Computed.took)

@@ -27,9 +27,9 @@ def test_takeovers_are_bounded_in_time_and_jump() -> None:
 
 
 def test_giving_back_loses_no_frame() -> None:
-    assert back_row([0.13] * 100, 0.1, 500, 500).ok
-    assert not back_row([0.13] * 100, 0.1, 500, 499).ok
-    assert not back_row([0.15] * 100, 0.1, 500, 500).ok
+    assert back_row([0.03] * 100, 500, 500).ok
+    assert not back_row([0.03] * 100, 500, 499).ok
+    assert not back_row([0.05] * 100, 500, 500).ok
 
 
 def test_one_stale_command_or_false_hold_is_a_miss() -> None:

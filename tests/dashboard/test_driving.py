@@ -290,3 +290,65 @@ def test_base_is_driven_by_bounded_speeds() -> None:
     axis = JogAxis.of({"kind": "base", "axis": "angular", "direction": -1, "speed": 1})
     verb, params = axis.stretches({})[0]
     assert (verb, params["linear"], params["angular"]) == ("drive", 0.0, -driving.ANGULAR_RAD_S)
+
+
+async def led(page: Page) -> Any:
+    return await page.control.lead(KEY, "mock", "wave", pictures=False)
+
+
+async def test_lead_needs_control_and_brings_its_lease(page: Page) -> None:
+    assert "Take control" in text_of(await led(page))
+    await page.take()
+    assert not is_error(await led(page))
+    (asked,) = page.feed.asked("lead")
+    assert asked["lease_id"] == "lease-1"
+    assert (asked["policy_provider"], asked["instruction"]) == ("mock", "wave")
+    assert "already" in text_of(await led(page))
+
+
+async def test_refusal_of_a_lead_is_the_answer(page: Page) -> None:
+    page.feed.answers["lead"] = [error("hand of arm-9 leads it")]
+    await page.take()
+    assert text_of(await led(page)) == "hand of arm-9 leads it"
+    assert "does not lead" in page.control.give_back(KEY)
+
+
+async def test_page_that_goes_while_a_lead_begins_leaves_the_robot_stopped(page: Page) -> None:
+    await page.take()
+    page.feed.slow["lead"] = asyncio.Event()
+    beginning = asyncio.create_task(led(page))
+    await until(lambda: page.feed.asked("lead"), what="the lead is asked for")
+    await page.control.leave()
+    stops = page.feed.stops
+    page.feed.slow["lead"].set()
+    assert is_error(await beginning)
+    assert page.feed.stops == stops + 1
+
+
+@pytest.mark.parametrize("kind", ["tip", "gripper", "base"])
+async def test_turns_with_a_policy_lead_joints_alone(page: Page, kind: str) -> None:
+    await page.take()
+    await led(page)
+    axis = {"tip": "x", "gripper": "", "base": "linear"}[kind]
+    assert "joints alone" in page.control.begin(KEY, {**JOG, "kind": kind, "axis": axis})
+    assert page.control.begin(KEY, JOG) == ""
+
+
+@pytest.mark.parametrize("ending", ["give", "leave", "end_lead"])
+async def test_robot_is_stopped_before_the_end_of_the_lead_is_waited_for(page: Page, ending: str) -> None:
+    await page.take()
+    await led(page)
+    await (page.control.leave() if ending == "leave" else getattr(page.control, ending)(KEY))
+    assert page.feed.stops == 1
+    assert page.control.pictures(KEY) is None
+    (over,) = [each for each in page.told if each.get("state") == "over"]
+    assert over["stopped"] is True
+
+
+async def test_lost_control_ends_the_lead_and_stops_no_other_holder(page: Page) -> None:
+    await page.take()
+    await led(page)
+    page.feed.answers["renewControl"] = [error("agent-1 holds control", code="displaced")]
+    await until(lambda: any(each.get("halted") for each in page.told), what="the lead is over")
+    assert page.feed.stops == 0
+    assert not page.control.holds(KEY)

@@ -207,6 +207,7 @@ def test_viewer_may_look_and_stop_and_move_nothing(make: Make) -> None:
         for message in (
             {"type": "call", "verb": "execute", "params": {}},
             {"type": "take"},
+            {"type": "lead", "policy": "mock", "task": "wave"},
             {"type": "forget"},
             {"type": "resume", "keys": ["dc:arm-1"], "passphrase": "x"},
         ):

@@ -174,7 +174,7 @@ def _reachable(link: LinkConfig, endpoint: str) -> str:
 
 
 PAGE_CALLER = "dashboard"
-PAGE_VERBS = ("acquireControl", "moveJoints", "moveBy", "setGripper")
+PAGE_VERBS = ("acquireControl", "moveJoints", "moveBy", "setGripper", "lead")
 """Verbs with which the operator's page drives a robot by hand."""
 
 EMULATED = ("so100", "so101")

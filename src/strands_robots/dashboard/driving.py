@@ -14,8 +14,10 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from strands_robots.dashboard.page_lead import PageLead, ShownPictures, caller
 from strands_robots.dashboard.page_robots import PageRobot
-from strands_robots.envelope import Envelope, error, is_error, text_of
+from strands_robots.envelope import Envelope, error, is_error, success, text_of
+from strands_robots.fleet.far_lead import FarLead
 from strands_robots.policies.base import plain_numbers
 from strands_robots.safety.resume import sign_take
 from strands_robots.safety.stopping import grade
@@ -49,6 +51,9 @@ LINEAR_M_S, ANGULAR_RAD_S = 0.3, 0.8
 
 TIP_AXES = ("x", "y", "z")
 KINDS = ("joint", "tip", "gripper", "base")
+
+LEADER = "page"
+TAKE_FIRST = "Take control of the robot first."
 
 SendToPage = Callable[[dict[str, Any]], None]
 
@@ -127,6 +132,7 @@ class HeldRobot:
     lease_id: str
     renewing: asyncio.Task[None] | None = None
     jog: Jogging | None = None
+    lead: PageLead | None = None
     lost: str = ""
 
 
@@ -153,7 +159,7 @@ class Jogging:
 
 
 class HandControl:
-    """Robots that one page holds, and its jogs.
+    """Robots that one page holds, its jogs, and its turns with a policy.
 
     Args:
         tell: sends a message to the page.
@@ -209,11 +215,85 @@ class HandControl:
         fields = {name: value for name, value in answer.items() if name not in (LEASE_ID, "content")}
         return {**fields, "content": [{"text": _taken(answer)}]} if "taken_from" in answer else fields
 
+    async def lead(self, key: str, policy: str, task: str, *, pictures: bool) -> Envelope:
+        """Have a policy drive a held robot, from which a push takes over.
+
+        Args:
+            policy: its name.
+            task: told to the policy.
+            pictures: the page drives by pictures, whose age bounds its commands.
+        """
+        held = self._held.get(key)
+        if held is None:
+            return error(TAKE_FIRST)
+        if held.lead is not None or held.jog is not None or key in self._taking:
+            return error(f"This page moves {held.robot.id} already.")
+        self._taking.add(key)
+        try:
+            asked = {"leader": LEADER, "guide": "differences", "policy_provider": policy, "instruction": task}
+            asked |= self._lease_of(held)
+            answer = await held.robot.call("lead", asked, ANSWER_S, moves=True)
+            if is_error(answer):
+                return answer
+            if self._held.get(key) is not held or "lead_id" not in answer:
+                # The page has gone, or has lost control: nobody is there to lead it.
+                await held.robot.stop()
+                return error(f"{held.robot.id} is not held any more, and was stopped.")
+            far = FarLead(held.robot.id, caller(held.robot), answer, policy=True)
+        finally:
+            self._taking.discard(key)
+
+        def tell(kind: str, **facts: Any) -> None:
+            self._tell({"type": kind, "key": key, **facts})
+
+        def ended(why: str, halted: bool) -> None:
+            held.lead = None
+            tell("turn", state="over", why=why, halted=halted)
+
+        held.lead = PageLead(
+            far,
+            told=lambda state, why: tell("turn", state=state, why=why),
+            let_go=lambda why: tell("let_go", why=why),
+            ended=ended,
+            pictures=ShownPictures() if pictures else None,
+        )
+        return success(f"The policy drives {held.robot.id}. A push takes over.")
+
+    def give_back(self, key: str) -> str:
+        """Leave a led robot to its policy; return why not, or ""."""
+        held = self._held.get(key)
+        if held is None or held.lead is None:
+            return "This page does not lead the robot."
+        held.lead.give_back()
+        return ""
+
+    async def end_lead(self, key: str) -> Envelope:
+        """Stop a robot that this page leads, and end the lead."""
+        held = self._held.get(key)
+        if held is None or held.lead is None:
+            return error("This page does not lead the robot.")
+        return await self._ended(key, held, held.lead)
+
+    async def _ended(self, key: str, held: HeldRobot, lead: PageLead) -> Envelope:
+        held.lead = None
+        # The stop waits for nothing of the lead.
+        answer = await held.robot.stop()
+        await lead.end()
+        self._tell({"type": "turn", "key": key, "state": "over", "why": "", "stopped": grade(answer).stopped})
+        return answer
+
+    def pictures(self, key: str) -> ShownPictures | None:
+        """Return the pictures by which the page leads a robot; None where it does not."""
+        held = self._held.get(key)
+        return held.lead.pictures if held is not None and held.lead is not None else None
+
     async def give(self, key: str) -> Envelope:
-        """Stop what this page jogs there, and give the robot back."""
+        """Stop what this page moves there, and give the robot back."""
         held = self._held.get(key)
         if held is None:
             return error("This page does not hold the robot.")
+        if held.lead is not None:
+            await self._ended(key, held, held.lead)
         if held.jog is not None:
             held.jog.release("control was given back")
             if held.jog.task is not None:
@@ -227,13 +307,17 @@ class HandControl:
         """Begin a jog of a held robot; return the reason of a refusal, or ""."""
         held = self._held.get(key)
         if held is None:
-            return "Take control of the robot first."
+            return TAKE_FIRST
         if held.jog is not None:
             return "Another jog of this robot has not ended yet."
         try:
             axis = JogAxis.of(message)
         except ValidationError as refused:
             return str(refused)
+        if held.lead is not None:
+            if axis.kind != "joint":
+                return "in turns with a policy the page leads joints alone."
+            return held.lead.push(axis.name, axis.direction, axis.speed)
         jog = held.jog = Jogging(axis, units or {})
         jog.task = asyncio.create_task(self._jog(key, held, jog))
         return ""
@@ -241,12 +325,16 @@ class HandControl:
     def beat(self, key: str) -> None:
         """Note that the button is still held down."""
         held = self._held.get(key)
+        if held is not None and held.lead is not None:
+            held.lead.beat()
         if held is not None and held.jog is not None:
             held.jog.heartbeat = time.monotonic()
 
     def release(self, key: str, why: str = "released") -> None:
-        """End the jog of a robot."""
+        """End the jog or the push of a robot."""
         held = self._held.get(key)
+        if held is not None and held.lead is not None:
+            held.lead.release(why)
         if held is not None and held.jog is not None:
             held.jog.release(why)
 
@@ -260,7 +348,7 @@ class HandControl:
         await asyncio.gather(*(self._leave(key, each) for key, each in held), return_exceptions=True)
 
     async def _leave(self, key: str, held: HeldRobot) -> None:
-        if held.jog is None:
+        if held.jog is None and held.lead is None:
             await held.robot.stop()
         await self.give(key)
 
@@ -297,6 +385,11 @@ class HandControl:
                 held.jog.release("control was lost")
             self._held.pop(key, None)
             self._tell({"type": "control", "key": key, "held": False, "text": held.lost})
+            lead, held.lead = held.lead, None
+            if lead is not None:
+                # Another holder may move it now: it is not stopped here.
+                await lead.end()
+                self._tell({"type": "turn", "key": key, "state": "over", "why": held.lost, "halted": True})
             return
 
     async def _jog(self, key: str, held: HeldRobot, jog: Jogging) -> None:

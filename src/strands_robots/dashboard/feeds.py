@@ -318,8 +318,8 @@ class FleetFeed:
             description = RobotDescription.of(functions)
             forms, known = verb_forms(description.verbs.values()), isinstance(functions, list | tuple)
             lacking = ", ".join(f"no {each}" for each in description.lacking) if known else ""
-            holdable = "acquireControl" in description.verbs
-            self._model.update(self.network, name, forms=forms, holdable=holdable, lacking=lacking)
+            can = {fact: verb in description.verbs for fact, verb in (("holdable", "acquireControl"), ("led", "lead"))}
+            self._model.update(self.network, name, forms=forms, lacking=lacking, **can)
 
     async def _ask_verbs(self, name: str) -> None:
         loop = asyncio.get_running_loop()

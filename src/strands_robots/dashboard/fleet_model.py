@@ -345,6 +345,7 @@ class FleetModel:
                 "key": key,
                 "forms": list(row.forms),
                 "holdable": row.holdable,
+                "led": row.led,
                 "limits": row.limits,
                 "units": row.units,
                 "cameras": row.cameras,

@@ -70,6 +70,7 @@ class RobotRow:
         units: unit of each joint's position, as its features name it; ``limits`` are in the same.
         forms: its verbs, as :func:`~strands_robots.dashboard.feeds.verb_forms` describes them.
         holdable: its control lease can be acquired.
+        led: it follows a leader elsewhere.
         lacking: what a device that is none of ours does not have: a lockout, a lease, a stop.
         hidden: another row shows the same robot.
         namesake: another robot of this id has a row, too.
@@ -96,6 +97,7 @@ class RobotRow:
     check_in: dict[str, Any] | None = None
     forms: tuple[Mapping[str, Any], ...] = ()
     holdable: bool = False
+    led: bool = False
     lacking: str = ""
     hidden: bool = False
     namesake: bool = False

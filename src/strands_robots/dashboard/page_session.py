@@ -17,11 +17,12 @@ from strands_robots.arm_mixin import WAIT_S
 from strands_robots.bounded_json import json_object
 from strands_robots.dashboard.access import OPERATOR, KeyRefusedError, OperatorKey
 from strands_robots.dashboard.driving import HandControl
-from strands_robots.dashboard.feeds import LEFT_OUT, FleetFeed
+from strands_robots.dashboard.feeds import CAMERA_NAME_MAX, LEFT_OUT, FleetFeed
 from strands_robots.dashboard.fleet_model import FleetModel
+from strands_robots.dashboard.page_lead import ShownPictures
 from strands_robots.dashboard.page_robots import PageRobot, PageRobots
 from strands_robots.dashboard.pictures import SMALL, SMALL_HZ, Pictures
-from strands_robots.envelope import Envelope, error, is_error, jsonable, text_of
+from strands_robots.envelope import Envelope, error, is_error, jsonable, success, text_of
 from strands_robots.recording.cameras import OVERVIEW
 from strands_robots.safety.stop_notes import Unheard, unheard_now
 from strands_robots.safety.stopping import grade
@@ -49,6 +50,8 @@ POSE_AGAIN_S = 5.0
 
 UNKNOWN_AGAIN_S = 1.0
 NOT_KNOWN = "the robot is not known yet."
+LED = "led:"
+"""Head of the pictures by which the page leads; no network has this name."""
 
 
 Message = Mapping[str, Any]
@@ -94,6 +97,7 @@ class PageSession:
         self._looking: asyncio.Task[None] | None = None
         self._calls: set[asyncio.Task[None]] = set()
         self._thumbnails: dict[str, asyncio.Task[None]] = {}
+        self._leading: asyncio.Task[None] | None = None
         self._sending = asyncio.Lock()
 
     @property
@@ -117,7 +121,7 @@ class PageSession:
         except (WebSocketDisconnect, KeyError, RuntimeError) as gone:
             logger.debug("A page is gone, or sent bytes: %s", type(gone).__name__)
         finally:
-            for task in (sending, self._looking, *self._thumbnails.values()):
+            for task in (sending, self._looking, self._leading, *self._thumbnails.values()):
                 if task is not None:
                     task.cancel()
             await asyncio.shield(asyncio.ensure_future(self._control.leave()))
@@ -192,6 +196,8 @@ class PageSession:
             self._show_thumbnails(message.get("keys"))
         elif kind == "jog":
             self._jog(key, message)
+        elif kind == "seen":
+            self._seen(key, message.get("number"))
         elif kind in _ASKED:
             if len(self._calls) >= CALLS_MAX and not (kind == "call" and message.get("verb") in STOPS):
                 self._answer(message, error("Too many calls of this page are waiting for an answer."))
@@ -300,12 +306,15 @@ class PageSession:
     async def _send_thumbnails(self, key: str) -> None:
         with contextlib.suppress(ValidationError, WebSocketDisconnect, RuntimeError):
             robot = self._server.robots.of(key)
-            head = key.encode()
             frames = self._server.pictures.camera(robot.feed, robot.id, "", SMALL, SMALL_HZ)
             async with contextlib.aclosing(frames):
-                async for frame in frames:
-                    async with self._sending:
-                        await self._socket.send_bytes(len(head).to_bytes(2, "big") + head + frame)
+                async for frame, _ in frames:
+                    await self._send_picture(key, frame)
+
+    async def _send_picture(self, head: str, jpeg: bytes) -> None:
+        encoded = head.encode()
+        async with self._sending:
+            await self._socket.send_bytes(len(encoded).to_bytes(2, "big") + encoded + jpeg)
 
     async def _call(self, key: str, message: Message) -> Envelope:
         verb, params = text("verb", message.get("verb"), longest=100), message.get("params")
@@ -354,6 +363,45 @@ class PageSession:
         answer = await self._control.give(key)
         self.tell({"type": "control", "key": key, "held": False, "text": text_of(answer)})
         return answer
+
+    async def _lead(self, key: str, message: Message) -> Envelope:
+        self._may_drive()
+        policy = text("policy", message.get("policy"), longest=128)
+        task = text("task", message.get("task"), longest=2000)
+        camera = text("camera", message.get("camera", ""), longest=CAMERA_NAME_MAX, empty=True)
+        answer = await self._control.lead(key, policy, task, pictures=bool(camera))
+        pictures = self._control.pictures(key)
+        if pictures is not None:
+            if self._leading is not None:
+                self._leading.cancel()
+            self._leading = asyncio.create_task(self._send_pictures(key, camera, pictures))
+        return answer
+
+    async def _send_pictures(self, key: str, camera: str, pictures: ShownPictures) -> None:
+        """Send numbered pictures of a camera while the page leads by them."""
+        with contextlib.suppress(ValidationError, WebSocketDisconnect, RuntimeError):
+            robot = self._server.robots.of(key)
+            while self._control.pictures(key) is pictures:
+                frames = self._server.pictures.camera(robot.feed, robot.id, camera)
+                async with contextlib.aclosing(frames):
+                    async for frame, asked in frames:
+                        if self._control.pictures(key) is not pictures:
+                            return
+                        await self._send_picture(f"{LED}{pictures.send(frame, asked)}:{key}", frame)
+                # A stream for which there was no room is asked for again.
+                await asyncio.sleep(UNKNOWN_AGAIN_S)
+
+    def _seen(self, key: str, number: object) -> None:
+        pictures = self._control.pictures(key)
+        if pictures is not None and isinstance(number, int) and not isinstance(number, bool):
+            pictures.shown(number)
+
+    async def _give_back(self, key: str, message: Message) -> Envelope:
+        why = self._control.give_back(key)
+        return error(why) if why else success("The policy has it back.")
+
+    async def _end_lead(self, key: str, message: Message) -> Envelope:
+        return await self._control.end_lead(key)
 
     async def _resume(self, key: str, message: Message) -> Envelope:
         self._may_drive()
@@ -408,6 +456,9 @@ _ASKED: dict[str, Callable[[PageSession, str, Message], Awaitable[Envelope]]] = 
     "call": PageSession._call,
     "take": PageSession._take_control,
     "give": PageSession._give_control,
+    "lead": PageSession._lead,
+    "give_back": PageSession._give_back,
+    "end_lead": PageSession._end_lead,
     "resume": PageSession._resume,
     "forget": PageSession._forget,
     "look": PageSession._look_closer,

@@ -12,7 +12,7 @@ import time
 from collections.abc import AsyncGenerator, Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 from strands_robots.dashboard.feeds import FleetFeed
 from strands_robots.envelope import Envelope, error, is_error, success, text_of
@@ -119,10 +119,18 @@ class Poses:
             process.communicate()  # closes its pipes, too
 
 
+class TimedPicture(NamedTuple):
+    """A JPEG picture, and when it was asked for (monotonic): it is no older."""
+
+    jpeg: bytes
+    asked: float
+
+
 @dataclass(slots=True)
 class _Stream:
     viewers: int = 0
     frame: bytes = b""
+    asked: float = 0.0
     number: int = 0
     changed: asyncio.Condition = field(default_factory=asyncio.Condition)
     ended: bool = False
@@ -139,13 +147,13 @@ class Pictures:
 
     def camera(
         self, feed: FleetFeed, robot: str, camera: str, size: tuple[int, int] = LARGE, hz: float = LARGE_HZ
-    ) -> AsyncGenerator[bytes, None]:
+    ) -> AsyncGenerator[TimedPicture, None]:
         """Yield the pictures of a camera as they come; a slow reader misses some."""
         params = {"camera": camera, "width": size[0], "height": size[1]}
         key = (f"{feed.network}:{robot}", camera, size)
         return self._frames(key, lambda: feed.call(robot, "getPicture", params, ANSWER_S), hz)
 
-    def pose(self, feed: FleetFeed, robot: str) -> AsyncGenerator[bytes, None]:
+    def pose(self, feed: FleetFeed, robot: str) -> AsyncGenerator[TimedPicture, None]:
         """Yield pictures of a robot's pose, drawn here; a slow reader misses some."""
         # No camera has this size.
         key = (f"{feed.network}:{robot}", "", (0, 0))
@@ -153,7 +161,7 @@ class Pictures:
 
     async def _frames(
         self, key: tuple[str, str, tuple[int, int]], ask: Callable[[], Awaitable[Envelope]], hz: float
-    ) -> AsyncGenerator[bytes, None]:
+    ) -> AsyncGenerator[TimedPicture, None]:
         stream = self._streams.get(key)
         if stream is None:
             if self._closed or len(self._streams) >= STREAMS_MAX:
@@ -169,8 +177,8 @@ class Pictures:
                         await stream.changed.wait()
                     if stream.ended:
                         return
-                    seen, frame = stream.number, stream.frame
-                yield frame
+                    seen, picture = stream.number, TimedPicture(stream.frame, stream.asked)
+                yield picture
         finally:
             stream.viewers -= 1
             if stream.viewers == 0:
@@ -189,9 +197,9 @@ class Pictures:
         self.poses.close()
 
 
-async def mjpeg(frames: AsyncGenerator[bytes, None]) -> AsyncGenerator[bytes, None]:
+async def mjpeg(pictures: AsyncGenerator[TimedPicture, None]) -> AsyncGenerator[bytes, None]:
     """Yield the parts of a ``multipart/x-mixed-replace`` answer."""
-    async for frame in frames:
+    async for frame, _ in pictures:
         head = b"--%s\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n" % (BOUNDARY, len(frame))
         # The first part is shown only once the second begins, so every part is followed by a boundary.
         yield head + frame + b"\r\n"
@@ -209,7 +217,7 @@ async def _take(stream: _Stream, ask: Callable[[], Awaitable[Envelope]], hz: flo
                 await asyncio.sleep(AGAIN_S)
                 continue
             async with stream.changed:
-                stream.frame, stream.number = frame, stream.number + 1
+                stream.frame, stream.asked, stream.number = frame, began, stream.number + 1
                 stream.changed.notify_all()
             await asyncio.sleep(max(0.0, began + 1.0 / hz - time.monotonic()))
     finally:

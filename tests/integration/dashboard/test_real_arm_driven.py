@@ -25,7 +25,8 @@ PYTHON = ROOT / ".venv-lerobot" / "bin" / "python"
 def test_joint_buttons_move_an_arm_that_is_served_for_the_page(chrome: Any, tmp_path: Path) -> None:
     assert PYTHON.exists(), "LeRobot's driver is not installed; run: make real-arm"
     machine = Machine(tmp_path)
-    line = ["serve", "so101", "--peer-id", "arm-1", "--emulated", "--drive-by-page", "--json", "--until-stdin-closes"]
+    line = ["serve", "so101", "--peer-id", "arm-1", "--emulated", "--drive-by-page"]
+    line += ["--allow-mock", "--json", "--until-stdin-closes"]
     paths = {"PYTHONPATH": os.pathsep.join((str(ROOT / "src"), str(ROOT)))}
     pipes: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     command = [str(PYTHON), "-m", "strands_robots.cli", *line]
@@ -55,6 +56,15 @@ def test_joint_buttons_move_an_arm_that_is_served_for_the_page(chrome: Any, tmp_
             eventually(
                 lambda: abs(float(shown.inner_text().split("\u00b0")[0]) - pan()) < 2, what="what is shown is so"
             )
+            page.fill("#turn-task", "wave")
+            page.get_by_role("button", name="Let the policy drive").click()
+            page.locator(".turn-said", has_text="THE POLICY DRIVES").wait_for()
+            led = page.locator(".turn-said", has_text="YOU LEAD")
+            hold_until(page, button, lambda: led.count() == 1, "the page takes over")
+            page.mouse.up()
+            picture(page, "real-arm-led")
+            page.get_by_role("button", name="End", exact=True).click()
+            page.locator(".turn-said", has_text="Over: it stands").wait_for()
     finally:
         if server is not None:
             server.close()

@@ -1,5 +1,5 @@
 // A grid of the cameras of all robots that have one, twelve at a time, one picture a second each.
-import { el, setAttr, setText } from "./dom.js";
+import { el, setAttr, setText, showJpeg } from "./dom.js";
 import { Filter } from "./filter.js";
 import { byName, kindText, nameText } from "./fleet.js";
 import { H } from "./history-strings.js";
@@ -30,9 +30,7 @@ class Tile {
   }
 
   take(bytes) {
-    const old = this.picture.src;
-    this.picture.src = URL.createObjectURL(new Blob([bytes], { type: "image/jpeg" }));
-    if (old.startsWith("blob:")) URL.revokeObjectURL(old);
+    showJpeg(this.picture, bytes);
     this.at = Date.now();
   }
 
@@ -100,10 +98,9 @@ export class CamerasView {
     this.state.send({ type: "thumbnails", keys: wanted });
   }
 
-  picture(data) {
-    const length = new DataView(data).getUint16(0), key = new TextDecoder().decode(new Uint8Array(data, 2, length));
-    const tile = this.tiles.find((each) => each.key === key);
-    if (tile && !this.paused) { tile.take(new Uint8Array(data, 2 + length)); tile.tell(false); }
+  picture({ head, jpeg }) {
+    const tile = this.tiles.find((each) => each.key === head);
+    if (tile && !this.paused) { tile.take(jpeg); tile.tell(false); }
   }
 
   draw() { for (const tile of this.tiles) tile.tell(this.paused); }

@@ -1,6 +1,6 @@
 // A card for each robot. Cards keep their size and their place: one that comes takes a free place, one that goes leaves
 // its own, and they are sorted anew only when somebody asks for it.
-import { el, setAttr, setLine, setText } from "./dom.js";
+import { el, setAttr, setLine, setText, showJpeg } from "./dom.js";
 import { ageText, byName, controlText, kindText, lockText, nameText, taskText, verdictText, verdictTone } from "./fleet.js";
 import { Filter } from "./filter.js";
 import { Halt } from "./halt.js";
@@ -152,13 +152,8 @@ export class FleetView {
 
   reconnected() { this.admitted = true; this.asked = ""; this.askThumbnails(); }
 
-  picture(data) {
-    const length = new DataView(data).getUint16(0);
-    const key = new TextDecoder().decode(new Uint8Array(data, 2, length));
-    const card = this.cards.get(key);
-    if (!card) return;
-    const old = card.picture.src;
-    card.picture.src = URL.createObjectURL(new Blob([new Uint8Array(data, 2 + length)], { type: "image/jpeg" }));
-    if (old.startsWith("blob:")) URL.revokeObjectURL(old);
+  picture({ head, jpeg }) {
+    const card = this.cards.get(head);
+    if (card) showJpeg(card.picture, jpeg);
   }
 }

@@ -11,6 +11,12 @@ if (fragment.get("token")) {
 const token = () => sessionStorage.getItem("token") || "";
 const address = (path) => `${location.protocol === "https:" ? "wss" : "ws"}://${location.host}${path}`;
 
+// A picture has a head of its own: its robot's key, or the number of a picture by which this page leads.
+function pictureOf(data) {
+  const length = new DataView(data).getUint16(0);
+  return { type: "picture", head: new TextDecoder().decode(new Uint8Array(data, 2, length)), jpeg: new Uint8Array(data, 2 + length) };
+}
+
 export class Channel extends EventTarget {
   constructor(path) {
     super();
@@ -33,8 +39,8 @@ export class Channel extends EventTarget {
     socket.onmessage = (event) => {
       if (socket !== this.socket) return;
       this.heardAt = performance.now();
-      const data = typeof event.data === "string" ? JSON.parse(event.data) : event.data;
-      this.dispatchEvent(new CustomEvent(data instanceof ArrayBuffer ? "picture" : data.type, { detail: data }));
+      const data = typeof event.data === "string" ? JSON.parse(event.data) : pictureOf(event.data);
+      this.dispatchEvent(new CustomEvent(data.type, { detail: data }));
     };
     socket.onclose = (event) => {
       if (socket !== this.socket) return;

@@ -34,6 +34,12 @@ export function setShown(node, shown) {
   setAttr(node, "data-shown", shown ? "yes" : "no");
 }
 
+export function showJpeg(image, bytes) {
+  const old = image.src;
+  image.src = URL.createObjectURL(new Blob([bytes], { type: "image/jpeg" }));
+  if (old.startsWith("blob:")) URL.revokeObjectURL(old);
+}
+
 export function typing(target) {
   return target instanceof HTMLTextAreaElement ||
     (target instanceof HTMLInputElement && !["button", "submit", "range"].includes(target.type));

@@ -3,9 +3,10 @@ import { el, setAttr, setText, setShown } from "./dom.js";
 import { controlText } from "./fleet.js";
 import { Jog } from "./jog.js";
 import { S } from "./strings.js";
+import { Turns } from "./turns.js";
 
 export class Drive {
-  constructor(fleet, state) {
+  constructor(fleet, state, pictures) {
     this.fleet = fleet;
     this.state = state;
     this.key = "";
@@ -13,6 +14,7 @@ export class Drive {
     this.groups = new Map();
     this.said = el("p", { class: "said", role: "status", "aria-live": "polite", tabindex: 0, "aria-label": S.driveSaid, text: S.jogHint });
     this.jog = new Jog(state, this.said);
+    this.turns = new Turns(state, pictures);
     this.control = el("p", { class: "control" });
     this.take = el("button", { type: "button", class: "take", text: S.take });
     this.take.addEventListener("click", () => this.toggleControl());
@@ -26,12 +28,13 @@ export class Drive {
     this.title = el("h3", { id: "drive-title", text: S.drive });
     this.speedLabel = el("label", { for: "jog-speed", text: S.speed });
     this.node = el("section", { class: "panel drive", "aria-labelledby": "drive-title" }, this.title, this.control,
-      el("div", { class: "tools" }, this.take, this.speedLabel, this.speed), this.passphraseField, this.said, this.pads);
+      el("div", { class: "tools" }, this.take, this.speedLabel, this.speed), this.passphraseField, this.said, this.turns.node, this.pads);
   }
 
   open(key) {
     this.close();
     this.jog.key = this.key = key;
+    this.turns.open(key);
     this.jog.axes = [];
     this.groups.clear();
     this.pads.replaceChildren();
@@ -43,6 +46,7 @@ export class Drive {
   // Keys and sticks move nothing that is not seen; draw() enables them again.
   close() {
     this.jog.end("hidden");
+    this.turns.close();
     this.jog.setEnabled(false);
   }
 
@@ -54,6 +58,7 @@ export class Drive {
   details(detail) {
     this.names = new Set(detail.forms.map((form) => form.name));
     this.holdable = detail.holdable;
+    this.turns.details(detail);
     if (detail.history.length) this.take_joints(detail.history[detail.history.length - 1][1]);
     this.arrange();
   }
@@ -133,7 +138,9 @@ export class Drive {
     const signable = this.hello && this.hello.operator_key && this.hello.local;
     this.passphraseField.hidden = !signable;
     setShown(this.passphraseField, !mine);
-    this.jog.setEnabled(Boolean(mine && operator && row.locked === false));
+    const may = Boolean(mine && operator && row.locked === false);
+    this.jog.setEnabled(may);
+    this.turns.draw(may, row);
     if (!operator && this.hello) setText(this.said, S.viewer);
   }
 }

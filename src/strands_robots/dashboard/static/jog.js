@@ -24,6 +24,7 @@ export class Jog {
     window.addEventListener("keyup", (event) => { if (this.now && this.now.by === event.code) this.end("released"); });
     state.addEventListener("lost", () => { this.end("lost"); this.setEnabled(false); });
     state.addEventListener("jogged", ({ detail }) => this.ended(detail));
+    state.addEventListener("let_go", ({ detail }) => { this.over(detail); setText(this.said, S.letGo(detail.why)); this.said.dataset.tone = "warn"; });
   }
 
   setEnabled(enabled) {
@@ -54,12 +55,15 @@ export class Jog {
     this.now = null;
   }
 
+  over(detail) {
+    if (!this.now || this.now.key !== detail.key) return;
+    clearInterval(this.timer);
+    if (this.now.node) this.now.node.classList.remove("held");
+    this.now = null;
+  }
+
   ended(detail) {
-    if (this.now && this.now.key === detail.key) {
-      clearInterval(this.timer);
-      if (this.now.node) this.now.node.classList.remove("held");
-      this.now = null;
-    }
+    this.over(detail);
     if (detail.began === false) { setText(this.said, S.jogRefused(detail.why)); this.said.dataset.tone = "warn"; return; }
     if (detail.stopped !== true) { setText(this.said, S.jogNotStopped(detail.text || detail.why)); this.said.dataset.tone = "bad"; return; }
     setText(this.said, detail.refused ? S.jogRefused(detail.why) : S.jogStopped(detail.why, detail.ms));

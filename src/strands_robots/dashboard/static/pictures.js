@@ -1,11 +1,11 @@
 // What a robot sees, and how it stands: two frames whose size does not depend on what is in them.
-import { el, setText } from "./dom.js";
+import { el, setText, showJpeg } from "./dom.js";
 import { S } from "./strings.js";
 
 export class Pictures {
   constructor() {
     this.hello = null;
-    this.key = "";
+    this.key = this.ledBy = "";
     this.names = [];
     this.camera = el("img", { class: "camera", alt: "" });
     this.pose = el("img", { class: "camera", alt: "" });
@@ -30,7 +30,7 @@ export class Pictures {
   }
 
   close() {
-    this.key = "";
+    this.key = this.ledBy = "";
     // A stream that nobody looks at must end: a browser has six connections to a page.
     for (const image of [this.camera, this.pose]) image.removeAttribute("src");
   }
@@ -50,7 +50,7 @@ export class Pictures {
     this.noCamera.hidden = !none;
     this.chosen.disabled = this.camera.hidden = none;
     if (none) this.camera.removeAttribute("src");
-    this.showCamera();
+    if (!this.ledBy) this.showCamera();
     this.ownPose = names.includes("overview");
     if (this.ownPose) this.showPose("");
   }
@@ -62,6 +62,27 @@ export class Pictures {
     setText(this.noPose, why && !coming ? S.noPose(why) : why);
     if (why) this.pose.removeAttribute("src");
     else if (!this.pose.getAttribute("src")) this.show(this.pose, "overview", !this.ownPose);
+  }
+
+  // While the page leads by pictures of a camera they come numbered, and each is told once it is seen.
+  led(camera) {
+    this.ledBy = camera;
+    this.chosen.value = camera;
+    this.chosen.disabled = true;
+    this.camera.removeAttribute("src");
+  }
+
+  ledNoMore() {
+    if (!this.ledBy) return;
+    this.ledBy = "";
+    this.chosen.disabled = this.names.length === 0;
+    this.showCamera();
+  }
+
+  ledPicture(jpeg, seen) {
+    if (!this.ledBy) return;
+    showJpeg(this.camera, jpeg);
+    this.camera.decode().then(seen, () => {});
   }
 
   showCamera() { if (this.chosen.value) this.show(this.camera, this.chosen.value); }

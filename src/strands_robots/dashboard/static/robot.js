@@ -36,7 +36,7 @@ export class RobotView {
     this.forget.addEventListener("click", () => this.state.ask({ type: "forget", key: this.key }));
     this.pictures = new Pictures();
     this.joints = new Joints();
-    this.drive = new Drive(fleet, state);
+    this.drive = new Drive(fleet, state, this.pictures);
     this.verbs = new Verbs(state);
     this.timeline = new Timeline(fleet);
     this.opening = el("p", { class: "small opening", role: "status" });
@@ -52,6 +52,7 @@ export class RobotView {
       this.opening, this.parts);
     state.addEventListener("pose", ({ detail }) => { if (detail.key === this.key) this.pictures.showPose(detail.why); });
     state.addEventListener("robot", ({ detail }) => { if (detail.key === this.key) this.details(detail); });
+    state.addEventListener("picture", ({ detail }) => this.ledPicture(detail));
     state.addEventListener("joints", ({ detail }) => {
       if (detail.key !== this.key) return;
       setAttr(this.columns, "data-joints", "yes");
@@ -86,6 +87,11 @@ export class RobotView {
   }
 
   watch() { if (this.key) this.state.send({ type: "watch", key: this.key }); }
+
+  ledPicture({ head, jpeg }) {
+    const [, number, key] = head.match(/^led:(\d+):(.*)$/) || [];
+    if (key && key === this.key) this.pictures.ledPicture(jpeg, () => this.state.send({ type: "seen", key, number: Number(number) }));
+  }
 
   resetPictures() { this.pictures.reset(); }
 
