@@ -7,7 +7,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 from fixtures.command_line import Machine
@@ -15,18 +15,24 @@ from fixtures.page_driving import answer, hold_until, take
 from fixtures.page_site import PageServer, picture, shows
 from fixtures.waiting import eventually
 
-from strands_robots.device_connect import FleetClient, loopback_config
-
 pytestmark = [pytest.mark.system, pytest.mark.timeout(300)]
 
 STATE = ".turn-said"
 
 
-@pytest.fixture(scope="module")
-def site(chrome: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Any, FleetClient]]:
-    """A page, and a client that reads the arm."""
+class Site(NamedTuple):
+    """A page and the network of its arm."""
+
+    page: Any
+    network: str
+
+
+@pytest.fixture(scope="module", params=["dc", "mesh"])
+def site(request: pytest.FixtureRequest, chrome: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
+    """A page that shows the arm on one of the networks."""
+    mesh = ["--mesh"] if request.param == "mesh" else []
     machine = Machine(tmp_path_factory.mktemp("turns"))
-    line = ["serve", "so100", "--peer-id", "arm-1", "--json", "--until-stdin-closes"]
+    line = ["serve", "so100", "--peer-id", "arm-1", "--json", "--until-stdin-closes", *mesh]
     pipes: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     arm = subprocess.Popen([sys.executable, "-m", "strands_robots.cli", *line], env=machine.environment, **pipes)
     with ExitStack() as stack:
@@ -34,34 +40,33 @@ def site(chrome: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tupl
         stack.callback(arm.communicate, timeout=60)
         assert arm.stdout is not None
         assert json.loads(arm.stdout.readline())["event"] == "serving"
-        server = PageServer(machine)
+        server = PageServer(machine, *mesh)
         stack.callback(server.close)
         page = chrome.new_page(viewport={"width": 1280, "height": 1000})
+        stack.callback(page.close)
         page.goto(server.url)
         page.locator(".card").wait_for(timeout=60_000)
-        client = stack.enter_context(
-            FleetClient(loopback_config(int(machine.environment["STRANDS_DC_PORT"])), "reader")
-        )
-        yield page, client
+        yield Site(page, request.param)
 
 
 def said(page: Any, words: str) -> None:
     page.locator(STATE, has_text=words).wait_for(timeout=30_000)
 
 
-def test_push_takes_over_from_the_policy_and_a_button_gives_back(site: tuple[Any, FleetClient]) -> None:
-    page, client = site
+def test_push_takes_over_from_the_policy_and_a_button_gives_back(site: Site) -> None:
+    page, network = site
 
     def pan() -> float:
-        return float(client.call("arm-1", "getPose")["joints"]["shoulder_pan"])
+        return float(page.locator(".bar .value").first.inner_text().rstrip("\u00b0"))
 
-    button = take(page, "shoulder_pan +")
+    button = take(page, "shoulder_pan +", network=network)
+    shows(page, "/\\d/.test(document.querySelector('.bar .value')?.textContent)")
     start = pan()
     page.fill("#turn-task", "wave")
     page.get_by_role("button", name="Let the policy drive").click()
     said(page, "THE POLICY DRIVES")
     picture(page, "turn-policy")
-    eventually(lambda: abs(pan() - start) > 1, what="the policy moves the arm")
+    eventually(lambda: abs(pan() - start) > 0.5, what="the policy moves the arm")
 
     before = pan()
     hold_until(page, button, lambda: "YOU LEAD" in page.locator(STATE).inner_text(), "the page leads")
@@ -76,8 +81,8 @@ def test_push_takes_over_from_the_policy_and_a_button_gives_back(site: tuple[Any
     said(page, "Over: it stands")
 
 
-def test_hand_that_drives_by_pictures_is_held_where_they_show_nothing_new(site: tuple[Any, FleetClient]) -> None:
-    page, _ = site
+def test_hand_that_drives_by_pictures_is_held_where_they_show_nothing_new(site: Site) -> None:
+    page, network = site
     page.select_option("#turn-camera", "front")
     page.get_by_role("button", name="Let the policy drive").click()
     said(page, "THE POLICY DRIVES")
@@ -91,6 +96,6 @@ def test_hand_that_drives_by_pictures_is_held_where_they_show_nothing_new(site: 
     page.get_by_role("button", name="Give back to the policy").click()
     said(page, "THE POLICY DRIVES")
     page.keyboard.press("Space")
-    answer(page, "arm-1", "stopped")
+    answer(page, "arm-1", "stopped", network)
     said(page, "Over")
     shows(page, "!document.querySelector('.pictures .camera').src.startsWith('blob:')")
