@@ -138,11 +138,12 @@ def test_waiting_motions_take_no_thread_of_the_loop(
             released.set()
         assert await asyncio.gather(*waiting) == [far] * 40
 
+    before = threading.enumerate()
     with Networks([near, far]) as networks:
         networks.settled()
         asyncio.run(work(networks))
     eventually(
-        lambda: not [each for each in threading.enumerate() if each.name.startswith("networks")],
+        lambda: not [each for each in threading.enumerate() if each.name.startswith("networks") and each not in before],
         what="the end of the threads",
     )
 
