@@ -134,7 +134,7 @@ def test_read_that_asks_for_a_permit_is_refused() -> None:
     def look(self: object, permit: Permit) -> None: ...
 
     look.__annotations__["permit"] = Permit
-    with pytest.raises(ValidationError, match="declared a read"):
+    with pytest.raises(ValidationError, match="moves nothing"):
         declared(look, motion=False).check()
 
 

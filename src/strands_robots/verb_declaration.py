@@ -62,9 +62,10 @@ class DeclaredVerb:
     Attributes:
         function: as it was written.
         name: on the wire.
-        motion: False for a read.
+        motion: False for a read, and for a change.
         lasts: seconds that it may take to return.
         wrapper: the method that ``@verb`` made of the function.
+        changes: it changes something and moves nothing.
     """
 
     function: Callable[..., Any]
@@ -72,6 +73,7 @@ class DeclaredVerb:
     motion: bool
     lasts: float
     wrapper: Callable[..., Any]
+    changes: bool = False
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -118,7 +120,7 @@ class DeclaredVerb:
     def check(self) -> None:
         """Raise :class:`ValidationError` where the verb cannot be served."""
         if self.permit and not self.motion:
-            raise ValidationError(f"{self.method} is declared a read (motion=False), and a read gets no Permit.")
+            raise ValidationError(f"{self.method} moves nothing (motion=False), and gets no Permit.")
         _ = self.parameters
 
     def carry_out(
@@ -197,10 +199,12 @@ def verb(function: F) -> F: ...
 
 
 @overload
-def verb(*, motion: bool = True, name: str = "", lasts: float = 0.0) -> Callable[[F], F]: ...
+def verb(*, motion: bool = True, name: str = "", lasts: float = 0.0, changes: bool = False) -> Callable[[F], F]: ...
 
 
-def verb(function: F | None = None, *, motion: bool = True, name: str = "", lasts: float = 0.0) -> F | Callable[[F], F]:
+def verb(
+    function: F | None = None, *, motion: bool = True, name: str = "", lasts: float = 0.0, changes: bool = False
+) -> F | Callable[[F], F]:
     """Declare a method as a verb of its robot, for every network and face.
 
     Args:
@@ -210,11 +214,15 @@ def verb(function: F | None = None, *, motion: bool = True, name: str = "", last
         name: on the wire, in camelCase; made from the method's name by default.
         lasts: seconds that it may take to return, 0 to 3600, besides the 10 s that every motion has. After that its
             permit is void.
+        changes: True, with ``motion=False``, for what moves nothing and is not for every caller, such as a setting:
+            callers are authorized as for a motion, and lease, lockout and approval do not concern it.
 
     Raises:
         ValidationError: an argument outside its domain, or ``function`` is no plain method.
     """
     flag("motion", motion)
+    if flag("changes", changes) and motion:
+        raise ValidationError("changes=True goes with motion=False: a motion changes something anyway.")
     seconds = number("lasts", lasts, low=0.0, high=DURATION_MAX_S)
 
     def declare(method: F) -> F:
@@ -231,7 +239,7 @@ def verb(function: F | None = None, *, motion: bool = True, name: str = "", last
         def call(self: object, *values: object, **named: object) -> Any:
             return declared.called(self, *values, **named)
 
-        declared = DeclaredVerb(method, _wire_name(name, method.__name__), motion, seconds, call)
+        declared = DeclaredVerb(method, _wire_name(name, method.__name__), motion, seconds, call, changes)
         vars(call)[MARK] = declared
         return call  # type: ignore[return-value]  # the same signature, its permit left out by callers
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import io
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,13 +12,18 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from fixtures.waiting import eventually
 from rich.console import Console
 
 from strands_robots.cli.dataset_recording import Attempts, record_attempts
 from strands_robots.cli.output import CliError, Screen
+from strands_robots.cli.recorder_device import RecorderDevice
+from strands_robots.cli.recording_state import RecordingState
 from strands_robots.datasets import tables
 from strands_robots.datasets.check import check_dataset
+from strands_robots.datasets.layout import data_file
 from strands_robots.datasets.session import RecordingSession
+from strands_robots.envelope import is_error
 from strands_robots.recording.file import Pictures, Recorder
 
 FPS = 30
@@ -110,3 +116,61 @@ def test_leader_that_failed_costs_no_saved_episode(tmp_path: Path, arm: Arm) -> 
             record_attempts(Screen(console=Console(file=io.StringIO())), arm, recording, attempts)
         assert recording.episodes == 2
     assert tables.read_frames(tmp_path / "data/chunk-000/file-001.parquet")["next.success"].tolist() == [False] * 10
+
+
+class Steady:
+    """A task that runs until it is told to end."""
+
+    voided, error = False, ""
+
+    def __init__(self) -> None:
+        self.running = True
+
+
+def test_words_of_the_network_are_those_of_the_keys(tmp_path: Path, arm: Arm) -> None:
+    device = RecorderDevice(state := RecordingState(), "arm-1", "wave")
+    screen = Screen(console=Console(file=io.StringIO()))
+    attempts = Attempts(9, Steady, FPS, None, 60.0, success=False, asked=True, state=state)
+    with session(tmp_path) as recording:
+        thread = threading.Thread(target=record_attempts, args=(screen, arm, recording, attempts))
+        thread.start()
+        for judged in (lambda: device.keep_episode(True), device.redo_episode, lambda: device.keep_episode(False)):
+            for word in (device.begin_episode, judged):
+                eventually(lambda word=word: not is_error(word()), what="a moment that it fits")  # type: ignore[misc]
+        eventually(lambda: device.get_recording()["said"].endswith("no success."), what="the last episode")
+        assert (device.get_recording()["episode"], device.get_recording()["saved"]) == (3, 2)
+        eventually(lambda: not is_error(device.end_recording()), what="the end")
+        thread.join(10)
+        assert not thread.is_alive()
+        assert recording.episodes == 2
+    worth = [bool(tables.read_frames(tmp_path / data_file(number))["next.success"][-1]) for number in (0, 1)]
+    assert worth == [True, False]
+    assert device.get_recording()["state"] == "over"
+
+
+def test_attempts_by_time_wait_for_nobody_and_take_a_word(tmp_path: Path, arm: Arm) -> None:
+    device = RecorderDevice(state := RecordingState(), "arm-1", "wave")
+    screen = Screen(console=Console(file=io.StringIO()))
+    attempts = Attempts(2, Steady, FPS, 600.0, 600.0, success=True, state=state)
+    with session(tmp_path) as recording:
+        thread = threading.Thread(target=record_attempts, args=(screen, arm, recording, attempts))
+        thread.start()
+        eventually(lambda: not is_error(device.keep_episode(False)), what="the first, which nobody began")
+        eventually(lambda: device.get_recording().get("begins_in_s", 0) > 500, what="the pause")
+        assert not is_error(device.begin_episode()), "who has put things back need not wait"
+        eventually(lambda: not is_error(device.end_recording()), what="the end")
+        thread.join(10)
+        assert recording.episodes == 1
+
+
+def test_stop_of_the_recording_is_an_episode_without_success_and_its_end(tmp_path: Path, arm: Arm) -> None:
+    device = RecorderDevice(state := RecordingState(), "arm-1", "wave")
+    attempts = Attempts(9, Steady, FPS, None, 0.0, success=True, state=state)
+    stopper = threading.Thread(target=lambda: (eventually(lambda: state.runs), device.halt("stop by desk")))
+    stopper.start()
+    with session(tmp_path) as recording:
+        with pytest.raises(CliError, match="the recording was stopped: stop by desk"):
+            record_attempts(Screen(console=Console(file=io.StringIO())), arm, recording, attempts)
+        assert recording.episodes == 1
+    stopper.join(10)
+    assert not tables.read_frames(tmp_path / data_file(0))["next.success"].any()

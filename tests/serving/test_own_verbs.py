@@ -71,6 +71,7 @@ def test_motion_that_no_stop_would_end_is_refused_at_registration() -> None:
     with pytest.raises(ValidationError, match="a motion that no stop would end"):
         own_verbs(with_verb(brew))
     assert own_verbs(with_verb(brew, motion=False))["brew"].kind is Kind.READ
+    assert own_verbs(with_verb(brew, motion=False, changes=True))["brew"].kind is Kind.CHANGE
 
     class Halts:
         def halt(self, reason: str = "") -> dict[str, Any]:

@@ -36,6 +36,7 @@ class AttemptProgress:
         self._began = time.monotonic()
         self._pictures: dict[str, float] = {}
         self._steps: deque[tuple[float, int]] = deque([(self._began, 0)])
+        self._counting = threading.Lock()
 
     def take_picture(self, camera: str, picture: Any, at: float | None) -> None:
         """Note when a picture had arrived, and hand it to the encoder."""
@@ -97,12 +98,14 @@ class AttemptProgress:
                 screen.say(self.line())
 
     def _rate(self, moment: float) -> float:
-        count = sum(each for topic, each in list(self._recorder.counts.items()) if topic.endswith(f"/{STEP}"))
-        if not count:
-            # The rate is that of a robot that moves.
-            self._steps.clear()
-        self._steps.append((moment, count))
-        while len(self._steps) > 2 and moment - self._steps[1][0] >= RATE_S:
-            self._steps.popleft()
-        (since, before), (_, count) = self._steps[0], self._steps[-1]
+        # The screen asks, and who looks from the network.
+        with self._counting:
+            count = sum(each for topic, each in list(self._recorder.counts.items()) if topic.endswith(f"/{STEP}"))
+            if not count:
+                # The rate is that of a robot that moves.
+                self._steps.clear()
+            self._steps.append((moment, count))
+            while len(self._steps) > 2 and moment - self._steps[1][0] >= RATE_S:
+                self._steps.popleft()
+            (since, before), (_, count) = self._steps[0], self._steps[-1]
         return (count - before) / (moment - since) if moment > since else 0.0

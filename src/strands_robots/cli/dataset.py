@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -65,7 +65,12 @@ def record(
     episodes: Annotated[int, typer.Option("--episodes", help="How many to save.")] = 50,
     fps: Annotated[int, typer.Option("--fps", help="Frames a second.")] = 30,
     episode_s: Annotated[
-        float | None, typer.Option("--episode-s", help="Longest time of one; needed without a terminal.", metavar="S")
+        float | None,
+        typer.Option(
+            "--episode-s",
+            help="Longest time of one; without it, and a terminal, the page's buttons end it.",
+            metavar="S",
+        ),
     ] = None,
     pause_s: Annotated[
         float, typer.Option("--pause-s", help="Between two, to put things back, without a terminal.", metavar="S")
@@ -86,6 +91,8 @@ def record(
     """Record episodes of a robot that is led. What is saved outlives a kill."""
     from strands_robots.cli.dataset_recording import Attempts, Keys, record_attempts  # noqa: PLC0415 - an extra
     from strands_robots.cli.local_recording import LocalAttempts, leader_drives, policy_drives, turns_drive  # noqa: PLC0415 - as above
+    from strands_robots.cli.recorder_device import recorder_served  # noqa: PLC0415 - as above
+    from strands_robots.cli.recording_state import RecordingState  # noqa: PLC0415 - as above
     from strands_robots.datasets.session import RecordingSession  # noqa: PLC0415 - as above
     from strands_robots.recording.cameras import chosen_frames  # noqa: PLC0415 - as above
 
@@ -93,10 +100,11 @@ def record(
     number("--pause-s", pause_s, low=0, high=3600)
     longest = None if episode_s is None else number("--episode-s", episode_s, above=0, high=3600)
     _check_drivers(robot, leader, policy)
-    asked = screen.live and sys.stdin.isatty()
-    if not asked and longest is None:
-        raise ValidationError("--episode-s is needed without a terminal: nobody says when an attempt is over.")
-    keys = Keys() if asked else None
+    keys = Keys() if screen.live and sys.stdin.isatty() else None
+    if keys is None and longest is None and no_network:
+        raise ValidationError("--episode-s is needed without a terminal and a network: nobody ends an attempt.")
+    asked, state = keys is not None or longest is None, RecordingState(keys)
+    buttons = partial(recorder_served, screen, network, needed=asked and keys is None)
     names = None if cameras is None else [name for name in cameras.split(",") if name]
     of_leader = arm_options("", leader_id, leader_calibration)
     if policies is not None and not (policy and is_own(robot)):
@@ -110,8 +118,8 @@ def record(
             )
         hand = HandLeader(screen, leader, of_leader, keys) if leader not in (None, PAGE) else None
         with served_robot(screen, network, robot, policy or "", task, names, hand) as far:
-            attempts = Attempts(episodes, partial(far.begin, longest), fps, longest, pause_s, success, keys)
-            _record_served(screen, folder, far, task, attempts)
+            attempts = Attempts(episodes, partial(far.begin, longest), fps, longest, pause_s, success, asked, state)
+            _record_served(screen, folder, far, task, attempts, buttons)
         return
     how = Serving.of(network, peer_id, None, alone=no_network)
     if policies is not None:
@@ -128,12 +136,13 @@ def record(
     with (
         RecordingSession(folder, fps, task, kind, lambda said: screen.say(said, "yellow")) as session,
         made_follower(screen, robot, arm, None, how) as led,
+        nullcontext() if no_network else buttons(led.peer_id, state, task, on_mesh=network.mesh),
         drives(led) as driver,
         halted_first(led.robot),
     ):
         frames = None if names == [NO_CAMERAS] else chosen_frames(led.robot, names)
-        local = LocalAttempts(led, frames, driver)
-        record_attempts(screen, local, session, Attempts(episodes, driver.begin, fps, longest, pause_s, success, keys))
+        attempts = Attempts(episodes, driver.begin, fps, longest, pause_s, success, asked, state)
+        record_attempts(screen, LocalAttempts(led, frames, driver), session, attempts)
         count = session.episodes
     _tell_dataset(screen, folder, count)
 
@@ -152,15 +161,23 @@ def _check_drivers(robot: str, leader: str | None, policy: str | None) -> None:
         raise ValidationError("--leader must be of this machine, and --robot one of this command or a served one's id.")
 
 
-def _record_served(screen: Screen, folder: Path, far: FarRobot, task: str, attempts: Attempts) -> None:
+def _record_served(  # noqa: PLR0917 - one robot, and what is done with it
+    screen: Screen,
+    folder: Path,
+    far: FarRobot,
+    task: str,
+    attempts: Attempts,
+    buttons: Callable[..., AbstractContextManager[None]],
+) -> None:
     """Record attempts of a robot that another process serves."""
     from strands_robots.cli.dataset_recording import record_attempts  # noqa: PLC0415 - an extra
     from strands_robots.datasets.session import RecordingSession  # noqa: PLC0415 - as above
 
     with (
         RecordingSession(folder, attempts.fps, task, far.kind, lambda said: screen.say(said, "yellow")) as session,
-        halted_first(far),
         answering(far.networks, far.name, ""),
+        buttons(far.remote.id, attempts.state, task, on_mesh=far.on_mesh),
+        halted_first(far),
         far.held(),
     ):
         record_attempts(screen, far, session, attempts)

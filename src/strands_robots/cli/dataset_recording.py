@@ -7,15 +7,14 @@ import select
 import sys
 import termios
 import time
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
-from dataclasses import dataclass, replace
-from enum import Enum
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 from strands_robots.cli.attempt_progress import AttemptProgress
-from strands_robots.cli.output import POLL_S, CliError, Screen, wait_until
+from strands_robots.cli.output import CliError, Screen, wait_until
+from strands_robots.cli.recording_state import RecordingState, Said, Stage, Words
 from strands_robots.datasets.recorded import ATTEMPT_ENDED
 from strands_robots.recording.file import Pictures, Recorder
 from strands_robots.safety.stopping import StopVerdict
@@ -28,15 +27,6 @@ FIRST_PICTURE_S = 10.0
 """Longest wait for the cameras before an attempt: the first picture of a simulation may take seconds."""
 
 
-class Said(Enum):
-    """Word of a person on an attempt, by the key before Enter."""
-
-    SUCCESS = ""
-    FAILURE = "f"
-    REDO = "r"
-    END = "q"
-
-
 KEYS = "Enter keeps it as a success, f Enter as a failure, r Enter redoes it, q Enter drops it and ends."
 
 KEYBOARD = "Enter keeps it as a success, x as a failure, z redoes it, c drops it and ends."
@@ -45,60 +35,63 @@ KEYBOARD = "Enter keeps it as a success, x as a failure, z redoes it, c drops it
 _KEYBOARD = {"\n": Said.SUCCESS, "x": Said.FAILURE, "z": Said.REDO, "c": Said.END}
 
 
-class Keys:
+class Keys(Words):
     """Words of the person at the terminal, by lines, or by the keys of a leader.
 
     Args:
         fd: of the terminal; standard input by default.
     """
 
+    begins = "Enter begins, q Enter ends."
+
     def __init__(self, fd: int | None = None) -> None:
+        super().__init__()
         self.leading = False
         """True while a keyboard leads: its keys come by :meth:`pressed`, and no line is read."""
         self._fd = sys.stdin.fileno() if fd is None else fd
         self.turn: Callable[[], None] = lambda: None
         """Takes the robot over from its policy, or gives it back, by the key ``t`` Enter, or ``v`` of a keyboard."""
-        self._words: deque[Said] = deque()
         self._line = b""
+
+    @property
+    def judges(self) -> str:
+        """Words that judge an attempt, for the screen."""
+        return KEYBOARD if self.leading else KEYS
 
     def pressed(self, key: str) -> None:
         """Note a key of the leader."""
         if key.lower() == "v":
             self.turn()
         if (word := _KEYBOARD.get(key.lower())) is not None:
-            self._words.append(word)
+            self.take(word)
 
     def said(self) -> Said | None:
         """Return the next word of the person; None while there is none."""
         if not self.leading:
             self._read()
-        return self._words.popleft() if self._words else None
+        return super().said()
 
     def forget(self) -> None:
         """Forget what was typed until now, also without an Enter."""
         if os.isatty(self._fd):
             termios.tcflush(self._fd, termios.TCIFLUSH)
-        self._words.clear()
+        super().forget()
         self._line = b""
-
-    def wait(self) -> Said:
-        """Wait for a word."""
-        while (word := self.said()) is None:
-            time.sleep(POLL_S)
-        return word
 
     def _read(self) -> None:
         while select.select([self._fd], [], [], 0)[0]:
             data = os.read(self._fd, 4096)
             if not data:
-                self._words.append(Said.END)
+                self.take(Said.END)
                 return
             *lines, self._line = (self._line + data).split(b"\n")
             for line in lines:
                 said = line.decode("utf-8", "replace").strip().lower()
                 if said == "t":
                     self.turn()
-                self._words.extend(each for each in Said if each.value == said)
+                for each in Said:
+                    if each.value == said:
+                        self.take(each)
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +105,8 @@ class Attempts:
         seconds: longest time of one; None for as long as the person likes.
         pause_s: between two, where nobody is asked.
         success: of an attempt that ends by its time.
-        keys: of the person; None for nobody.
+        asked: a person begins each; else time does.
+        state: told to the network, with the person's words.
     """
 
     count: int
@@ -121,7 +115,13 @@ class Attempts:
     seconds: float | None
     pause_s: float
     success: bool
-    keys: Keys | None = None
+    asked: bool = False
+    state: RecordingState = field(default_factory=RecordingState)
+
+    def tell(self, screen: Screen, text: str, style: str) -> None:
+        """Say what became of an attempt, here and to who asks over the network."""
+        self.state.note(text)
+        screen.say(text, style)
 
 
 class AttemptRobot(Protocol):
@@ -168,21 +168,28 @@ def record_attempts(screen: Screen, led: AttemptRobot, session: RecordingSession
     from strands_robots.datasets.encoder import CameraEncoder  # noqa: PLC0415 - an extra
 
     with CameraEncoder(attempts.fps) if led.has_cameras else nullcontext() as encoder:
-        _record(screen, led, session, attempts, encoder)
+        try:
+            _record(screen, led, session, attempts, encoder)
+        finally:
+            attempts.state.enter(Stage.OVER)
 
 
 def _record(
     screen: Screen, led: AttemptRobot, session: RecordingSession, attempts: Attempts, encoder: CameraEncoder | None
 ) -> None:
-    saved = 0
+    saved, pause_s, state = 0, 0.0, attempts.state
     while saved < attempts.count:
-        if not _ready(screen, attempts, saved):
+        state.count(attempts.count, saved)
+        if not _ready(screen, attempts, saved, pause_s):
             return
+        pause_s = attempts.pause_s
         ended = _attempt(screen, led, session, attempts, encoder)
         if ended.stopped_by:
             try:
-                _save(screen, session, success=False)
+                _save(screen, session, attempts, success=False)
             finally:
+                state.note(f"Stopped from the network: {ended.stopped_by}")
+                state.enter(Stage.STOPPED)
                 # Also where the disk is full: a locked robot is resumed on its network.
                 led.hold(screen)
             raise CliError(f"Stopped from the network: {ended.stopped_by}")
@@ -190,10 +197,10 @@ def _record(
             raise CliError("The follower did not confirm its stop; the attempt is saved at the next start.")
         if ended.said in (Said.REDO, Said.END):
             session.discard()
-            screen.say("Dropped.", "yellow")
+            attempts.tell(screen, "Dropped.", "yellow")
         else:
-            lacking = _save(screen, session, success=ended.said is Said.SUCCESS)
-            if lacking and attempts.keys is None:
+            lacking = _save(screen, session, attempts, success=ended.said is Said.SUCCESS)
+            if lacking and not attempts.asked:
                 failed = f"The attempt failed: {ended.failed.rstrip('.')}. " if ended.failed else ""
                 raise CliError(f"{failed}{lacking} Nothing more is recorded.")
             saved += not lacking
@@ -214,16 +221,24 @@ class _Ended:
     verdict: StopVerdict | None
 
 
-def _ready(screen: Screen, attempts: Attempts, saved: int) -> bool:
+def _ready(screen: Screen, attempts: Attempts, saved: int, pause_s: float) -> bool:
     """Wait until the next attempt may begin; False where none shall."""
-    if attempts.keys is not None:
-        attempts.keys.forget()
-        screen.say(f"Attempt {saved + 1} of {attempts.count}: Enter begins, q Enter ends.", "bold")
-        return attempts.keys.wait() is not Said.END
-    if saved:
-        over = time.monotonic() + attempts.pause_s
-        return wait_until(screen, lambda: "over" if time.monotonic() >= over else "") != "Ctrl-C."
-    return True
+    words, begins_at = attempts.state.words, None if attempts.asked else time.monotonic() + pause_s
+    attempts.state.wait_for_begin(begins_at)
+    if attempts.asked:
+        screen.say(f"Attempt {saved + 1} of {attempts.count}: {words.begins}", "bold")
+    said = list[Said]()
+
+    def over() -> str:
+        word = words.said()
+        if word is not None:
+            said.append(word)
+            return "said"
+        return "" if begins_at is None or time.monotonic() < begins_at else "over"
+
+    why = wait_until(screen, over)
+    attempts.state.enter(Stage.STARTING)
+    return why != "Ctrl-C." and Said.END not in said
 
 
 @contextmanager
@@ -254,7 +269,8 @@ def _attempt(
     screen: Screen, led: AttemptRobot, session: RecordingSession, attempts: Attempts, encoder: CameraEncoder | None
 ) -> _Ended:
     """Lead and record one attempt, and halt the robot."""
-    said, ends = list[Said](), list[tuple[str, StopVerdict | None]]()
+    said, halts, state = list[Said](), list[str](), attempts.state
+    ends = list[tuple[str, StopVerdict | None]]()
     with ExitStack() as recorded:
         recorder = recorded.enter_context(_recording(screen, led, session))
         if encoder is not None:
@@ -267,14 +283,18 @@ def _attempt(
                 f"No camera delivered a picture within {FIRST_PICTURE_S:g} s; --cameras none records without."
             )
         task, began = attempts.begin(), time.monotonic()
-        if attempts.keys is not None:
-            screen.say(KEYBOARD if attempts.keys.leading else KEYS)
+        state.enter(Stage.RECORDING, progress.row)
+        if attempts.asked:
+            screen.say(state.words.judges)
 
         def over() -> str:
-            word = None if attempts.keys is None else attempts.keys.said()
+            word = state.words.said()
             if word is not None:
                 said.append(word)
                 return "said"
+            if halted := state.halted:
+                halts.append(halted)
+                return "halted"
             if attempts.seconds is not None and time.monotonic() - began >= attempts.seconds:
                 return "time"
             if task.voided:
@@ -284,6 +304,7 @@ def _attempt(
             return "" if task.running else "ended"
 
         def end() -> None:
+            state.enter(Stage.ENDING)
             if led.stopped:
                 ends.append((led.stopped_by, None))
                 return
@@ -293,10 +314,14 @@ def _attempt(
 
         with progress.shown(screen):
             why = wait_until(screen, over, at_end=end)
+            state.enter(Stage.SAVING)
+    if why in ("time", "ended") and (late := state.words.said()) is not None:
+        # It was said before the end was seen.
+        said.append(late)
     stopped_by, verdict = ends[0]
     done = attempts.success and why in ("time", "ended") and not task.error
     word = said[0] if said else Said.SUCCESS if done else Said.FAILURE
-    ended = _Ended(word, stopped_by, task.error, why == "Ctrl-C.", verdict)
+    ended = _Ended(word, stopped_by, task.error or "".join(halts), why == "Ctrl-C.", verdict)
     return ended if encoder is None else _with_pictures(screen, encoder, ended)
 
 
@@ -312,7 +337,7 @@ def _with_pictures(screen: Screen, encoder: CameraEncoder, ended: _Ended) -> _En
     return replace(ended, said=word, failed=ended.failed or encoder.failed)
 
 
-def _save(screen: Screen, session: RecordingSession, *, success: bool) -> str:
+def _save(screen: Screen, session: RecordingSession, attempts: Attempts, *, success: bool) -> str:
     """Save the attempt; return why it is none, else nothing.
 
     Raises:
@@ -330,10 +355,11 @@ def _save(screen: Screen, session: RecordingSession, *, success: bool) -> str:
     else:
         lacking = "The robot made no step: there is nothing to save."
     if kept is None:
-        screen.say(lacking, "yellow")
+        attempts.tell(screen, lacking, "yellow")
         return lacking
     index, frames = kept
     row: Mapping[str, Any] = {"event": "saved", "episode": index, "frames": frames, "success": success}
     screen.data(dict(row))
-    screen.say(f"episode {index} is saved: {frames} frames, {'a success' if success else 'no success'}.", "green")
+    worth = "a success" if success else "no success"
+    attempts.tell(screen, f"episode {index} is saved: {frames} frames, {worth}.", "green")
     return ""

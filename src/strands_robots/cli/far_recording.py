@@ -19,7 +19,7 @@ from strands_robots.cli.output import CliError, Screen
 from strands_robots.cli.record import NO_CAMERAS
 from strands_robots.datasets.recorded import LED_BY_PERSON, LED_BY_RECORDING
 from strands_robots.errors import NoAnswerError, RefusalError, RobotError, UnreachableError
-from strands_robots.fleet.adapter import Detail, RobotEvent
+from strands_robots.fleet.adapter import DEVICE_CONNECT, Detail, RobotEvent
 from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.remote_robot import ROBOT_NAME, RemoteRobot
 from strands_robots.fleet.reports import runs, said
@@ -139,6 +139,15 @@ class FarRobot:
     def name(self) -> str:
         """Its id in recordings."""
         return self.remote.address
+
+    @property
+    def on_mesh(self) -> bool:
+        """True where it is reached over the mesh.
+
+        Raises:
+            RefusalError: it is on no network.
+        """
+        return self.networks.of(self.name).name != DEVICE_CONNECT
 
     @property
     def kind(self) -> str:

@@ -43,7 +43,7 @@ from strands_robots.serving.pipeline import Command, Pipeline, Result, busy
 from strands_robots.serving.policy_arguments import profile_list
 from strands_robots.serving.stop_arguments import noted, stop_of
 from strands_robots.serving.stops import stop_within
-from strands_robots.serving.verbs import Arguments, Kind, Verb, described, labels_of, text_of
+from strands_robots.serving.verbs import OF_ALLOWED_CALLERS, Arguments, Kind, Verb, described, labels_of, text_of
 from strands_robots.serving.workers import ShareFullError, called, loop_future
 from strands_robots.stop_log import stop_logger
 from strands_robots.utils import START_S, WAIT_S, ValidationError, shown, text
@@ -218,7 +218,7 @@ class RobotDriver(CollectedOnce):
                 request.give_up()
             return error(f"The robot did not answer {verb.name} in time; what it may still start is void.")
         answer = enveloped(verb.name, result.result)
-        if moves and is_error(answer):
+        if verb.kind in OF_ALLOWED_CALLERS and is_error(answer):
             self._records.refused(self.peer_id, command, result.refusal, answer)
         if moves and result.refusal is None:
             logger.info("%s: %s by caller %s (self-declared).", self.peer_id, verb.name, shown(caller))
@@ -227,7 +227,7 @@ class RobotDriver(CollectedOnce):
 
     def authorize(self, command: Command, arguments: Arguments) -> tuple[str, ...]:
         """Refuse a caller or a policy that is not allowed; return the caller's name."""
-        if command.verb.kind is not Kind.MOTION:
+        if command.verb.kind not in OF_ALLOWED_CALLERS:
             return ()
         provider = arguments.get("policy_provider", "")
         self.policy_provider = provider or self.policy_provider

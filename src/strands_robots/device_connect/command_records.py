@@ -1,4 +1,4 @@
-"""Safety records of a device's stops and of the motions that it refused."""
+"""Safety records of a device's stops and of the motions and changes it refused."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class CommandRecords:
         self._stops = EventBudget(EACH_PER_S, IN_ALL_PER_S, pooled=True)
 
     def refused(self, peer_id: str, command: Command, refusal: Refused | None, answer: Envelope) -> None:
-        """Record a motion that was answered with an error."""
+        """Record a motion or a change that was answered with an error."""
         if refusal is None:
             reason = text_of(answer)
         else:

@@ -25,7 +25,7 @@ from strands_robots.serving.pipeline import Command, Own, Pipeline, Result, busy
 from strands_robots.serving.stop_arguments import stop_of
 from strands_robots.serving.stops import Request as StopRequest
 from strands_robots.serving.stops import StopRequests, robot_stop, stop_within
-from strands_robots.serving.verbs import Arguments, Kind, Verb
+from strands_robots.serving.verbs import OF_ALLOWED_CALLERS, Arguments, Kind, Verb
 from strands_robots.serving.workers import ShareFullError
 from strands_robots.stop_log import stop_logger
 from strands_robots.utils import RESERVED_IDS, ValidationError, shown
@@ -73,24 +73,27 @@ class SenderCheck:
     def __call__(self, command: Command, arguments: Arguments) -> tuple[str, ...]:
         """Return the sender's proven names; raise :class:`Refused` where it may not."""
         request: wire.Request = command.proof
-        if command.verb.kind is Kind.MOTION and request.sender_id in RESERVED_IDS:
+        asked = command.verb.kind in OF_ALLOWED_CALLERS
+        if asked and request.sender_id in RESERVED_IDS:
             raise Refused(RefusalReason.CALLER, f"no peer is called {request.sender_id}")
         # What only takes energy away is done twice, and whatever the sender's clock says: refusing one as a replay
         # could only leave a robot moving.
-        if command.verb.kind in (Kind.MOTION, Kind.RESUME):
+        if asked or command.verb.kind is Kind.RESUME:
             if request.timestamp is None or not wire.fresh(request.timestamp, self._context.clock()):
                 raise Refused(RefusalReason.CALLER, REPLAYED, reason="the timestamp is not fresh")
             # Commands of a stream have numbers of their own, and would push the turns of others out.
             if not command.verb.streamed and not self._replays.first((request.sender_id, request.turn_id)):
                 raise Refused(RefusalReason.CALLER, REPLAYED, reason="the turn was carried out before")
-        if not self._hardware or command.verb.kind is not Kind.MOTION:
+        if not self._hardware or not asked:
             return ()
         try:
             return self._proven_names(request)
         except IdentityError as why:
+            what = "moves real hardware" if command.verb.kind is Kind.MOTION else "is for known senders"
+            besides = ", besides operator approval" if command.verb.kind is Kind.MOTION else ""
             text = (
-                f"{command.verb.name} moves real hardware, and its sender cannot be attributed: {why}. A console "
-                f"on another machine is enrolled at this one, besides operator approval."
+                f"{command.verb.name} {what}, and its sender cannot be attributed: {why}. A console "
+                f"on another machine is enrolled at this one{besides}."
             )
             raise Refused(RefusalReason.APPROVAL, text, reason=f"the sender is not attributed: {why}") from None
 

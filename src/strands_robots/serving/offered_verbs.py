@@ -221,11 +221,12 @@ def _served(body: object, declared: DeclaredVerb) -> Verb:
 
     return Verb(
         name,
-        Kind.MOTION if declared.motion else Kind.READ,
+        Kind.MOTION if declared.motion else Kind.CHANGE if declared.changes else Kind.READ,
         declared.summary,
         declared.parameters,
         returns=declared.returns,
         begin=begin,
+        critical=declared.motion,
         lasts=declared.lasts > 0,
         # It may move any robot of a world, so a lease on one of them refuses it.
         of_world=holds_robots(body),

@@ -49,6 +49,9 @@ class Kind(Enum):
     MOTION = "motion"
     """Authorized, refused while locked, approved on hardware."""
 
+    CHANGE = "change"
+    """Authorized as a motion is; it moves nothing, so no lease, lockout or approval concerns it."""
+
     READ = "read"
     """Answered to every caller."""
 
@@ -58,6 +61,9 @@ class Kind(Enum):
     RESUME = "resume"
     """Authorized by what it brings: the operator's signature, or the secret of a lease."""
 
+
+OF_ALLOWED_CALLERS = frozenset({Kind.MOTION, Kind.CHANGE})
+"""Kinds for which the caller is authorized."""
 
 LEASE_ID = "lease_id"
 
@@ -211,7 +217,7 @@ class Verb:
         # Only motions wait for motions.
         if self.urgent:
             return "urgent"
-        if self.lasts and not (self.own and self.kind is Kind.READ):
+        if self.lasts and not (self.own and self.kind is not Kind.MOTION):
             return "lasting"
         return "motion" if self.kind is Kind.MOTION else "own_read" if self.own else "read"
 

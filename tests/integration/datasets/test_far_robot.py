@@ -7,7 +7,7 @@ import os
 import signal
 import subprocess
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from unittest import mock
 
@@ -25,6 +25,10 @@ from strands_robots.cli.output import Screen
 from strands_robots.datasets import tables
 from strands_robots.datasets.check import check_dataset
 from strands_robots.datasets.layout import data_file
+from strands_robots.errors import RefusalError
+from strands_robots.fleet import Fleet
+from strands_robots.fleet.networks import Networks
+from strands_robots.fleet.remote_robot import RemoteRobot
 from strands_robots.recording.file import Recorder, read_events
 
 
@@ -186,7 +190,7 @@ def test_motion_that_a_locked_robot_refuses_is_told_to_the_recorder(tmp_path: Pa
     [
         (("--episode-s", "1"), "give --leader, --policy, or both"),
         (("--policy", "mock", "--leader", "page", "--episode-s", "1"), "not with page"),
-        (("--policy", "mock"), "--episode-s is needed without a terminal"),
+        (("--robot", "so100", "--policy", "mock", "--no-network"), "--episode-s is needed without a terminal"),
         (("--policy", "mock", "--episode-s", "1", "--peer-id", "x"), "the id of a served robot, without options"),
         (("--leader", "gamepad", "--episode-s", "1", "--no-network"), "is led by its id, over a network"),
         (("--leader", "mesh:lead-1", "--episode-s", "1"), "--leader must be of this machine"),
@@ -263,3 +267,50 @@ def rests(at: tuple[str, ...]) -> None:
         return len(seen) > 1 and seen[-1] == pytest.approx(seen[-2], abs=0.05)
 
     eventually(still, within=20)
+
+
+def reached(there: Networks, name: str) -> RemoteRobot | None:
+    with suppress(RefusalError):
+        return Fleet(there)[name]
+    return None
+
+
+def say(recorder: RemoteRobot, state: str, verb: str, **arguments: object) -> None:
+    """Say a word once the recording is in a state; an attempt has some frames by then."""
+
+    def ready() -> bool:
+        told = recorder.call("getRecording")
+        return told["state"] == state and (state == "waiting" or told["frames"] > 5)
+
+    eventually(ready, within=60, what=state)
+    recorder.call(verb, **arguments)
+
+
+@pytest.mark.parametrize("mesh", [False, True], ids=["device_connect", "mesh"])
+def test_page_begins_and_judges_the_attempts_of_a_recording_without_a_terminal(tmp_path: Path, mesh: bool) -> None:
+    folder, port = tmp_path / "set", free_port()
+    at = ("--port", str(port), *(["--mesh"] if mesh else []))
+    with arm(*at), Network(port=port, mesh=mesh).joined(source="dashboard") as there:
+        child = recording(folder, "--policy", "mock", "--cameras", "none", *at)
+        try:
+            recorder = eventually(lambda: reached(there, "recorder-arm-1"), within=60)
+            say(recorder, "waiting", "beginEpisode")
+            with pytest.raises(RefusalError, match="beginEpisode is refused"):
+                recorder.call("beginEpisode")
+            say(recorder, "recording", "redoEpisode")
+            for success in (True, False):
+                say(recorder, "waiting", "beginEpisode")
+                say(recorder, "recording", "keepEpisode", success=success)
+            if not mesh:
+                refused = on("call", "recorder-arm-1", "endRecording", *at, code=1)[1][-1]
+                assert "no entry of DEVICE_CONNECT_RPC_ALLOW fits it" in str(refused["reason"])
+            say(recorder, "waiting", "endRecording")
+            rows = told(child)
+        finally:
+            child.kill()
+            child.communicate()
+    assert [each["event"] for each in rows if each["event"] != "progress"] == ["saved", "saved", "dataset"]
+    info, found = check_dataset(folder)
+    assert (info.episodes, [each for each in found if each.wrong]) == (2, [])
+    worth = [bool(tables.read_frames(folder / data_file(number))["next.success"][-1]) for number in range(2)]
+    assert worth == [True, False]

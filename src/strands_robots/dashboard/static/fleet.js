@@ -111,7 +111,8 @@ export function kindText(row) {
 
 export function taskText(row) {
   const task = row.task;
-  if (!task.state || task.state === "idle") return S.idle;
+  // A recorder that waits tells how far it is.
+  if (!task.state || task.state === "idle") return row.kind === "recorder" && task.instruction ? task.instruction : S.idle;
   const step = typeof task.step === "number" && ["running"].includes(task.state) ? `, ${S.step(task.step)}` : "";
   return `${task.state}${task.instruction ? `: ${task.instruction}` : ""}${step}`;
 }

@@ -6,6 +6,7 @@ import { STOPS } from "./forms.js";
 import { Halt } from "./halt.js";
 import { Joints } from "./joints.js";
 import { Pictures } from "./pictures.js";
+import { Recorder, isRecorder } from "./recorder.js";
 import { S } from "./strings.js";
 import { Timeline } from "./timeline.js";
 import { Verbs } from "./verbs.js";
@@ -32,23 +33,25 @@ export class RobotView {
     this.stopAlone.addEventListener("click", () => { const row = this.row(); if (row) onStop(row.id, row.key); });
     this.stopCell = el("button", { type: "button", class: "stop-one stop-cell", text: S.stopCellShort });
     this.stopCell.addEventListener("click", () => { const row = this.row(); if (row) onStop(row.id, null, row.cell); });
+    this.stopWhy = el("p", { class: "small", text: S.stopOneWhy });
     this.forget = el("button", { type: "button", class: "plain forget", text: S.forget, title: S.forgetHint });
     this.forget.addEventListener("click", () => this.state.ask({ type: "forget", key: this.key }));
     this.pictures = new Pictures();
     this.joints = new Joints();
     this.drive = new Drive(fleet, state, this.pictures);
     this.verbs = new Verbs(state);
+    this.recorder = new Recorder(state);
     this.timeline = new Timeline(fleet);
     this.opening = el("p", { class: "small opening", role: "status" });
     this.columns = el("div", { class: "columns" }, this.pictures.node, this.drive.node, this.pictures.poseNode, this.joints.node);
-    this.parts = el("div", { class: "parts" }, this.columns, this.timeline.node, this.verbs.node);
+    this.parts = el("div", { class: "parts" }, this.recorder.node, this.columns, this.timeline.node, this.verbs.node);
     this.node = el("div", { id: "robot" },
       el("div", { class: "back" }, el("a", { href: "#/", text: S.back }), this.forget),
       el("div", { class: "about" },
         el("div", { class: "head" }, el("div", { class: "who" }, this.title, this.kind), this.halt.button),
         this.halt.said,
         el("div", { class: "now", role: "group", "aria-label": S.state, tabindex: 0 }, this.task, this.lock, this.age, this.verdict),
-        el("div", { class: "stop-own" }, this.stop, this.stopCell, this.stopAlone, el("p", { class: "small", text: S.stopOneWhy }))),
+        el("div", { class: "stop-own" }, this.stop, this.stopCell, this.stopAlone, this.stopWhy)),
       this.opening, this.parts);
     state.addEventListener("pose", ({ detail }) => { if (detail.key === this.key) this.pictures.showPose(detail.why); });
     state.addEventListener("robot", ({ detail }) => { if (detail.key === this.key) this.details(detail); });
@@ -61,7 +64,7 @@ export class RobotView {
     });
   }
 
-  set hello(hello) { for (const part of [this.pictures, this.drive, this.verbs]) part.hello = hello; }
+  set hello(hello) { for (const part of [this.pictures, this.drive, this.verbs, this.recorder]) part.hello = hello; }
 
   row() { return this.fleet.rows.get(this.key); }
 
@@ -72,10 +75,20 @@ export class RobotView {
     this.placed = false;
     setAttr(this.columns, "data-joints", "yes");
     for (const part of [this.pictures, this.joints, this.drive, this.verbs]) part.open(key);
+    this.record();
     this.ready(false);
     this.waiting = setTimeout(() => this.ready(true), READY_MS);
     this.watch();
     this.draw();
+  }
+
+  // A recorder has buttons of its own, and nothing to drive.
+  record() {
+    const recorder = isRecorder(this.row());
+    this.recorder.open(this.key, recorder);
+    this.columns.hidden = recorder;
+    setText(this.stopWhy, recorder ? S.recorder.stops : S.stopOneWhy);
+    this.recording = recorder;
   }
 
   ready(shown) {
@@ -98,6 +111,7 @@ export class RobotView {
   close() {
     this.drive.close();
     this.pictures.close();
+    this.recorder.close();
     this.key = "";
     this.state.send({ type: "watch", key: "" });
   }
@@ -119,6 +133,7 @@ export class RobotView {
   draw() {
     const row = this.row();
     if (!row) { setLine(this.title, this.key.slice(this.key.indexOf(":") + 1)); return; }
+    if (isRecorder(row) !== this.recording) this.record();
     this.halt.of(row);
     setLine(this.title, nameText(row));
     setLine(this.kind, kindText(row));

@@ -1,5 +1,7 @@
 const bounds = ({ low, high }) => (low === null ? `at most ${high}` : high === null ? `at least ${low}` : `${low} to ${high}`);
 
+const number = (value, digits, unit) => (typeof value === "number" ? `${value.toFixed(digits)}\u00a0${unit}` : "");
+
 // Every English sentence of the page.
 export const S = {
   theme: "Light or dark",
@@ -78,7 +80,18 @@ export const S = {
   worst: (n) => ` \u00b7 ${n} ${n === 1 ? "needs" : "need"} attention`,
   none: "No robot has been found yet. Serve one in a terminal: strands-robots serve so100",
   starting: "is starting...",
-  kinds: { strands_sim: "simulated", sim: "simulated", strands_robot: "robot", mobile_base: "mobile base" },
+  kinds: { strands_sim: "simulated", sim: "simulated", strands_robot: "robot", mobile_base: "mobile base", recorder: "recording" },
+  recorder: {
+    title: "Recording",
+    words: { begin: "Begin", success: "Keep as success", failure: "Keep as failure", redo: "Redo", end: "End" },
+    stops: "STOP all stops and locks all robots. Halt and STOP this one end the episode and the recording, and halt its robot.",
+    unknown: "The recording has not answered yet.",
+    where: ({ robot, task, episode, episodes, stage }) => `${robot}: episode ${episode} of ${episodes}, ${stage} \u00b7 ${task}`,
+    figures: (facts) => {
+      if (facts.state === "waiting") return facts.begins_in_s === undefined ? "Put things back, then press Begin." : `Put things back: it begins in ${Math.ceil(facts.begins_in_s)}\u00a0s.`;
+      return [number(facts.seconds, 1, "s"), number(facts.frames, 0, "frames"), number(facts.hz, 1, "Hz")].filter(Boolean).join(" \u00b7 ");
+    },
+  },
   noMatch: "No robot matches.",
   locked: "LOCKED",
   lockedBy: (who, when) => `LOCKED by ${who} since ${when}`,

@@ -1,0 +1,144 @@
+"""A recording on its robot's network: its state, and a person's words as verbs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from typing import Any
+
+from strands_robots import settings
+from strands_robots.cli.network import Network
+from strands_robots.cli.output import CliError, Screen
+from strands_robots.cli.own_robot import device_of, peer_of
+from strands_robots.cli.recording_state import BEGIN, END, KEEP, REDO, RecordingState, Said
+from strands_robots.cli.serve import PAGE_CALLER
+from strands_robots.envelope import Envelope, success
+from strands_robots.safety.authorization import Authorization
+from strands_robots.safety.gate import gate_of
+from strands_robots.utils import MissingExtraError, ValidationError
+from strands_robots.verb_declaration import verb
+
+RECORDER = "recorder"
+"""Kind of the device, on every network."""
+
+ROBOT_FIRST_S = 1.0
+"""Seconds in which a robot that an emergency stop locks as well is seen to be stopped, and ends the attempt itself."""
+
+
+class RecorderDevice:
+    """A recording, as callers see and steer it.
+
+    Its verbs move nothing: what they cause is done by the recording, by the rules of its keys. A stop of it ends the
+    attempt that runs, which halts the robot.
+
+    Args:
+        state: of the recording.
+        robot: that is recorded, by its name on the network.
+        task: in words.
+    """
+
+    device_type = RECORDER
+
+    def __init__(self, state: RecordingState, robot: str, task: str) -> None:
+        self.tool_name_str = RECORDER
+        self._state, self._robot, self._task = state, robot, task
+
+    @verb(motion=False)
+    def get_recording(self) -> dict[str, Any]:
+        """Read how far the recording is, and the verbs that fit now.
+
+        Returns:
+            robot, task, state, episode, episodes, saved, can, said; of an attempt seconds, frames, hz and age_ms
+        """
+        return {"robot": self._robot, "task": self._task, **self._state.facts()}
+
+    @verb(motion=False, changes=True, name=BEGIN)
+    def begin_episode(self) -> Envelope:
+        """Begin the next episode: the robot is led from now on."""
+        locked = gate_of(self).lockout(BEGIN)
+        if locked is not None:
+            return locked
+        return self._state.press(BEGIN, Said.SUCCESS)
+
+    @verb(motion=False, changes=True, name=KEEP)
+    def keep_episode(self, success: bool) -> Envelope:
+        """End the episode and save it.
+
+        Args:
+            success: whether it was one
+        """
+        return self._state.press(KEEP, Said.SUCCESS if success else Said.FAILURE)
+
+    @verb(motion=False, changes=True, name=REDO)
+    def redo_episode(self) -> Envelope:
+        """End the episode and drop it, to do it again."""
+        return self._state.press(REDO, Said.REDO)
+
+    @verb(motion=False, changes=True, name=END)
+    def end_recording(self) -> Envelope:
+        """End the recording; an episode that runs is dropped. What is saved stays."""
+        return self._state.press(END, Said.END)
+
+    def get_task_status(self) -> dict[str, Any]:
+        """Return an attempt as a task; a locked recorder leads nothing any more."""
+        facts = self._state.facts()
+        runs = self._state.runs and gate_of(self).lockout(RECORDER) is None
+        text = f"{self._robot}: episode {facts['episode']} of {facts['episodes']}, {facts['stage']}"
+        return success(text, task_status="running" if runs else "idle", instruction=text)
+
+    def halt(self, reason: str = "") -> None:
+        """End the attempt that runs; its status tells when the robot is halted."""
+        locked = gate_of(self).lockout(RECORDER) is not None
+        self._state.halt(f"the recording was stopped: {reason}", ROBOT_FIRST_S if locked else 0.0)
+
+
+@contextmanager
+def recorder_served(
+    screen: Screen, network: Network, robot: str, state: RecordingState, task: str, *, on_mesh: bool, needed: bool
+) -> Iterator[None]:
+    """Have a recording on the network of its robot, for the block.
+
+    Args:
+        screen: where its id is told, or why it has none.
+        network: the flags.
+        robot: the robot's name on the network, which its id is made of.
+        state: of the recording.
+        task: in words.
+        on_mesh: the robot is on the mesh, else on Device Connect.
+        needed: nothing else could end an attempt.
+
+    Raises:
+        CliError: it is not on the network, and is needed there.
+    """
+    device, name = RecorderDevice(state, robot, task), f"{RECORDER}-{robot.replace('/', '-')}"
+    with ExitStack() as stack:
+        try:
+            if on_mesh:
+                stack.enter_context(peer_of(device, name, RECORDER))
+            else:
+                stack.enter_context(device_of(network, network.link(), recorder_driver(device, name), name))
+        except (CliError, ValidationError, MissingExtraError) as absent:
+            why = f"The page has no buttons for this recording: {str(absent).removeprefix(NOT_SERVED)}"
+            if needed:
+                raise CliError(f"{why} --episode-s ends each attempt by its time.") from absent
+            screen.say(why, "yellow")
+        else:
+            screen.say(f"The page has its buttons: {name}.")
+        yield
+
+
+NOT_SERVED = "The robot is not on the network: "
+
+
+def recorder_driver(device: RecorderDevice, name: str) -> Any:
+    """Return the driver of a recording, whose callers are asked as for hardware."""
+    from strands_robots.device_connect.robot_driver import RobotDeviceDriver  # noqa: PLC0415 - an extra
+
+    allowed = Authorization(hardware=True, read_list=_callers, robot=name)
+    return RobotDeviceDriver(device, authorization=allowed)
+
+
+def _callers(setting: str) -> Sequence[str]:
+    """Return the list of a setting; the page, where nobody stated callers."""
+    stated = settings.items(setting)
+    return stated or ([PAGE_CALLER] if setting == "DEVICE_CONNECT_RPC_ALLOW" else [])

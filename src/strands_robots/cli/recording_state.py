@@ -1,0 +1,160 @@
+"""State of a recording, and the words of a person that change it."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from enum import Enum
+from typing import Any
+
+from strands_robots.envelope import Envelope, error, success
+
+
+class Said(Enum):
+    """Word of a person on an attempt, by the key before Enter."""
+
+    SUCCESS = ""
+    FAILURE = "f"
+    REDO = "r"
+    END = "q"
+
+
+class Words:
+    """Words of a person, in order; from any thread.
+
+    Those of a terminal are read by a subclass.
+    """
+
+    begins = "Begin on the page begins, End ends."
+    """Words that begin an attempt, for the screen."""
+
+    def __init__(self) -> None:
+        self._words: deque[Said] = deque()
+
+    @property
+    def judges(self) -> str:
+        """Words that judge an attempt, for the screen."""
+        return "The page's buttons keep it as a success or as a failure, redo it, or drop it and end."
+
+    def take(self, word: Said) -> None:
+        """Note a word."""
+        self._words.append(word)
+
+    def said(self) -> Said | None:
+        """Return the next word; None while there is none."""
+        return self._words.popleft() if self._words else None
+
+    def forget(self) -> None:
+        """Forget what was said until now."""
+        self._words.clear()
+
+
+class Stage(Enum):
+    """Stage of a recording, in words for a person."""
+
+    STARTING = "starting"
+    WAITING = "waiting for Begin"
+    RECORDING = "recording"
+    ENDING = "ending"
+    SAVING = "saving"
+    STOPPED = "stopped"
+    OVER = "over"
+
+
+BEGIN, KEEP, REDO, END = "beginEpisode", "keepEpisode", "redoEpisode", "endRecording"
+"""Verbs of a recorder, each of which is a word."""
+
+_AT = {Stage.WAITING: (BEGIN, END), Stage.RECORDING: (KEEP, REDO, END)}
+"""Verbs that fit a stage."""
+
+Progress = Callable[[], Mapping[str, Any]]
+
+
+class RecordingState:
+    """Stage of a recording; callable from any thread.
+
+    A word from the network counts where it fits the stage, once: the loop that records takes it, as it takes a key's.
+
+    Args:
+        words: of the person, which the loop reads.
+    """
+
+    def __init__(self, words: Words | None = None) -> None:
+        self.words = words or Words()
+        self._lock = threading.Lock()
+        self._stage = Stage.STARTING
+        self._pressed = False
+        self._progress: Progress = dict
+        self._begins_at: float | None = None
+        self._halt: tuple[float, str] | None = None
+        self._said = ""
+        self._counts = {"episode": 1, "episodes": 1, "saved": 0}
+
+    def count(self, episodes: int, saved: int) -> None:
+        """Note how many episodes are to be saved, and how many are."""
+        with self._lock:
+            self._counts = {"episode": min(saved + 1, episodes), "episodes": episodes, "saved": saved}
+
+    def note(self, text: str) -> None:
+        """Note what the screen says, for those who do not see it."""
+        with self._lock:
+            self._said = text
+
+    def wait_for_begin(self, begins_at: float | None) -> None:
+        """Wait for a beginning from now on.
+
+        Args:
+            begins_at: monotonic time at which the attempt begins by itself; None where a person begins it.
+        """
+        # What was said before is about the attempt before.
+        self.words.forget()
+        self.enter(Stage.WAITING)
+        with self._lock:
+            self._begins_at = begins_at
+
+    def enter(self, stage: Stage, progress: Progress | None = None) -> None:
+        """Enter a stage; ``progress`` returns the figures of its attempt."""
+        with self._lock:
+            self._stage, self._pressed, self._begins_at, self._halt = stage, False, None, None
+            self._progress = progress or (self._progress if stage in (Stage.ENDING, Stage.SAVING) else dict)
+
+    def halt(self, reason: str, after_s: float = 0.0) -> None:
+        """End the attempt that runs, if any, in so many seconds; it is no success."""
+        with self._lock:
+            if self._stage is Stage.RECORDING and self._halt is None:
+                self._halt = time.monotonic() + after_s, reason
+
+    @property
+    def halted(self) -> str:
+        """The reason why the attempt has to end now; empty for none."""
+        with self._lock:
+            return self._halt[1] if self._halt is not None and time.monotonic() >= self._halt[0] else ""
+
+    @property
+    def runs(self) -> bool:
+        """True while an attempt leads its robot."""
+        return self._stage in (Stage.RECORDING, Stage.ENDING)
+
+    def press(self, verb: str, word: Said) -> Envelope:
+        """Take a word from the network; an error names the stage that it does not fit."""
+        with self._lock:
+            stage, fits = self._stage, _AT.get(self._stage, ())
+            if verb not in fits:
+                works = f" {' and '.join(fits)} work now." if fits else ""
+                return error(f"{verb} is refused: the recording is {stage.value}.{works}", state=stage.name.lower())
+            if self._pressed:
+                return error(f"{verb} is refused: the word before it is being carried out.", state=stage.name.lower())
+            self._pressed = True
+            self.words.take(word)
+        return success(f"{verb} is taken.", state=stage.name.lower())
+
+    def facts(self) -> dict[str, Any]:
+        """Return the stage, its figures, and the verbs that fit it now."""
+        with self._lock:
+            stage, progress, begins_at = self._stage, self._progress, self._begins_at
+            fits = [] if self._pressed else list(_AT.get(stage, ()))
+            told = {"state": stage.name.lower(), "stage": stage.value, **self._counts, "said": self._said, "can": fits}
+        left = {} if begins_at is None else {"begins_in_s": round(max(0.0, begins_at - time.monotonic()), 1)}
+        return {**told, **left, **progress()}

@@ -1,0 +1,73 @@
+"""A recording as a device: who may say a word, and what a lockout and a lease are to it."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+import pytest
+from fixtures.waiting import eventually
+
+from strands_robots.cli.recorder_device import RecorderDevice, recorder_driver
+from strands_robots.cli.recording_state import RecordingState, Said, Stage
+from strands_robots.safety.lockout import LockoutLatch
+
+
+class Bench:
+    """A recording that runs, and its driver, which is called as by a network."""
+
+    def __init__(self) -> None:
+        self.state = RecordingState()
+        self.driver = recorder_driver(RecorderDevice(self.state, "arm-1", "wave"), "recorder-arm-1")
+        self.state.enter(Stage.RECORDING)
+
+    def call(self, verb: str, caller: str | None = "dashboard", **arguments: object) -> dict[str, Any]:
+        answer: dict[str, Any] = asyncio.run(self.driver.invoke(verb, source_device=caller, **arguments))
+        return answer
+
+
+@pytest.fixture
+def bench() -> Bench:
+    return Bench()
+
+
+def test_page_alone_may_say_a_word_where_nobody_else_is_named(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    for other in ("agent-1", "strands-robots", None):
+        refused = bench.call("endRecording", other)
+        assert (refused["status"], "DEVICE_CONNECT_RPC_ALLOW" in refused["reason"]) == ("error", True)
+        assert bench.call("getRecording", other)["state"] == "recording", "every caller may look"
+    assert bench.state.words.said() is None
+    monkeypatch.setenv("DEVICE_CONNECT_RPC_ALLOW", "agent-*")
+    assert bench.call("endRecording")["status"] == "error"
+    assert bench.call("endRecording", "agent-1")["status"] == "success"
+    assert bench.state.words.said() is Said.END
+
+
+@pytest.mark.parametrize("given", [{}, {"success": 1}, {"success": "yes"}, {"success": True, "episode": 3}])
+def test_worth_that_is_none_is_refused_by_name(bench: Bench, given: dict[str, object]) -> None:
+    refused = bench.call("keepEpisode", **given)
+    assert refused["status"] == "error"
+    assert "success" in refused["reason"]
+    assert bench.state.words.said() is None
+
+
+def test_locked_recorder_begins_nothing_and_ends_what_its_robot_does_not(bench: Bench) -> None:
+    latch = LockoutLatch("recorder-arm-1")
+    bench.driver.robot.gate.attach(latch)
+    latch.engage("e" * 32, "desk", "smoke")
+    bench.driver.robot.halt("emergency stop of desk")
+    assert bench.state.halted == "", "the robot's own stop is seen first, where it is stopped as well"
+    eventually(lambda: bench.state.halted, what="the end of the attempt")
+    bench.state.wait_for_begin(None)
+    refused = bench.call("beginEpisode")
+    assert (refused["status"], refused["locked"]) == ("error", True)
+    assert bench.state.words.said() is None
+
+
+def test_locked_recorder_ends_all_the_same_and_asks_for_no_lease(bench: Bench) -> None:
+    latch = LockoutLatch("recorder-arm-1")
+    bench.driver.robot.gate.attach(latch)
+    latch.engage("e" * 32, "desk", "smoke")
+    bench.call("acquireControl", "other", holder="other", kind="agent")
+    assert bench.call("endRecording")["status"] == "success"
+    assert bench.state.words.said() is Said.END
