@@ -159,7 +159,7 @@ class HardwareRobot(ArmMixin, TeleopMixin):
         Where no turn comes, or a stop waits for the bus, they are those of the last read, and ``joints_error`` says
         why. A camera that fails does not touch them.
         """
-        led = bool(self.tasks.leading() or self.tasks.running())
+        led = bool(self.tasks.driving())
         problem = self._body.refresh(led=led, rate=self.control_hz)
         age, joints = self._body.latest_joints or (None, {})
         fields: dict[str, Any] = {"joints": joints, "task": self._task_fields()}
@@ -358,7 +358,7 @@ class HardwareRobot(ArmMixin, TeleopMixin):
     def stop_task(self) -> Envelope:
         """Stop the task and freeze the robot, within the halt deadline."""
         self.tasks.waiting.void()
-        if self.gate.under_way:
+        if self.gate.under_way or self.tasks.leading():
             return self.halt("stop_task").envelope()
         task = self.tasks.by_body.get(self.tool_name_str)
         if task is None or not task.running:
@@ -372,6 +372,8 @@ class HardwareRobot(ArmMixin, TeleopMixin):
 
     def get_task_status(self) -> Envelope:
         """Return the state of the current or last task.
+
+        The session of a leader is one while it runs.
 
         ``task_status`` (idle, running, completed, stopped, error), ``instruction``, ``policy``, ``step_count``,
         ``duration`` (seconds it has taken), ``error`` and ``outcome``.
@@ -502,7 +504,7 @@ class HardwareRobot(ArmMixin, TeleopMixin):
             raise ValidationError(f"{self.tool_name_str} is not connected; connect() it first.")
 
     def _task_fields(self) -> dict[str, Any]:
-        task = self.tasks.by_body.get(self.tool_name_str)
+        task = next(iter(self.tasks.driving()), self.tasks.by_body.get(self.tool_name_str))
         return {
             "task_status": "idle" if task is None else task.state,
             "instruction": "" if task is None else task.instruction,

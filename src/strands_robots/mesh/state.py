@@ -456,9 +456,9 @@ MOTION_REFUSED = "motion_refused"
 
 
 class StepPublisher:
-    """Publishes policy steps: of rollouts, and those that a program hands in.
+    """Publishes turns and policy steps, of rollouts and of programs.
 
-    A rollout reports its steps on its control thread, so they leave on a thread of this publisher's own; where the
+    A rollout reports on its control thread, so its messages leave on a thread of this publisher's own; where the
     transport is slower than the rollout the oldest are dropped.
 
     Args:
@@ -468,7 +468,6 @@ class StepPublisher:
     def __init__(self, context: Context, robot: Any, hz: float) -> None:
         self._context = context
         self._robot = robot
-        self._hz = hz
         self._handed_in = RateLimiter(hz)
         self._rollouts = RateLimiter(hz)
         self._executor = BoundedExecutor(f"{context.peer_id}-stream", WAITING)
@@ -481,8 +480,6 @@ class StepPublisher:
         if self._robot is None:
             return
         self._unwatch = gate_of(body_of(self._robot)).watch_refusals(self.on_refused)
-        if self._hz <= 0:
-            return
         try:
             self._unsubscribe = self._robot.subscribe(self.on_event)
         except Exception as exc:  # noqa: BLE001 - a foreign robot's subscribe may be something else altogether
@@ -516,6 +513,11 @@ class StepPublisher:
                 self._put(stamp, event.step, observation, action, **about, **led)
 
             self._executor.submit(publish)
+        elif event.kind == "turn":
+            peer, stamp = self._context.peer_id, self._context.clock()
+            body = {"peer_id": peer, "t": stamp, "state": event.state, "leader": event.led_by, "why": event.error}
+            named = {"robot_name": event.robot} if holds_robots(self._robot) else {}
+            self._executor.submit(partial(self._send, topics.turn(peer), {**body, **named}))
 
     def on_refused(self, verb: str, why: str) -> None:
         """Publish that a motion was refused while locked; return at once.

@@ -56,6 +56,7 @@ TABLE: tuple[Topic, ...] = (
     Topic("safety_event", "strands/*/safety/event", 0, None, 16 * KIB, True, False, 1, True, True),
     Topic("state", "strands/*/state", 10, 400, 256 * KIB),
     Topic("stream", "strands/*/stream", 0, 400, 256 * KIB),
+    Topic("turn", "strands/*/turn", 0, None, 16 * KIB, True, False, 1),
     Topic("pose", "strands/*/pose", 10, 400, 64 * KIB),
     Topic("imu", "strands/*/imu", 10, 400, 64 * KIB),
     Topic("odom", "strands/*/odom", 10, 400, 64 * KIB),
@@ -120,6 +121,10 @@ def responses(requester: str) -> str:
 
 def stream(peer: str) -> str:
     return f"{ROOT}/{peer}/stream"
+
+
+def turn(peer: str) -> str:
+    return f"{ROOT}/{peer}/turn"
 
 
 def camera(peer: str, name: str) -> str:

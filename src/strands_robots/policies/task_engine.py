@@ -189,6 +189,10 @@ class TaskEngine:
         """Return the running sessions by leader."""
         return {name: session for name, session in list(self.by_leader.items()) if session.running}
 
+    def driving(self) -> list[Rollout]:
+        """Return all that run: tasks, and sessions of leaders."""
+        return [*self.running().values(), *self.leading().values()]
+
     def leader_of(self, name: str) -> str:
         """Return the leader that drives a body; empty when none does."""
         return next((leader for leader, session in self.leading().items() if session.robot == name), "")

@@ -449,8 +449,8 @@ class Simulation(PicturesMixin, ArmMixin, TeleopMixin):
         return success(f"{body.name} stopped after {rollout.step_count} steps.", **row)
 
     def list_policies_running(self) -> list[dict[str, Any]]:
-        """Return one row for each running rollout, as :meth:`Rollout.row`."""
-        return [rollout.row() for rollout in self.tasks.running().values()]
+        """Return a row of each running rollout; leaders have theirs, too."""
+        return [rollout.row() for rollout in self.tasks.driving()]
 
     def outcomes(self) -> dict[str, dict[str, Any]]:
         """Return how the last rollout of each robot ended, until its next one."""

@@ -117,6 +117,7 @@ def test_recording_has_pictures_and_each_stop_of_the_fleet_once(followed: Follow
     followed.say("arm-1/camera/front", {"data": "no base64"})
     followed.say("arm-2/camera/front", {"data": 7})
     followed.say("arm-1/stream", {"step": 1})
+    followed.say("arm-1/turn", {"state": "led", "leader": "hand"})
     followed.say("safety/resume", {"peer_id": "desk-1"})
     followed.say("safety/estop", {})
     followed.say("arm-2/safety/event", {"event": "last"})
@@ -128,6 +129,7 @@ def test_recording_has_pictures_and_each_stop_of_the_fleet_once(followed: Follow
             ("arm-1", "camera_front", "front", None),
             ("arm-2", "camera_front", "front", None),
             ("arm-1", "streamStep", "", None),
+            ("arm-1", "turnChanged", "", None),
             ("desk-1", "resume", "", None),
             ("mesh", "emergencyStop", "", None),
             ("arm-2", "safety_event", "", None),
@@ -158,8 +160,10 @@ def test_safety_event_is_plain_and_for_the_timeline(followed: Followed) -> None:
     followed.say("arm-1/safety/event", {"event": "\x1b[2J" + "x" * 1000})
     followed.say("arm-1/safety/event", {"type": "locked"})
     followed.say("arm-1/safety/event", {"event": ["nonsense"]})
+    followed.say("arm-1/turn", {"state": "led", "leader": "hand"})
     followed.arrived("safety event")
     followed.arrived("locked")
+    followed.arrived("turnChanged")
     names = [each.name for each in followed.events if not each.frequent]
     assert max(map(len, names)) <= 100
     assert "\x1b" not in "".join(names)

@@ -170,6 +170,9 @@ LOAD_MAX = 1000.0
 STREAM, STEP = "stream", "streamStep"
 """Name of a policy step: as an event, and in a recording."""
 
+TURN = "turnChanged"
+"""Event of another driver, of a robot that a leader elsewhere has."""
+
 OF_FLEET = "strands/safety/"
 """Topics of emergency stops and resumes, which are no robot's."""
 
@@ -225,6 +228,7 @@ def _of_one(mesh: Mesh, robot: str, on_event: OnEvent, *, states: bool) -> dict[
 
     receivers = {
         topics.stream(robot): (STREAM, _named(STREAM, on_event)),
+        topics.turn(robot): ("turn", _named(TURN, on_event)),
         topics.safety_event(robot): ("safety_event", _named("safety_event", on_event)),
         topics.presence(robot): ("presence", presence),
     }
@@ -248,6 +252,7 @@ def _recorded(robot: str, on_event: OnEvent) -> dict[str, tuple[str, OnMessage]]
     return {
         topics.state(robot): ("state", _named("state", on_event)),
         topics.stream(robot): (STREAM, _named(STEP, on_event)),
+        topics.turn(robot): ("turn", _named(TURN, on_event)),
         topics.camera(robot, "*"): ("camera", picture),
         topics.safety_event(robot): ("safety_event", _named("safety_event", on_event)),
         topics.estop(): ("estop", of_fleet("emergencyStop")),
@@ -306,6 +311,7 @@ def _of_all(mesh: Mesh, on_event: OnEvent) -> dict[str, tuple[str, OnMessage]]:
         on_event(RobotEvent(_sender(key), plain_text(name, 100) or "safety event", message, alive=False))
 
     return {
+        topics.turn(EVERY): ("turn", _named(TURN, on_event)),
         topics.state(EVERY): ("state", state),
         topics.presence(EVERY): ("presence", presence),
         topics.sensor(EVERY, "health"): ("health", health),
