@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import json
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from fixtures.leaders import write_csv
 from tests.cli.conftest import Run
+
+from strands_robots.cli.network import one_robot
+from strands_robots.utils import ValidationError
 
 
 def test_recording_leads_a_simulated_arm_to_its_end(run: Run, tmp_path: Path) -> None:
@@ -61,6 +66,28 @@ def test_follower_of_another_process_takes_no_option_of_one_here(
     result = run(*words, "--no-network", "--json")
     assert result.exit_code == 2
     assert "is led by its id, over a network" in json.loads(result.stdout)["reason"]
+
+
+@pytest.mark.parametrize(
+    ("line", "argument"), [(("replay", "FILE", "--to", "cell"), "--to"), (("teleop", "FILE", "cell"), "FOLLOWER")]
+)
+def test_world_of_several_robots_is_led_only_where_one_is_named(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, line: tuple[str, ...], argument: str
+) -> None:
+    world = SimpleNamespace(id="cell", robots={"left": None, "right": None})
+    monkeypatch.setattr("strands_robots.cli.teleop.reached", lambda *_: nullcontext((None, world)))
+    write_csv(tmp_path / "run.csv", [(0.0, {"shoulder_pan": 0.0})])
+    result = run(*(str(tmp_path / "run.csv") if word == "FILE" else word for word in line), "--json")
+    assert result.exit_code == 2
+    assert f"{argument} must be one of cell/left, cell/right, not 'cell'" in json.loads(result.stdout)["reason"]
+
+
+@pytest.mark.parametrize(("part", "chosen"), [("", "world"), ("left", "left")])
+def test_only_robot_of_a_world_need_not_be_named(part: str, chosen: str) -> None:
+    world: Any = SimpleNamespace(id="cell", robots={"left": "left"})
+    assert one_robot(world, part, "--to") == (world if chosen == "world" else "left")
+    with pytest.raises(ValidationError, match="--to must be one of cell/left, not 'cell/right'"):
+        one_robot(world, "right", "--to")
 
 
 def test_refused_option_is_not_reported_as_unknown_follower(run: Run, tmp_path: Path) -> None:

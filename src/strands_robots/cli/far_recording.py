@@ -15,6 +15,7 @@ from functools import partial
 from typing import Any
 
 from strands_robots.cli.far_hand import HandLeader
+from strands_robots.cli.network import one_robot
 from strands_robots.cli.output import CliError, Screen
 from strands_robots.cli.record import NO_CAMERAS
 from strands_robots.datasets.recorded import LED_BY_PERSON, LED_BY_RECORDING
@@ -120,11 +121,7 @@ class FarRobot:
         cameras: Sequence[str] | None,
         hand: HandLeader | None = None,
     ) -> None:
-        robots = world.robots
-        if part not in robots and (part or len(robots) > 1):
-            known = ", ".join(f"{world.id}/{name}" for name in robots) or world.id
-            raise ValidationError(f"--robot must be one of {known}, not {shown(f'{world.id}/{part}')}.")
-        self.remote = robots[part] if part else world
+        self.remote = one_robot(world, part, "--robot")
         self.networks, self._part, self._policy, self._task = networks, part, policy, task
         self._cameras = _cameras_of(world, part, cameras)
         self._hand = hand

@@ -29,7 +29,7 @@ from strands_robots.fleet.adapter import DEVICE_CONNECT, SOURCE
 from strands_robots.fleet.device_connect.config import LinkFlags, as_flag
 from strands_robots.fleet.mesh.config import put_settings
 from strands_robots.fleet.profiles import FleetProfile, mesh_at, profile_for, profile_name
-from strands_robots.utils import ValidationError, near, port, redacted
+from strands_robots.utils import ValidationError, near, port, redacted, shown
 
 if TYPE_CHECKING:
     from strands_robots.device_connect.backends import LinkConfig
@@ -272,6 +272,25 @@ def reached(screen: Screen, network: Network, robot: str) -> Iterator[tuple[Netw
         with answering(there, robot, ""):
             found = Fleet(there)[robot]
         yield there, found
+
+
+def one_robot(world: RemoteRobot, part: str, argument: str) -> RemoteRobot:
+    """Return the named robot of a world, or the only one that is there.
+
+    Args:
+        world: the world, or a robot that is none.
+        part: the robot's name in its world; empty for the only one.
+        argument: names it in a refusal.
+
+    Raises:
+        ValidationError: the world has several robots and none is named, or none of that name.
+        RefusalError: it does not answer.
+    """
+    robots = world.robots
+    if part not in robots and (part or len(robots) > 1):
+        known = ", ".join(f"{world.id}/{name}" for name in robots) or world.id
+        raise ValidationError(f"{argument} must be one of {known}, not {shown(f'{world.id}/{part}'.rstrip('/'))}.")
+    return robots[part] if part else world
 
 
 @contextmanager

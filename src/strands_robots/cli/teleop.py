@@ -29,7 +29,7 @@ from strands_robots.cli.leading import (
     recorded_leader,
 )
 from strands_robots.cli.led_robot import LedRobot, Serving, halted_first
-from strands_robots.cli.network import Network, answering, mesh_peer, reached
+from strands_robots.cli.network import Network, answering, mesh_peer, one_robot, reached
 from strands_robots.cli.output import POLL_S, CliError, Exit, Screen, table, wait_until
 from strands_robots.envelope import text_of
 from strands_robots.errors import NoAnswerError, NoSuchRobotError, RefusalError
@@ -114,7 +114,8 @@ def teleop(
     if not no_network and _is_served(follower):
         if publish is not None or record is not None or arm or peer_id is not None:
             raise ValidationError(f"{follower} is served elsewhere: leave out what is of a follower of this command.")
-        _lead_served(screen, network, HandLeader(screen, leader, of_leader, None), follower, options)
+        hand = HandLeader(screen, leader, of_leader, None)
+        _lead_served(screen, network, hand, follower, options, argument="FOLLOWER")
         return
 
     def connected(robot: Any) -> AbstractContextManager[Any]:
@@ -142,7 +143,8 @@ def replay(
     if not no_network and _is_served(to):
         if arm or peer_id is not None:
             raise ValidationError(f"{to} is served elsewhere: leave out what is of a follower of this command.")
-        _lead_served(screen, network, HandLeader(screen, file.name, {}, None, leader), to, TeleopOptions())
+        hand = HandLeader(screen, file.name, {}, None, leader)
+        _lead_served(screen, network, hand, to, TeleopOptions(), argument="--to")
         return
     how = _how_served(network, to, peer_id, None, alone=no_network)
     _drive(screen, file.name, to, lambda _: nullcontext(leader), arm, how=how, options=TeleopOptions())
@@ -348,14 +350,24 @@ def _is_served(follower: str) -> bool:
     return not follower.startswith(MESH_PREFIX) and follower != NO_FOLLOWER and not is_own(follower)
 
 
-def _lead_served(screen: Screen, network: Network, hand: HandLeader, follower: str, options: TeleopOptions) -> None:
+def _lead_served(
+    screen: Screen, network: Network, hand: HandLeader, follower: str, options: TeleopOptions, *, argument: str
+) -> None:
     """Let a leader drive a robot that another process serves, and stop it.
+
+    Args:
+        screen: where it is told.
+        network: that reaches the robot.
+        hand: the leader.
+        follower: ``ID`` or ``WORLD/ROBOT``, the value of ``argument``.
+        options: of the teleoperation.
+        argument: names the follower in a refusal.
 
     Raises:
         CliError: it was refused, the leader failed, or others stopped the robot.
     """
     ends = list[tuple[str, bool]]()
-    with served_follower(screen, network, follower) as robot, hand.connected(), halted_first(robot):
+    with served_follower(screen, network, follower, argument) as robot, hand.connected(), halted_first(robot):
         with _refused():
             hand.begin(robot, "", "", options.seconds, lambda *end: ends.append(end), max_speed=options.max_speed)
         verdicts = list[StopVerdict]()
@@ -376,20 +388,18 @@ def _lead_served(screen: Screen, network: Network, hand: HandLeader, follower: s
 
 
 @contextmanager
-def served_follower(screen: Screen, network: Network, name: str) -> Iterator[RemoteRobot]:
+def served_follower(screen: Screen, network: Network, name: str, argument: str) -> Iterator[RemoteRobot]:
     """Join the networks, and yield the served robot ``ID`` or ``WORLD/ROBOT``.
 
     Raises:
         CliError: there is no such robot, or it does not answer.
+        ValidationError: the world has several robots and none is named, or none of that name.
     """
     peer, _, part = name.partition("/")
-    with reached(screen, network, identifier("FOLLOWER", peer)) as (there, world):
+    with reached(screen, network, identifier(argument, peer)) as (there, world):
         with answering(there, peer, ""):
-            robots = world.robots if part else {}
-        if part and part not in robots:
-            known = ", ".join(f"{peer}/{each}" for each in robots) or peer
-            raise ValidationError(f"FOLLOWER must be one of {known}, not {name}.")
-        yield robots[part] if part else world
+            robot = one_robot(world, part, argument)
+        yield robot
 
 
 def _publish(screen: Screen, leader: str, peer: str, source: Any, options: TeleopOptions) -> None:

@@ -122,6 +122,12 @@ def test_peer_whose_answers_have_another_shape_is_refused_by_name(
         follower_of(monkeypatch, features, state)
 
 
+def test_stream_leads_no_world_of_several_robots(monkeypatch: pytest.MonkeyPatch) -> None:
+    arms = {"left": {"actuators": {"pan": None}}, "right": {"actuators": {"pan": None}}}
+    with pytest.raises(ValidationError, match="must be one of arm-1/left, arm-1/right, without mesh:"):
+        follower_of(monkeypatch, {"robots": arms}, {})
+
+
 @pytest.mark.parametrize("streams", [5, ["leader"], {"leader": {}}])
 def test_streams_of_another_shape_are_no_answer(monkeypatch: pytest.MonkeyPatch, streams: object) -> None:
     follower = follower_of(monkeypatch, ARM, {})

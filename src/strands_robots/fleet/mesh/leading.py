@@ -43,6 +43,7 @@ class RemoteFollower:
 
     Raises:
         RefusalError: it is not in reach, does not answer, or has no action that can be led.
+        ValidationError: it is a world of several robots, of which a stream moves the first alone.
     """
 
     def __init__(self, mesh: Mesh, peer: str) -> None:
@@ -66,6 +67,9 @@ class RemoteFollower:
             }
         except ValidationError as exc:
             raise RobotError(f"{peer} cannot be led by what it reports: {exc}") from None
+        if len(robots) > 1:
+            known = ", ".join(f"{peer}/{name}" for name in robots)
+            raise ValidationError(f"the follower must be one of {known}, without mesh:, not the world {peer}.")
         if not self.bounds:
             raise RobotError(f"{peer} reports no action key that could be led")
 
