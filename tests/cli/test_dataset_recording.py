@@ -18,7 +18,7 @@ from rich.console import Console
 from strands_robots.cli.dataset_recording import Attempts, record_attempts
 from strands_robots.cli.output import CliError, Screen
 from strands_robots.cli.recorder_device import RecorderDevice
-from strands_robots.cli.recording_state import RecordingState
+from strands_robots.cli.recording_state import RecordingState, Said, Stage
 from strands_robots.datasets import tables
 from strands_robots.datasets.check import check_dataset
 from strands_robots.datasets.layout import data_file
@@ -163,6 +163,20 @@ def test_attempts_by_time_wait_for_nobody_and_take_a_word(tmp_path: Path, arm: A
         assert recording.episodes == 1
 
 
+def test_begin_that_comes_as_the_pause_is_over_judges_no_attempt(tmp_path: Path, arm: Arm) -> None:
+    class Pressed(RecordingState):
+        def enter(self, stage: Stage, progress: Any = None) -> None:
+            super().enter(stage, progress)
+            if stage is Stage.STARTING:
+                self.words.take(Said.SUCCESS)
+
+    task = SimpleNamespace(voided=False, running=False, error="")
+    attempts = Attempts(1, lambda: task, FPS, 600.0, 0.0, success=False, state=Pressed())
+    with session(tmp_path) as recording:
+        record_attempts(Screen(console=Console(file=io.StringIO())), arm, recording, attempts)
+    assert not tables.read_frames(tmp_path / data_file(0))["next.success"].any()
+
+
 def test_stop_of_the_recording_is_an_episode_without_success_and_its_end(tmp_path: Path, arm: Arm) -> None:
     device = RecorderDevice(state := RecordingState(), "arm-1", "wave")
     attempts = Attempts(9, Steady, FPS, None, 0.0, success=True, state=state)
@@ -174,3 +188,20 @@ def test_stop_of_the_recording_is_an_episode_without_success_and_its_end(tmp_pat
         assert recording.episodes == 1
     stopper.join(10)
     assert not tables.read_frames(tmp_path / data_file(0))["next.success"].any()
+
+
+def test_recording_that_is_stopped_as_it_starts_begins_nothing(tmp_path: Path, arm: Arm) -> None:
+    class Stopped(RecordingState):
+        def enter(self, stage: Stage, progress: Any = None) -> None:
+            super().enter(stage, progress)
+            if stage is Stage.STARTING:
+                self.halt("the recording was stopped: stop by desk")
+
+    began: list[Steady] = []
+    attempts = Attempts(9, lambda: began.append(Steady()), FPS, 600.0, 0.0, success=True, state=Stopped())
+    with (
+        session(tmp_path) as recording,
+        pytest.raises(CliError, match="Nothing began: the recording was stopped: stop by desk"),
+    ):
+        record_attempts(Screen(console=Console(file=io.StringIO())), arm, recording, attempts)
+    assert began == []

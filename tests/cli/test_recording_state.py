@@ -36,6 +36,7 @@ def test_word_counts_in_the_stage_that_it_fits_and_is_the_keys(state: RecordingS
 @pytest.mark.parametrize(
     ("stage", "refused", "why"),
     [
+        (Stage.OPENING, "end_recording", "the recording is opening."),
         (Stage.STARTING, "begin_episode", "beginEpisode is refused: the recording is starting."),
         (Stage.WAITING, "redo_episode", "waiting for Begin. beginEpisode and endRecording work now."),
         (Stage.RECORDING, "begin_episode", "recording. keepEpisode and redoEpisode and endRecording work now."),
@@ -75,7 +76,7 @@ def test_who_looks_sees_how_far_it_is(state: RecordingState, device: RecorderDev
     assert (told["episode"], told["episodes"], told["seconds"], told["frames"]) == (2, 3, 1.5, 45)
     state.wait_for_begin(0.0)
     assert device.get_recording()["begins_in_s"] == 0
-    assert device.get_task_status()["instruction"] == "arm-1: episode 2 of 3, waiting for Begin"
+    assert device.get_task_status()["instruction"] == "episode 2 of 3, waiting for Begin"
     assert device.get_task_status()["task_status"] == "idle"
 
 
@@ -83,9 +84,10 @@ def test_stop_of_a_recording_ends_the_attempt_that_runs(state: RecordingState, d
     state.wait_for_begin(None)
     device.halt("stop by desk")
     assert state.halted == "", "nothing runs that it could end"
-    state.enter(Stage.RECORDING)
+    state.enter(Stage.STARTING)
     assert device.get_task_status()["task_status"] == "running"
     device.halt("stop by desk")
+    state.enter(Stage.RECORDING)
     assert state.halted == "the recording was stopped: stop by desk"
     state.enter(Stage.ENDING)
     assert device.get_task_status()["task_status"] == "running", "the robot is not halted yet"

@@ -238,6 +238,9 @@ def _ready(screen: Screen, attempts: Attempts, saved: int, pause_s: float) -> bo
 
     why = wait_until(screen, over)
     attempts.state.enter(Stage.STARTING)
+    while (late := words.said()) is not None:
+        # It came with the begin, and judges no attempt.
+        said.append(late)
     return why != "Ctrl-C." and Said.END not in said
 
 
@@ -265,6 +268,17 @@ def _unwritten(session: RecordingSession, why: str) -> CliError:
     return CliError(f"{why.rstrip('.')}. Episodes that are saved: {session.episodes}. {kept_in}")
 
 
+def _begun(attempts: Attempts) -> Any:
+    """Begin to lead; return the task.
+
+    Raises:
+        CliError: it was refused, or the recording was stopped meanwhile.
+    """
+    if halted := attempts.state.halted:
+        raise CliError(f"Nothing began: {halted}.")
+    return attempts.begin()
+
+
 def _attempt(
     screen: Screen, led: AttemptRobot, session: RecordingSession, attempts: Attempts, encoder: CameraEncoder | None
 ) -> _Ended:
@@ -282,7 +296,7 @@ def _attempt(
             raise CliError(
                 f"No camera delivered a picture within {FIRST_PICTURE_S:g} s; --cameras none records without."
             )
-        task, began = attempts.begin(), time.monotonic()
+        task, began = _begun(attempts), time.monotonic()
         state.enter(Stage.RECORDING, progress.row)
         if attempts.asked:
             screen.say(state.words.judges)

@@ -83,7 +83,7 @@ class RecorderDevice:
         """Return an attempt as a task; a locked recorder leads nothing any more."""
         facts = self._state.facts()
         runs = self._state.runs and gate_of(self).lockout(RECORDER) is None
-        text = f"{self._robot}: episode {facts['episode']} of {facts['episodes']}, {facts['stage']}"
+        text = f"episode {facts['episode']} of {facts['episodes']}, {facts['stage']}"
         return success(text, task_status="running" if runs else "idle", instruction=text)
 
     def halt(self, reason: str = "") -> None:

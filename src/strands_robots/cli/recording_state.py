@@ -54,8 +54,9 @@ class Words:
 class Stage(Enum):
     """Stage of a recording, in words for a person."""
 
-    STARTING = "starting"
+    OPENING = "opening"
     WAITING = "waiting for Begin"
+    STARTING = "starting"
     RECORDING = "recording"
     ENDING = "ending"
     SAVING = "saving"
@@ -65,6 +66,9 @@ class Stage(Enum):
 
 BEGIN, KEEP, REDO, END = "beginEpisode", "keepEpisode", "redoEpisode", "endRecording"
 """Verbs of a recorder, each of which is a word."""
+
+_LEADS = frozenset({Stage.STARTING, Stage.RECORDING, Stage.ENDING})
+"""Stages in which the robot may be led."""
 
 _AT = {Stage.WAITING: (BEGIN, END), Stage.RECORDING: (KEEP, REDO, END)}
 """Verbs that fit a stage."""
@@ -84,7 +88,7 @@ class RecordingState:
     def __init__(self, words: Words | None = None) -> None:
         self.words = words or Words()
         self._lock = threading.Lock()
-        self._stage = Stage.STARTING
+        self._stage = Stage.OPENING
         self._pressed = False
         self._progress: Progress = dict
         self._begins_at: float | None = None
@@ -117,13 +121,15 @@ class RecordingState:
     def enter(self, stage: Stage, progress: Progress | None = None) -> None:
         """Enter a stage; ``progress`` returns the figures of its attempt."""
         with self._lock:
-            self._stage, self._pressed, self._begins_at, self._halt = stage, False, None, None
+            self._stage, self._pressed, self._begins_at = stage, False, None
+            # A stop while it starts ends it as soon as it has.
+            self._halt = self._halt if stage in _LEADS else None
             self._progress = progress or (self._progress if stage in (Stage.ENDING, Stage.SAVING) else dict)
 
     def halt(self, reason: str, after_s: float = 0.0) -> None:
         """End the attempt that runs, if any, in so many seconds; it is no success."""
         with self._lock:
-            if self._stage is Stage.RECORDING and self._halt is None:
+            if self._stage in _LEADS and self._halt is None:
                 self._halt = time.monotonic() + after_s, reason
 
     @property
@@ -134,8 +140,8 @@ class RecordingState:
 
     @property
     def runs(self) -> bool:
-        """True while an attempt leads its robot."""
-        return self._stage in (Stage.RECORDING, Stage.ENDING)
+        """True while an attempt may lead its robot."""
+        return self._stage in _LEADS
 
     def press(self, verb: str, word: Said) -> Envelope:
         """Take a word from the network; an error names the stage that it does not fit."""

@@ -13,7 +13,7 @@ from fixtures.waiting import eventually
 
 from strands_robots.cli.recorder_device import RecorderDevice
 from strands_robots.cli.recording_state import RecordingState, Stage
-from strands_robots.envelope import success
+from strands_robots.envelope import error, success
 from strands_robots.serving.offered_verbs import own_verbs
 from strands_robots.serving.verbs import described
 
@@ -56,7 +56,7 @@ def test_page_shows_a_recording_and_sends_each_word_that_fits(page: Any, served:
     recording.state.wait_for_begin(None)
     recording.tell()
     shown = card(page, "recorder-arm-1")
-    shown.locator(".task", has_text="arm-1: episode 3 of 50, waiting for Begin").wait_for(timeout=30_000)
+    shown.locator(".task", has_text="episode 3 of 50, waiting for Begin").wait_for(timeout=30_000)
     assert shown.locator(".halt").is_visible(), "no robot hides its stop by what it says"
     shown.locator("a.name").click()
     works(page, "Begin", "End")
@@ -80,3 +80,7 @@ def test_page_shows_a_recording_and_sends_each_word_that_fits(page: Any, served:
     served.feed.answers["redoEpisode"] = [recording.device.redo_episode()]
     button(page, "Redo").click()
     page.get_by_text("redoEpisode is refused: the recording is waiting for Begin").wait_for()
+    served.feed.answers["getRecording"] = [error("No device 'recorder-arm-1' in tenant 'default'.")]
+    page.get_by_text("The recording does not answer. It is over, or out of reach.").wait_for()
+    works(page)
+    assert page.get_by_text("episode 1 is saved: 149 frames, a success.").is_visible()

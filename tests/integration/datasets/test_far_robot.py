@@ -7,7 +7,7 @@ import os
 import signal
 import subprocess
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from unittest import mock
 
@@ -27,7 +27,6 @@ from strands_robots.datasets.check import check_dataset
 from strands_robots.datasets.layout import data_file
 from strands_robots.errors import RefusalError
 from strands_robots.fleet import Fleet
-from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.remote_robot import RemoteRobot
 from strands_robots.recording.file import Recorder, read_events
 
@@ -269,12 +268,6 @@ def rests(at: tuple[str, ...]) -> None:
     eventually(still, within=20)
 
 
-def reached(there: Networks, name: str) -> RemoteRobot | None:
-    with suppress(RefusalError):
-        return Fleet(there)[name]
-    return None
-
-
 def say(recorder: RemoteRobot, state: str, verb: str, **arguments: object) -> None:
     """Say a word once the recording is in a state; an attempt has some frames by then."""
 
@@ -290,25 +283,29 @@ def say(recorder: RemoteRobot, state: str, verb: str, **arguments: object) -> No
 def test_page_begins_and_judges_the_attempts_of_a_recording_without_a_terminal(tmp_path: Path, mesh: bool) -> None:
     folder, port = tmp_path / "set", free_port()
     at = ("--port", str(port), *(["--mesh"] if mesh else []))
-    with arm(*at), Network(port=port, mesh=mesh).joined(source="dashboard") as there:
-        child = recording(folder, "--policy", "mock", "--cameras", "none", *at)
-        try:
-            recorder = eventually(lambda: reached(there, "recorder-arm-1"), within=60)
+    # Of another process, and of the recording's own.
+    words = ("--robot", "so100", "--peer-id", "arm-1") if mesh else ()
+    with ExitStack() as stack:
+        if not mesh:
+            stack.enter_context(arm(*at))
+        child = recording(folder, *words, "--policy", "mock", "--cameras", "none", *at)
+        stack.callback(child.communicate)
+        stack.callback(child.kill)
+        eventually(lambda: "recorder-arm-1" in str(on("peers", *at, code=None)[1]), within=60)
+        there = stack.enter_context(Network(port=port, mesh=mesh).joined(source="dashboard"))
+        recorder = Fleet(there)["recorder-arm-1"]
+        say(recorder, "waiting", "beginEpisode")
+        with pytest.raises(RefusalError, match="beginEpisode is refused"):
+            recorder.call("beginEpisode")
+        say(recorder, "recording", "redoEpisode")
+        for success in (True, False):
             say(recorder, "waiting", "beginEpisode")
-            with pytest.raises(RefusalError, match="beginEpisode is refused"):
-                recorder.call("beginEpisode")
-            say(recorder, "recording", "redoEpisode")
-            for success in (True, False):
-                say(recorder, "waiting", "beginEpisode")
-                say(recorder, "recording", "keepEpisode", success=success)
-            if not mesh:
-                refused = on("call", "recorder-arm-1", "endRecording", *at, code=1)[1][-1]
-                assert "no entry of DEVICE_CONNECT_RPC_ALLOW fits it" in str(refused["reason"])
-            say(recorder, "waiting", "endRecording")
-            rows = told(child)
-        finally:
-            child.kill()
-            child.communicate()
+            say(recorder, "recording", "keepEpisode", success=success)
+        if not mesh:
+            refused = on("call", "recorder-arm-1", "endRecording", *at, code=1)[1][-1]
+            assert "no entry of DEVICE_CONNECT_RPC_ALLOW fits it" in str(refused["reason"])
+        say(recorder, "waiting", "endRecording")
+        rows = told(child)
     assert [each["event"] for each in rows if each["event"] != "progress"] == ["saved", "saved", "dataset"]
     info, found = check_dataset(folder)
     assert (info.episodes, [each for each in found if each.wrong]) == (2, [])

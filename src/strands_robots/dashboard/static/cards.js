@@ -4,6 +4,7 @@ import { el, setAttr, setLine, setText, showJpeg } from "./dom.js";
 import { ageText, byName, controlText, kindText, lockText, nameText, taskText, verdictText, verdictTone } from "./fleet.js";
 import { Filter } from "./filter.js";
 import { Halt } from "./halt.js";
+import { isRecorder } from "./recorder.js";
 import { S } from "./strings.js";
 
 class Card {
@@ -38,7 +39,7 @@ class Card {
     setLine(this.task, taskText(row));
     setAttr(this.task, "data-on", fleet.moving(row) ? "yes" : "no");
     // A card that is shown keeps its size until the cards are sorted.
-    if (!this.node.isConnected) this.shot.hidden = !row.pictures;
+    if (!this.node.isConnected) this.shot.hidden = !row.pictures || isRecorder(row);
     setAttr(this.node, "data-attention", fleet.attention(row));
     setLine(this.lock, lockText(row));
     setAttr(this.lock, "data-tone", row.alarm ? "bad" : row.locked === false ? "quiet" : "warn");

@@ -38,6 +38,7 @@ export class Recorder {
     this.key = key;
     this.node.hidden = !shown;
     this.tell(null);
+    setLine(this.said, "");
     this.say(this.viewer ? S.viewer : "", "quiet");
     if (!shown) return;
     this.look();
@@ -71,9 +72,10 @@ export class Recorder {
     const can = facts && Array.isArray(facts.can) ? facts.can : [];
     for (const [button, verb] of this.buttons) button.disabled = this.viewer !== false || !can.includes(verb);
     setAttr(this.node, "data-state", facts ? facts.state : "unknown");
-    setLine(this.where, facts ? S.recorder.where(facts) : problem || S.recorder.unknown);
-    setLine(this.figures, facts ? S.recorder.figures(facts) : "");
-    setLine(this.said, facts ? String(facts.said ?? "") : "");
+    setLine(this.where, facts ? S.recorder.where(facts) : problem ? S.recorder.gone : S.recorder.unknown);
+    setLine(this.figures, facts ? S.recorder.figures(facts) : problem);
+    // What became of the last episode stays where the recording is over.
+    if (facts) setLine(this.said, String(facts.said ?? ""));
   }
 
   async press(verb, params) {

@@ -86,6 +86,7 @@ export const S = {
     words: { begin: "Begin", success: "Keep as success", failure: "Keep as failure", redo: "Redo", end: "End" },
     stops: "STOP all stops and locks all robots. Halt and STOP this one end the episode and the recording, and halt its robot.",
     unknown: "The recording has not answered yet.",
+    gone: "The recording does not answer. It is over, or out of reach.",
     where: ({ robot, task, episode, episodes, stage }) => `${robot}: episode ${episode} of ${episodes}, ${stage} \u00b7 ${task}`,
     figures: (facts) => {
       if (facts.state === "waiting") return facts.begins_in_s === undefined ? "Put things back, then press Begin." : `Put things back: it begins in ${Math.ceil(facts.begins_in_s)}\u00a0s.`;
