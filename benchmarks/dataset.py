@@ -45,7 +45,7 @@ TARGETS: tuple[Target, ...] = ("recorder", "encoder", "robot")
 SAVING_SHARE = 4
 """One kill of so many is of a process that saves all the time, so that kills meet each moment of a save."""
 
-CUT_S, BEAT_MS, STORED, DEFAULT, STREAMING, STOP_MS = 1.0, 1.0, 0.95, 0.6, 1.1, 20.0
+CUT_S, HALT_MS, BEAT_MS, STORED, DEFAULT, STREAMING, STOP_MS = 1.0, 300.0, 1.0, 0.95, 0.6, 1.1, 20.0
 """The bounds."""
 
 
@@ -100,16 +100,21 @@ def kills_row(kills: Sequence[Kill], saving: int, lost: Sequence[str], lerobots:
         target: [kill.cut_s for kill in kills if kill.target == target and kill.cut_s is not None] for target in TARGETS
     }
     running = sum(len(each) for each in cuts.values())
+    halts = [1000 * kill.halt_s for kill in kills if kill.halt_s is not None]
     worst = max((max(each, default=0.0) for each in cuts.values()), default=0.0)
     each = ", ".join(f"{max(cuts[target], default=0.0):.2f}" for target in TARGETS)
     of = ", ".join(f"{counts[target]} of the {target}" for target in TARGETS)
     return Row(
         f"SIGKILL at {len(kills) + saving} random moments: {of}, {saving} of a process that saves all the time",
-        f"{len(lost)} saved episodes lost; {running} running ones, cut by at most {each} s",
+        f"{len(lost)} saved episodes lost; {running} running ones, cut by at most {each} s; the arms of {len(halts)} "
+        f"recorders that led one moved for at most {max(halts, default=0.0):.0f} ms more",
         "" if lerobots is None else f"{lerobots} of {SAVED} saved episodes lost by one kill of LeRobot 0.6.1's writer",
         None,
-        f"0 lost, the running one cut by at most {CUT_S:g} s, each part killed",
-        not lost and worst <= CUT_S and all(counts[target] for target in TARGETS),
+        f"0 lost, the running one cut by at most {CUT_S:g} s, each part killed, arms still after {HALT_MS:g} ms",
+        not lost
+        and worst <= CUT_S
+        and all(counts[target] for target in TARGETS)
+        and max(halts, default=0.0) <= HALT_MS,
     )
 
 

@@ -22,9 +22,10 @@ from fixtures.stop_controller import controller
 from fixtures.waiting import eventually, free_port
 from rich.console import Console
 
-from benchmarks.dataset import percentile
+from benchmarks.dataset import HALT_MS, percentile
 from benchmarks.table import Row
 from benchmarks.takeover_children import BEAT_S, LATENCY_S, PEER, POLICY, RANGES_PER_S
+from benchmarks.takeover_lerobot import NOT_MEASURED, PYTHON, SITES, beside_lerobot, kills_ms
 from benchmarks.takeover_wire import BEAT_S as WIRE_BEAT_S
 from benchmarks.takeover_wire import Carried, Weather, Wire
 from strands_robots.device_connect import loopback_config
@@ -44,8 +45,9 @@ STEADY_S = 600.0
 SLOW = {"max_speed": 0.2}
 """Options of a lead whose robot is still on its way when the leader or its camera fails."""
 
+ROWS = "turns, wire, pictures, kills, lerobot-kills, lerobot, stops"
 FAULTS = ("freezes", "repeats", "lags")
-PICTURE_MS, KILL_MS, STOP_MS = 350.0, 300.0, 20.0
+PICTURE_MS, STOP_MS = 350.0, 20.0
 STATES = ("policy", "led", "held")
 SETTLED_S = 0.06
 """After a stop: a write that came as late as this is still its last one."""
@@ -64,8 +66,14 @@ class Sizes:
     stops: int = 100
     """Stops in each state."""
 
+    recordings: int = 2
+    """Recordings by ``lerobot-record`` of each side."""
 
-QUICK = Sizes(turns=10, commands=2000, pictures=1, kills=3, stops=5)
+    recorded: int = 15
+    """Seconds of each."""
+
+
+QUICK = Sizes(turns=10, commands=2000, pictures=1, kills=3, stops=5, recordings=1, recorded=5)
 
 
 def run(*, quick: bool = False, sizes: Sizes | None = None, rows: Sequence[str] = ()) -> list[Row]:
@@ -76,6 +84,8 @@ def run(*, quick: bool = False, sizes: Sizes | None = None, rows: Sequence[str] 
         "wire": wired,
         "pictures": pictured,
         "kills": killed,
+        "lerobot-kills": lerobot_killed,
+        "lerobot": lambda size: beside_lerobot(size.recordings, size.recorded),
         "stops": stopped,
     }
     return [row for name, measure in parts.items() if not rows or name in rows for row in measure(size)]
@@ -286,7 +296,7 @@ def killed(size: Sizes) -> list[Row]:
                 time.sleep(moments.uniform(0.1, 0.4))
                 at = time.monotonic()
                 leader.kill()
-            time.sleep(KILL_MS / 1000 + 2 * SETTLED_S)
+            time.sleep(HALT_MS / 1000 + 2 * SETTLED_S)
             last, moved, _ = there.robot.ask("writes")
             assert last > at, "the hold is written at each beat"
             if moved > at:
@@ -294,18 +304,26 @@ def killed(size: Sizes) -> list[Row]:
                 late.append(1000 * (moved - at))
             there.robot.ask("halt")
             there.robot.ask("clear")
-    return [kill_row(late)]
+    return [kill_row("the leader", late)]
 
 
-def kill_row(late: Sequence[float]) -> Row:
+def lerobot_killed(size: Sizes) -> list[Row]:
+    """Kill ``lerobot-record`` at random moments."""
+    if not PYTHON.exists():
+        return [Row("SIGKILL of lerobot-record", NOT_MEASURED, "", None, "", ok=True)]
+    with ExitStack() as stack:
+        return [kill_row("lerobot-record", kills_ms([stack.enter_context(site()) for _ in range(SITES)], size.kills))]
+
+
+def kill_row(what: str, late: Sequence[float]) -> Row:
     """Return the row of kills, in ms from each to the last motion."""
     return Row(
-        f"SIGKILL of the leader at {len(late)} random moments: kill to the last motion, loopback",
+        f"SIGKILL of {what} at {len(late)} random moments: kill to the last motion, loopback",
         f"p50 {percentile(late, 0.5):.0f} p99 {percentile(late):.0f} worst {max(late):.0f} ms",
         "",
         None,
-        f"≤ {KILL_MS:g} ms",
-        max(late) <= KILL_MS,
+        f"≤ {HALT_MS:g} ms",
+        max(late) <= HALT_MS,
     )
 
 
@@ -353,7 +371,7 @@ def main() -> None:
 
     usual = Sizes()
     parser = argparse.ArgumentParser(prog="python -m benchmarks.takeover", description=__doc__)
-    parser.add_argument("--rows", default="", help="turns, wire, pictures, kills, stops, with commas (all)")
+    parser.add_argument("--rows", default="", help=f"{ROWS}, with commas (all)")
     for name in Sizes.__slots__:
         parser.add_argument(f"--{name}", type=int, default=getattr(usual, name))
     options: dict[str, Any] = vars(parser.parse_args())

@@ -140,6 +140,12 @@ class ServedRobot:
         """End what drives it."""
         self._robot.halt("bench")
 
+    def held(self) -> bool:
+        """Return True while a caller has its lease."""
+        from strands_robots.serving.control_leases import leases_of  # noqa: PLC0415 - heavy
+
+        return bool(leases_of(self._robot, hardware=True).facts()["held"])
+
     def writes(self) -> list[Any]:
         """Return the last write: its moment; and the moment of the last one that moved the arm."""
         writes, moved = list(self._robot.device.writes), 0.0

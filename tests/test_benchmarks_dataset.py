@@ -26,8 +26,10 @@ EACH = [Kill("recorder", 0.2, ""), Kill("encoder", None, ""), Kill("robot", 0.9,
         (EACH, ["episode 3"], False),
         ([*EACH, Kill("recorder", 1.1, "")], [], False),
         (EACH[:1] * 3, [], False),
+        ([*EACH, Kill("recorder", None, "", 0.3)], [], True),
+        ([*EACH, Kill("recorder", None, "", 0.31)], [], False),
     ],
-    ids=["all is well", "one is lost", "cut too short", "a part was never killed"],
+    ids=["all is well", "one is lost", "cut too short", "a part was never killed", "halted", "halted too late"],
 )
 def test_kills_keep_their_bound_where_nothing_is_lost(kills: list[Kill], lost: list[str], kept: bool) -> None:
     assert kills_row(kills, 5, lost, 5).ok is kept

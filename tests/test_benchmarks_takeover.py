@@ -13,6 +13,7 @@ from benchmarks.takeover import (
     takeover_row,
     wire_row,
 )
+from benchmarks.takeover_lerobot import FPS, Loop, age_s, loop_row
 from benchmarks.takeover_wire import Carried, Weather, Wire
 
 from strands_robots.policies.freshness import CommandAges
@@ -54,8 +55,27 @@ def test_pictures_kills_and_stops_have_their_bounds() -> None:
     assert picture_row({"freezes": [350.0], "lags": [340.0]}, WHY).ok
     assert not picture_row({"freezes": [351.0], "lags": [340.0]}, WHY).ok
     assert not picture_row({"freezes": [10.0]}, {"no fresh command"}).ok, "it held for another reason"
-    assert kill_row([300.0]).ok
-    assert not kill_row([10.0] * 99 + [301.0]).ok
+    assert kill_row("the leader", [300.0]).ok
+    assert not kill_row("the leader", [10.0] * 99 + [301.0]).ok
     good = dict.fromkeys(STATES, [5.0] * 100)
     assert stop_row(good).ok
     assert not stop_row({**good, "held": [5.0] * 98 + [21.0] * 2}).ok
+
+
+def test_loop_of_lerobot_has_a_rate_and_is_compared_by_its_slow_beats() -> None:
+    even = [n / 29.8 for n in range(200)]
+    theirs = Loop([even, even], [0.02])
+    assert loop_row(Loop([even, even], [0.04]), theirs, 6.7).ok
+    assert not loop_row(Loop([[n / 29.4 for n in range(200)]] * 2, [0.04]), theirs, 6.7).ok, "too slow"
+    late = [at + (0.012 if n % 50 == 0 else 0.0) for n, at in enumerate(even)]
+    assert not loop_row(Loop([late, late], [0.04]), theirs, 6.7).ok, "one beat of fifty is late"
+
+
+def test_turns_of_a_loop_are_not_one() -> None:
+    assert Loop([[0.0, 0.1], [5.0, 5.1]]).rate == pytest.approx(10)
+
+
+def test_age_of_a_picture_is_known_by_its_number() -> None:
+    number = int(1000.0 * FPS)
+    assert age_s(number % 2**16, 1000.05) == pytest.approx(0.05)
+    assert age_s(2**16 - 1, 2**16 / FPS) == pytest.approx(1 / FPS), "the numbers begin anew"
