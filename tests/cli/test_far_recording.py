@@ -13,8 +13,9 @@ from fixtures.waiting import eventually
 
 from strands_robots.cli import far_recording
 from strands_robots.cli.far_recording import FarRobot, FarTask
+from strands_robots.cli.led_robot import halted_first
 from strands_robots.cli.output import CliError
-from strands_robots.errors import NoAnswerError
+from strands_robots.errors import NoAnswerError, RobotError
 from strands_robots.fleet.adapter import RobotEvent
 from strands_robots.recording.file import Recorder
 
@@ -205,6 +206,16 @@ def test_start_that_is_not_answered_halts_the_robot(arm: ServedArm, robot: FarRo
     with pytest.raises(CliError, match="arm-1 did not confirm its stop and may move"):
         robot.begin(30)
     assert arm.halts == ["its start was not answered"]
+
+
+def test_robot_that_refused_its_start_is_not_halted_for_others_may_move_it(arm: ServedArm, robot: FarRobot) -> None:
+    def refused() -> None:
+        raise RobotError("it is driven by hand")
+
+    arm.start = refused
+    with pytest.raises(CliError, match="driven by hand"), halted_first(robot):
+        robot.begin(30)
+    assert arm.halts == []
 
 
 def test_refused_motion_of_the_mesh_is_recorded_as_that_of_device_connect(

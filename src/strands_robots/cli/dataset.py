@@ -177,8 +177,9 @@ def _record_served(  # noqa: PLR0917 - one robot, and what is done with it
         RecordingSession(folder, attempts.fps, task, far.kind, lambda said: screen.say(said, "yellow")) as session,
         answering(far.networks, far.name, ""),
         buttons(far.remote.id, attempts.state, task, on_mesh=far.on_mesh),
-        halted_first(far),
+        # A robot that another caller holds is not halted.
         far.held(),
+        halted_first(far),
     ):
         record_attempts(screen, far, session, attempts)
         count = session.episodes

@@ -15,6 +15,7 @@ from functools import partial
 from typing import Any
 
 from strands_robots.cli.far_hand import HandLeader
+from strands_robots.cli.led_robot import NotBegunError
 from strands_robots.cli.network import one_robot
 from strands_robots.cli.output import CliError, Screen
 from strands_robots.cli.record import NO_CAMERAS
@@ -172,7 +173,8 @@ class FarRobot:
         """Begin an attempt, and start the policy where it has one.
 
         Raises:
-            CliError: the robot refused it.
+            NotBegunError: the robot refused it.
+            CliError: it did not answer.
         """
         if self._policy and self._hand is None and seconds is None and not self.remote.has_lease:
             raise CliError(
@@ -185,10 +187,11 @@ class FarRobot:
             except RefusalError as refused:
                 why = said(refused)
                 task.end(why)
-                if isinstance(refused, NoAnswerError | UnreachableError):
-                    # It may have begun all the same.
-                    verdict = self.remote.halt("its start was not answered")
-                    why += "" if verdict.stopped else f" {self.name} did not confirm its stop and may move."
+                if not isinstance(refused, NoAnswerError | UnreachableError):
+                    raise NotBegunError(why) from refused
+                # It may have begun all the same.
+                verdict = self.remote.halt("its start was not answered")
+                why += "" if verdict.stopped else f" {self.name} did not confirm its stop and may move."
                 raise CliError(why) from refused
         threading.Thread(target=self._watch, args=(task,), name=f"attempt {self.name}", daemon=True).start()
         return task

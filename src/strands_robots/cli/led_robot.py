@@ -31,6 +31,9 @@ NO_NETWORK = "--no-network leads it without one: then Ctrl-C here is the only st
 ENDS = (signal.SIGTERM, signal.SIGHUP)
 """Signals that end a command, beside Ctrl-C."""
 
+ENDED = "teleop ended"
+"""Reason of the halt at the end of a command."""
+
 VERDICT_S = 60.0
 """Longest wait for the verdict on a stop of others, which is there within the halt deadline."""
 
@@ -167,7 +170,7 @@ class LedRobot:
     def halt_last(self) -> StopVerdict:
         """Halt it at the end: on its networks still, it begins no other motion."""
         put_away(self.robot)
-        verdict: StopVerdict = self.robot.halt("teleop ended")
+        verdict: StopVerdict = self.robot.halt(ENDED)
         return verdict
 
     def hold(self, screen: Screen) -> StopVerdict | None:
@@ -250,10 +253,18 @@ def _leave_mesh(robot: Any) -> None:
     robot.mesh = robot.input_sink = None
 
 
+class NotBegunError(CliError):
+    """Failure of a command that its robot refused.
+
+    Nothing of the command moves it, and a halt would only stop what others have it do.
+    """
+
+
 @contextmanager
 def halted_first(robot: Any) -> Iterator[None]:
     """Halt ``robot`` first where the block raises.
 
+    After :class:`NotBegunError` it is left alone.
     SIGTERM and the end of the terminal are Ctrl-C inside.
     What was entered before, such as the leader's device, may take its time to be left.
     """
@@ -264,8 +275,10 @@ def halted_first(robot: Any) -> Iterator[None]:
         before = {each: signal.signal(each, signal.default_int_handler) for each in ends}
     try:
         yield
+    except NotBegunError:
+        raise
     except BaseException:
-        robot.halt("teleop ended")
+        robot.halt(ENDED)
         raise
     finally:
         for each, handler in before.items():

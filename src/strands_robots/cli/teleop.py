@@ -28,11 +28,11 @@ from strands_robots.cli.leading import (
     made_follower,
     recorded_leader,
 )
-from strands_robots.cli.led_robot import LedRobot, Serving, halted_first
+from strands_robots.cli.led_robot import ENDED, LedRobot, NotBegunError, Serving, halted_first
 from strands_robots.cli.network import Network, answering, mesh_peer, one_robot, reached
 from strands_robots.cli.output import POLL_S, CliError, Exit, Screen, table, wait_until
 from strands_robots.envelope import text_of
-from strands_robots.errors import NoAnswerError, NoSuchRobotError, RefusalError
+from strands_robots.errors import NoAnswerError, NoSuchRobotError, RefusalError, UnreachableError
 from strands_robots.policies.rollout import STOP_JOIN_S
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.teleoperators import FULL_RANGES_PER_S, LeaderPolicy
@@ -317,25 +317,18 @@ def _lead_peer(
             policy = LeaderPolicy(source, device=DEVICE, method=options.method, max_speed=speed, period=1 / rate)
             led = LedPeer(follower, mesh.peer_id, policy)
             publishing = publisher(mesh, led.bounded, options.method, rate)
-            standing = threading.Event()
-
-            def stop() -> None:
-                if not standing.is_set():
-                    follower.stop()
-                    standing.set()
-
-            follower.open_stream(mesh.peer_id)
+            duration = getattr(source, "duration", None) or 0.0
             try:
-                publishing.start()
-                announce(screen, leader, peer, source)
-                why = wait_until(screen, options.timed(led.over), getattr(source, "duration", None) or 0.0, at_end=stop)
-            finally:
                 # The follower is stopped first; publishing ends even when it does not answer.
-                try:
-                    stop()
+                with halted_first(follower):
+                    with _refused():
+                        follower.open_stream(mesh.peer_id)
+                    publishing.start()
+                    announce(screen, leader, peer, source)
+                    why = wait_until(screen, options.timed(led.over), duration, at_end=lambda: follower.halt(ENDED))
                     screen.say(f"{peer} stands still.", "green")
-                finally:
-                    sent = publishing.stop()
+            finally:
+                sent = publishing.stop()
     row = {"frames": sent["frames"], "errors": policy.errors, "applied": led.counters.get("frames_received", 0)}
     screen.data({"event": "ended", **row, "why": why, "stopped": True})
     if led.bounded.error:
@@ -374,7 +367,7 @@ def _lead_served(
 
         def stop() -> None:
             hand.cease()
-            verdicts.append(robot.halt("teleop ended"))
+            verdicts.append(robot.halt(ENDED))
             hand.end()
 
         over = options.timed(lambda: ends[0][0] or "The leader has finished." if ends else "")
@@ -429,12 +422,18 @@ def _report_sent(screen: Screen, why: str, row: Mapping[str, Any]) -> None:
 
 @contextmanager
 def _refused() -> Iterator[None]:
-    """Raise a refusal as the command's failure."""
+    """Raise a refusal as the command's failure.
+
+    Raises:
+        NotBegunError: the robot refused it, or is not there.
+        CliError: it did not answer, and may have begun.
+    """
     try:
         yield
     except RefusalError as refusal:
         silent = isinstance(refusal, NoAnswerError | NoSuchRobotError)
-        raise CliError(str(refusal), Exit.SILENT if silent else Exit.REFUSED) from refusal
+        failure = CliError if isinstance(refusal, NoAnswerError | UnreachableError) else NotBegunError
+        raise failure(str(refusal), Exit.SILENT if silent else Exit.REFUSED) from refusal
 
 
 def _how_served(network: Network, follower: str, peer_id: str | None, on_mesh: str | None, *, alone: bool) -> Serving:

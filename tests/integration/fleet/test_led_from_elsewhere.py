@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import pytest
 from fixtures.command_line import COMMAND
+from fixtures.forked import COMMANDS, start
+from fixtures.leaders import write_csv
 from fixtures.waiting import eventually, free_port
 
 from strands_robots.errors import RefusalError
@@ -105,13 +109,18 @@ def test_arm_goes_where_its_leader_is_and_holds_in_its_silence(robot: RemoteRobo
         beat(lead, far, lambda: lead.state.joints["shoulder_pan"] < -1.0)
 
 
-def test_second_leader_is_refused_by_the_first_ones_name(robot: RemoteRobot) -> None:
-    with robot.events(timeout=20) as events, led(robot):
-        with pytest.raises(RefusalError, match=r"(is driven by hand|hand leads it)"):
-            robot.lead("other")
-        assert runs(robot.status()), "a led robot is at work"
+def test_second_leader_is_refused_by_the_first_ones_name(site: Site, tmp_path: Path) -> None:
+    write_csv(tmp_path / "run.csv", [(0.0, {"shoulder_pan": 0.0})])
+    line = [*COMMAND, "replay", str(tmp_path / "run.csv"), "--to", "arm-1", *(["--mesh"] if site.mesh else [])]
+    with site.robot.events(timeout=20) as events, led(site.robot) as lead:
+        with start(line, imports=COMMANDS, stderr=subprocess.PIPE, text=True) as other:
+            beat(lead, dict(lead.state.joints), lambda: other.poll() is not None)
+            refused = other.communicate()[1]
+        assert re.search(r"(is driven by hand|hand leads it)", refused), refused
+        beat(lead, dict(lead.state.joints), lambda: lead.state.state == "led")
+        assert runs(site.robot.status()), "a led robot is at work"
         assert any(each.task and each.task["instruction"] == "follow hand" for each in events), "and announces it"
-    assert not runs(robot.status())
+    assert not runs(site.robot.status())
 
 
 def test_stop_ends_the_lead_and_the_leader_is_told(robot: RemoteRobot) -> None:

@@ -86,11 +86,12 @@ def test_an_emergency_stop_ends_the_replay_and_nothing_follows(join: Join, repla
     assert len(arm.ask("actions")) == count
 
 
-def test_ctrl_c_stops_the_follower_first(join: Join, replay: Any, wave: Path) -> None:
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM])
+def test_end_of_the_command_stops_the_follower_first(join: Join, replay: Any, wave: Path, end: signal.Signals) -> None:
     arm = join("arm-1", "arm", STRANDS_ROBOT_COMMAND_ALLOW="teleop_receive")
     replaying = replay(str(wave), "--to", "mesh:arm-1")
     followed(arm, 10)
-    replaying.send_signal(signal.SIGINT)
+    replaying.send_signal(end)
     code, [report] = ended(replaying)
     assert (code, report["why"], report["stopped"]) == (0, "Ctrl-C.", True)
     assert len(arm.ask("halts")[0]) == 1

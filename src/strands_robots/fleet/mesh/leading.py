@@ -106,8 +106,9 @@ class RemoteFollower:
             else:
                 return
 
-    def stop(self) -> None:
+    def halt(self, reason: str) -> None:
         """Stop the peer; raise :class:`RefusalError` when it does not confirm that."""
+        del reason  # a stop of the mesh carries none
         answer = self.ask("stop")
         if answer.get("ok") is not True:
             raise RobotError(f"{self.peer} did not confirm its stop: {answer.get('error') or 'no reason given'}")
