@@ -46,7 +46,7 @@ PARTS = {
     "arm": "A real arm (in the environment of `make real-arm`)",
 }
 
-HOURS = {"dataset-train"}
+LONG = {"dataset-train"}
 """Parts that are measured only when they are asked for by name."""
 
 INTRODUCTION = """# Benchmarks
@@ -111,7 +111,7 @@ def main() -> int:
 
     console, kept = Console(), True
     pages: dict[str, str] = {}
-    for name in options.parts or [each for each in available if each not in HOURS]:
+    for name in options.parts or [each for each in available if each not in LONG]:
         started = time.monotonic()
         rows: list[Row] = importlib.import_module(f"benchmarks.{module_of(name)}").run(quick=options.quick)
         kept = kept and all(row.ok for row in rows)

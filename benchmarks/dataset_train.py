@@ -1,6 +1,6 @@
 """The same small ACT trained on our recording over the network and on LeRobot's own: successes on common seeds.
 
-It takes an hour or more on two cores, most of it for 200 episodes of both policies, so it is measured only when it is
+It takes half an hour, most of it for the recordings in real time, so it is measured only when it is
 asked for by its name.
 """
 

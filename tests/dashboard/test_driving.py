@@ -307,10 +307,11 @@ async def test_lead_needs_control_and_brings_its_lease(page: Page) -> None:
 
 
 async def test_refusal_of_a_lead_is_the_answer(page: Page) -> None:
-    page.feed.answers["lead"] = [error("hand of arm-9 leads it")]
+    page.feed.answers["lead"] = [error("hand of arm-9 leads it", refused="busy")]
     await page.take()
     assert text_of(await led(page)) == "hand of arm-9 leads it"
     assert "does not lead" in page.control.give_back(KEY)
+    assert page.feed.stops == 0
 
 
 async def test_page_that_goes_while_a_lead_begins_leaves_the_robot_stopped(page: Page) -> None:
@@ -338,9 +339,13 @@ async def test_turns_with_a_policy_lead_joints_alone(page: Page, kind: str) -> N
 async def test_robot_is_stopped_before_the_end_of_the_lead_is_waited_for(page: Page, ending: str) -> None:
     await page.take()
     await led(page)
-    await (page.control.leave() if ending == "leave" else getattr(page.control, ending)(KEY))
-    assert page.feed.stops == 1
-    assert page.control.pictures(KEY) is None
+    page.feed.stopped.clear()
+    ended = asyncio.create_task(page.control.leave() if ending == "leave" else getattr(page.control, ending)(KEY))
+    await until(lambda: page.feed.stops == 1, what="the stop")
+    assert not any("end" in each for each in page.feed.asked("leadTo"))
+    page.feed.stopped.set()
+    await ended
+    assert page.feed.asked("leadTo")[-1]["end"] is True
     (over,) = [each for each in page.told if each.get("state") == "over"]
     assert over["stopped"] is True
 
@@ -349,6 +354,30 @@ async def test_lost_control_ends_the_lead_and_stops_no_other_holder(page: Page) 
     await page.take()
     await led(page)
     page.feed.answers["renewControl"] = [error("agent-1 holds control", code="displaced")]
-    await until(lambda: any(each.get("halted") for each in page.told), what="the lead is over")
+    await until(lambda: any(each.get("state") == "over" for each in page.told), what="the lead is over")
     assert page.feed.stops == 0
     assert not page.control.holds(KEY)
+
+
+async def test_halt_of_a_led_robot_waits_for_nothing_of_the_lead(page: Page) -> None:
+    await page.take()
+    await led(page)
+    page.control.cease(KEY, "it was halted")
+    assert any(each.get("state") == "over" and each["why"] == "it was halted" for each in page.told)
+    await until(lambda: any("end" in each for each in page.feed.asked("leadTo")), what="the end of the lead")
+    assert "does not lead" in page.control.give_back(KEY)
+
+
+async def test_robot_that_did_not_answer_whether_it_is_led_is_stopped(page: Page) -> None:
+    await page.take()
+    page.feed.answers["lead"] = [error("no answer in 10 s")]
+    assert is_error(await led(page))
+    assert page.feed.stops == 1
+
+
+async def test_robot_of_a_page_that_is_silent_is_stopped(page: Page) -> None:
+    await page.take()
+    await led(page)
+    await until(lambda: any(each.get("state") == "over" for each in page.told), what="it is given up")
+    assert page.feed.stops == 1
+    assert "nothing was heard of the page" in page.told[-1]["why"]

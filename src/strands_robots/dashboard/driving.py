@@ -10,7 +10,7 @@ import asyncio
 import contextlib
 import math
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Coroutine, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -169,6 +169,7 @@ class HandControl:
         self._tell = tell
         self._held: dict[str, HeldRobot] = {}
         self._taking: set[str] = set()
+        self._endings: set[asyncio.Future[object]] = set()
         self._gone = False
 
     def lease(self, key: str) -> dict[str, str]:
@@ -234,29 +235,21 @@ class HandControl:
             asked |= self._lease_of(held)
             answer = await held.robot.call("lead", asked, ANSWER_S, moves=True)
             if is_error(answer):
+                if not {"refused", "code"} & answer.keys():
+                    # These are not the robot's words: it may have begun.
+                    await held.robot.stop()
                 return answer
             if self._held.get(key) is not held or "lead_id" not in answer:
                 # The page has gone, or has lost control: nobody is there to lead it.
                 await held.robot.stop()
                 return error(f"{held.robot.id} is not held any more, and was stopped.")
-            far = FarLead(held.robot.id, caller(held.robot), answer, policy=True)
+            held.lead = PageLead(
+                FarLead(held.robot.id, caller(held.robot), answer, policy=True),
+                LeadTold(self, key, held),
+                ShownPictures() if pictures else None,
+            )
         finally:
             self._taking.discard(key)
-
-        def tell(kind: str, **facts: Any) -> None:
-            self._tell({"type": kind, "key": key, **facts})
-
-        def ended(why: str, halted: bool) -> None:
-            held.lead = None
-            tell("turn", state="over", why=why, halted=halted)
-
-        held.lead = PageLead(
-            far,
-            told=lambda state, why: tell("turn", state=state, why=why),
-            let_go=lambda why: tell("let_go", why=why),
-            ended=ended,
-            pictures=ShownPictures() if pictures else None,
-        )
         return success(f"The policy drives {held.robot.id}. A push takes over.")
 
     def give_back(self, key: str) -> str:
@@ -272,15 +265,52 @@ class HandControl:
         held = self._held.get(key)
         if held is None or held.lead is None:
             return error("This page does not lead the robot.")
-        return await self._ended(key, held, held.lead)
+        return await self.ended(key, held, "")
 
-    async def _ended(self, key: str, held: HeldRobot, lead: PageLead) -> Envelope:
-        held.lead = None
-        # The stop waits for nothing of the lead.
-        answer = await held.robot.stop()
-        await lead.end()
-        self._tell({"type": "turn", "key": key, "state": "over", "why": "", "stopped": grade(answer).stopped})
+    async def ended(self, key: str, held: HeldRobot, why: str) -> Envelope:
+        """Stop a robot that this page leads, end the lead, and tell the page."""
+        lead, held.lead = held.lead, None
+        if lead is None:
+            return error("This page does not lead the robot.")
+        # The stop waits for nothing of the lead, and the robot holds where the stop is lost.
+        lead.cease()
+        self._taking.add(key)
+        try:
+            answer = await held.robot.stop()
+            await lead.end()
+        finally:
+            self._taking.discard(key)
+        self.tell_turn(key, "over", why, stopped=grade(answer).stopped, text=text_of(answer))
         return answer
+
+    def cease(self, key: str, why: str) -> None:
+        """End what the hand does at a robot that is being stopped; waits for nothing."""
+        held = self._held.get(key)
+        if held is None:
+            return
+        self.release(key, why)
+        lead, held.lead = held.lead, None
+        if lead is not None:
+            lead.cease()
+            self._keep(lead.end())
+            self.tell_turn(key, "over", why)
+
+    def tell_turn(self, key: str, state: str, why: str, **more: Any) -> None:
+        """Tell the page who drives a robot."""
+        self._tell({"type": "turn", "key": key, "state": state, "why": why, **more})
+
+    def tell_let_go(self, key: str, why: str) -> None:
+        """Tell the page why a push has ended."""
+        self._tell({"type": "let_go", "key": key, "why": why})
+
+    def end_soon(self, key: str, held: HeldRobot, why: str) -> None:
+        """Stop a robot that nobody leads any more."""
+        self._keep(self.ended(key, held, why))
+
+    def _keep(self, work: Coroutine[Any, Any, object]) -> None:
+        task = asyncio.ensure_future(work)
+        self._endings.add(task)
+        task.add_done_callback(self._endings.discard)
 
     def pictures(self, key: str) -> ShownPictures | None:
         """Return the pictures by which the page leads a robot; None where it does not."""
@@ -292,12 +322,12 @@ class HandControl:
         held = self._held.get(key)
         if held is None:
             return error("This page does not hold the robot.")
-        if held.lead is not None:
-            await self._ended(key, held, held.lead)
         if held.jog is not None:
             held.jog.release("control was given back")
             if held.jog.task is not None:
                 await asyncio.wait([held.jog.task], timeout=ANSWER_S)
+        if held.lead is not None:
+            await self.ended(key, held, "control was given back")
         self._held.pop(key, None)
         if held.renewing is not None:
             held.renewing.cancel()
@@ -308,7 +338,7 @@ class HandControl:
         held = self._held.get(key)
         if held is None:
             return TAKE_FIRST
-        if held.jog is not None:
+        if held.jog is not None or key in self._taking:
             return "Another jog of this robot has not ended yet."
         try:
             axis = JogAxis.of(message)
@@ -321,6 +351,12 @@ class HandControl:
         jog = held.jog = Jogging(axis, units or {})
         jog.task = asyncio.create_task(self._jog(key, held, jog))
         return ""
+
+    def alive(self, key: str) -> None:
+        """Note that somebody looks at the page of a robot that it leads."""
+        held = self._held.get(key)
+        if held is not None and held.lead is not None:
+            held.lead.alive()
 
     def beat(self, key: str) -> None:
         """Note that the button is still held down."""
@@ -389,7 +425,7 @@ class HandControl:
             if lead is not None:
                 # Another holder may move it now: it is not stopped here.
                 await lead.end()
-                self._tell({"type": "turn", "key": key, "state": "over", "why": held.lost, "halted": True})
+                self.tell_turn(key, "over", held.lost)
             return
 
     async def _jog(self, key: str, held: HeldRobot, jog: Jogging) -> None:
@@ -500,6 +536,32 @@ class HandControl:
     @staticmethod
     def _lease_of(held: HeldRobot) -> dict[str, str]:
         return {LEASE_ID: held.lease_id, **({"robot_name": held.part} if held.part else {})}
+
+
+class LeadTold:
+    """What is heard of the lead of a held robot.
+
+    Args:
+        control: of the page.
+        key: of the robot.
+        held: the robot.
+    """
+
+    def __init__(self, control: HandControl, key: str, held: HeldRobot) -> None:
+        self._control, self._key, self._held = control, key, held
+
+    def turned(self, state: str, why: str) -> None:
+        self._control.tell_turn(self._key, state, why)
+
+    def let_go(self, why: str) -> None:
+        self._control.tell_let_go(self._key, why)
+
+    def over(self, why: str, *, halted: bool) -> None:
+        self._held.lead = None
+        self._control.tell_turn(self._key, "over", why, halted=halted)
+
+    def lost(self, why: str) -> None:
+        self._control.end_soon(self._key, self._held, why)
 
 
 def stated_positions(state: Mapping[str, Any], units: Mapping[str, str]) -> dict[str, float]:

@@ -90,14 +90,14 @@ class PageSession:
         self.ticket = secrets.token_urlsafe(18)
         self._server, self._socket = server, socket
         self._role, self._local = role, local
-        self._control = HandControl(self.tell)
+        self._control = HandControl(self._tell_of_hand)
         self._waiting: asyncio.Queue[dict[str, Any]] = asyncio.Queue(WAITING_MAX)
         self._watched, self._joints_at = "", 0.0
         self._forms: list[Any] | None = None
         self._looking: asyncio.Task[None] | None = None
         self._calls: set[asyncio.Task[None]] = set()
         self._thumbnails: dict[str, asyncio.Task[None]] = {}
-        self._leading: asyncio.Task[None] | None = None
+        self._led: dict[str, asyncio.Task[None]] = {}
         self._sending = asyncio.Lock()
 
     @property
@@ -110,6 +110,12 @@ class PageSession:
         with contextlib.suppress(asyncio.QueueFull):
             self._waiting.put_nowait(message)
 
+    def _tell_of_hand(self, message: dict[str, Any]) -> None:
+        if message["type"] == "turn" and message["state"] == "over" and message["key"] in self._led:
+            # A camera that gives nothing would keep its stream.
+            self._led.pop(message["key"]).cancel()
+        self.tell(message)
+
     async def run(self) -> None:
         """Serve the page until it goes, then halt and give back what it holds."""
         sending: asyncio.Task[None] | None = None
@@ -121,7 +127,7 @@ class PageSession:
         except (WebSocketDisconnect, KeyError, RuntimeError) as gone:
             logger.debug("A page is gone, or sent bytes: %s", type(gone).__name__)
         finally:
-            for task in (sending, self._looking, self._leading, *self._thumbnails.values()):
+            for task in (sending, self._looking, *self._led.values(), *self._thumbnails.values()):
                 if task is not None:
                     task.cancel()
             await asyncio.shield(asyncio.ensure_future(self._control.leave()))
@@ -188,6 +194,8 @@ class PageSession:
             return
         if kind == "beat":
             self._control.beat(key)
+        elif kind == "alive":
+            self._control.alive(key)
         elif kind == "unjog":
             self._control.release(key, "the page was hidden" if message.get("why") == "hidden" else "released")
         elif kind == "watch":
@@ -322,7 +330,7 @@ class PageSession:
             # Before anything else of the message is looked at.
             stopped = self._server.robots.of(key)
             # Its next stretch may be on the way to a robot that stands between two of them.
-            self._control.release(key, "it was halted")
+            self._control.cease(key, "it was halted")
             answer = await stopped.stop()
             self._note_halt(stopped.feed.network, stopped.id, grade(answer).stopped)
             return answer
@@ -371,10 +379,8 @@ class PageSession:
         camera = text("camera", message.get("camera", ""), longest=CAMERA_NAME_MAX, empty=True)
         answer = await self._control.lead(key, policy, task, pictures=bool(camera))
         pictures = self._control.pictures(key)
-        if pictures is not None:
-            if self._leading is not None:
-                self._leading.cancel()
-            self._leading = asyncio.create_task(self._send_pictures(key, camera, pictures))
+        if pictures is not None and not is_error(answer):
+            self._led[key] = asyncio.create_task(self._send_pictures(key, camera, pictures))
         return answer
 
     async def _send_pictures(self, key: str, camera: str, pictures: ShownPictures) -> None:
@@ -384,10 +390,8 @@ class PageSession:
             while self._control.pictures(key) is pictures:
                 frames = self._server.pictures.camera(robot.feed, robot.id, camera)
                 async with contextlib.aclosing(frames):
-                    async for frame, asked in frames:
-                        if self._control.pictures(key) is not pictures:
-                            return
-                        await self._send_picture(f"{LED}{pictures.send(frame, asked)}:{key}", frame)
+                    async for picture in frames:
+                        await self._send_picture(f"{LED}{pictures.send(picture)}:{key}", picture.jpeg)
                 # A stream for which there was no room is asked for again.
                 await asyncio.sleep(UNKNOWN_AGAIN_S)
 

@@ -120,17 +120,20 @@ class Poses:
 
 
 class TimedPicture(NamedTuple):
-    """A JPEG picture, and when it was asked for (monotonic): it is no older."""
+    """A JPEG picture, and when it was taken, in monotonic seconds of this process.
+
+    The robot's clock is not compared: that is halfway between the question and the answer.
+    """
 
     jpeg: bytes
-    asked: float
+    taken: float
 
 
 @dataclass(slots=True)
 class _Stream:
     viewers: int = 0
     frame: bytes = b""
-    asked: float = 0.0
+    taken: float = 0.0
     number: int = 0
     changed: asyncio.Condition = field(default_factory=asyncio.Condition)
     ended: bool = False
@@ -177,7 +180,7 @@ class Pictures:
                         await stream.changed.wait()
                     if stream.ended:
                         return
-                    seen, picture = stream.number, TimedPicture(stream.frame, stream.asked)
+                    seen, picture = stream.number, TimedPicture(stream.frame, stream.taken)
                 yield picture
         finally:
             stream.viewers -= 1
@@ -211,13 +214,14 @@ async def _take(stream: _Stream, ask: Callable[[], Awaitable[Envelope]], hz: flo
         while True:
             began = time.monotonic()
             answer = await ask()
+            taken = (began + time.monotonic()) / 2
             encoded = answer.get("jpeg")
             frame = b"" if is_error(answer) or not isinstance(encoded, str) else _decoded(encoded)
             if not frame:
                 await asyncio.sleep(AGAIN_S)
                 continue
             async with stream.changed:
-                stream.frame, stream.asked, stream.number = frame, began, stream.number + 1
+                stream.frame, stream.taken, stream.number = frame, taken, stream.number + 1
                 stream.changed.notify_all()
             await asyncio.sleep(max(0.0, began + 1.0 / hz - time.monotonic()))
     finally:

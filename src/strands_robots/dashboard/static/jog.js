@@ -5,6 +5,7 @@ import { S } from "./strings.js";
 const BEAT_MS = 50;
 const UP = "qwertyuiop", DOWN = "asdfghjkl;";
 const DEAD_ZONE = 0.35;
+const OWN = ["released", "the page was hidden"];
 
 export class Jog {
   constructor(state, said) {
@@ -24,7 +25,7 @@ export class Jog {
     window.addEventListener("keyup", (event) => { if (this.now && this.now.by === event.code) this.end("released"); });
     state.addEventListener("lost", () => { this.end("lost"); this.setEnabled(false); });
     state.addEventListener("jogged", ({ detail }) => this.ended(detail));
-    state.addEventListener("let_go", ({ detail }) => { this.over(detail); setText(this.said, S.letGo(detail.why)); this.said.dataset.tone = "warn"; });
+    state.addEventListener("let_go", ({ detail }) => this.letGo(detail));
   }
 
   setEnabled(enabled) {
@@ -53,6 +54,15 @@ export class Jog {
     this.state.send({ type: "unjog", key: this.now.key, why });
     if (this.now.node) this.now.node.classList.remove("held");
     this.now = null;
+  }
+
+  letGo({ key, why }) {
+    // What this page let go of is over here already, and another push may be on.
+    const own = OWN.includes(why);
+    if (key !== this.key || (own && this.now)) return;
+    if (!own) this.over({ key });
+    setText(this.said, S.letGo(why));
+    this.said.dataset.tone = "warn";
   }
 
   over(detail) {

@@ -3,6 +3,7 @@ import { el, setAttr, setShown, setText } from "./dom.js";
 import { S } from "./strings.js";
 
 const MOCK = "mock";
+const ALIVE_MS = 250;
 const SIMULATED = ["strands_sim", "sim"];
 
 export class Turns {
@@ -24,6 +25,9 @@ export class Turns {
       el("div", { class: "tools" }, this.go, this.finish), this.said);
     state.addEventListener("turn", ({ detail }) => { if (detail.key === this.key) this.turned(detail); });
     state.addEventListener("lost", () => { if (this.on) this.turned({ state: "over", why: S.turnLost }); });
+    // The server stops a robot that is led by a page of which it hears nothing.
+    setInterval(() => { if (this.on && !document.hidden) state.send({ type: "alive", key: this.key }); }, ALIVE_MS);
+    document.addEventListener("visibilitychange", () => { if (document.hidden) this.close(); });
   }
 
   get on() { return ["policy", "led", "held"].includes(this.now); }
@@ -65,17 +69,21 @@ export class Turns {
 
   async press() {
     if (this.on) { await this.ask({ type: "give_back" }); return; }
-    const camera = this.camera.value;
+    const camera = this.camera.value, key = this.key;
     this.go.disabled = true;
     this.say(S.turnBegins, "warn");
-    if (await this.ask({ type: "lead", policy: this.policy.value.trim(), task: this.task.value.trim(), camera }) && camera) this.pictures.led(camera);
+    const begun = await this.ask({ type: "lead", policy: this.policy.value.trim(), task: this.task.value.trim(), camera });
+    if (!begun) return;
+    if (key !== this.key || document.hidden) this.state.ask({ type: "end_lead", key });
+    else if (camera) this.pictures.led(camera);
   }
 
-  turned({ state, why }) {
+  turned({ state, why, stopped, text }) {
     this.now = state;
     if (state === "over") {
       this.pictures.ledNoMore();
-      this.say(S.turnOver(why), why ? "warn" : "good");
+      if (stopped === false || stopped === null) this.say(S.jogNotStopped(text), "bad");
+      else this.say(S.turnOver(why), why ? "warn" : "good");
     } else this.say(state === "held" ? S.turnHeld(why) : S.turns[state], state === "policy" ? "good" : "warn");
   }
 
