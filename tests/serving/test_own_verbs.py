@@ -13,9 +13,10 @@ from fixtures.barista import Barista, Careless, Stubborn
 from strands_robots import Permit, verb
 from strands_robots.adapted import adapt
 from strands_robots.envelope import success, text_of
+from strands_robots.serving.advertised import RobotDescription
 from strands_robots.serving.offered_verbs import answer_of, own_verbs
 from strands_robots.serving.pipeline import Command, Pipeline, Result
-from strands_robots.serving.verbs import Kind
+from strands_robots.serving.verbs import Kind, described
 from strands_robots.utils import ValidationError
 
 
@@ -71,7 +72,6 @@ def test_motion_that_no_stop_would_end_is_refused_at_registration() -> None:
     with pytest.raises(ValidationError, match="a motion that no stop would end"):
         own_verbs(with_verb(brew))
     assert own_verbs(with_verb(brew, motion=False))["brew"].kind is Kind.READ
-    assert own_verbs(with_verb(brew, motion=False, changes=True))["brew"].kind is Kind.CHANGE
 
     class Halts:
         def halt(self, reason: str = "") -> dict[str, Any]:
@@ -81,6 +81,17 @@ def test_motion_that_no_stop_would_end_is_refused_at_registration() -> None:
         def brew(self) -> None: ...
 
     assert own_verbs(adapt(Halts()))["brew"].kind is Kind.MOTION
+
+
+def test_change_is_a_motion_to_its_callers_and_says_that_it_moves_nothing() -> None:
+    def dim(self: object) -> None: ...
+
+    dimmed = own_verbs(with_verb(dim, motion=False, changes=True))["dim"]
+    assert (dimmed.kind, dimmed.leased) == (Kind.CHANGE, False)
+    advertised = RobotDescription.of([described(dimmed)]).verbs["dim"]
+    assert (advertised.kind, advertised.changes) == ("motion", True)
+    with pytest.raises(ValidationError, match="changes=True goes with motion=False"):
+        with_verb(dim, changes=True)
 
 
 def test_description_beyond_64_kb_is_refused() -> None:

@@ -126,6 +126,7 @@ def _form(verb: AdvertisedVerb) -> dict[str, Any]:
         "name": verb.name,
         "kind": "read" if verb.reads else "motion",
         "own": verb.own,
+        "changes": verb.changes,
         "lasts_s": verb.lasts_s,
         "summary": verb.summary[:TEXT_MAX],
         "parameters": [{**_field(each), "shown": each.name in shown} for each in verb.parameters[:PARAMETERS_MAX]],

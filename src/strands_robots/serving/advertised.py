@@ -188,6 +188,7 @@ class AdvertisedVerb:
         own: it is declared one of the robot's own, or the robot is none of ours.
         lasts_s: seconds that it may take before it answers; 0 for a verb that answers soon.
         stated: all its parameters are known; else it may take any.
+        changes: it says that it moves nothing, and is a motion to its callers all the same: not every caller may.
     """
 
     name: str
@@ -198,6 +199,7 @@ class AdvertisedVerb:
     own: bool
     lasts_s: float
     stated: bool
+    changes: bool = False
 
     @property
     def reads(self) -> bool:
@@ -394,6 +396,7 @@ class _Reader:
             own=foreign or _declared_own(function),
             lasts_s=_seconds(labels.get("lasts_s")),
             stated=isinstance(stated, Mapping) and len(parameters) == len(properties) - len(leases),
+            changes=kind == "motion" and labels.get("changes") in ("true", True),
         )
 
     def _parameter(self, verb: str, name: object, said: object, needed: set[str]) -> AdvertisedParameter | None:

@@ -381,12 +381,17 @@ Labels = dict[str, str | list[str]]
 
 
 def labels_of(verb: Verb) -> Labels:
-    """Return the labels of a verb: direction, whose it is, seconds to return."""
+    """Return the labels of a verb: direction, whose it is, seconds to return.
+
+    A change moves nothing and says so, besides what it has in common with a motion.
+    """
     kind: Labels = {"direction": "read"} if verb.kind is Kind.READ else {"direction": "write"}
     if verb.kind is not Kind.READ and verb.critical:
         kind["safety"] = "critical"
     if verb.own:
         kind["own"] = "true"
+    if verb.kind is Kind.CHANGE:
+        kind["changes"] = "true"
     duration = verb.by_name.get("duration") if verb.lasts else None
     lasts_s = verb.lasts_s if duration is None else float(duration.default)
     if lasts_s:

@@ -128,9 +128,13 @@ class NetworkBench:
         return next(iter(self.on.values()))
 
     def motions(self, network: str = "") -> list[AdvertisedVerb]:
-        """Return its verbs that may move it, on a network; by default on the first one."""
+        """Return its verbs that may move it, on a network; by default on the first one.
+
+        One that changes something and moves nothing is none.
+        """
         robot = self.on[network] if network else self.remote
-        return [each for each in robot.verbs.values() if each.kind == "motion" and each.name not in RESUMES]
+        verbs = (each for each in robot.verbs.values() if each.name not in RESUMES)
+        return [each for each in verbs if each.kind == "motion" and not each.changes]
 
     def plain_reads(self, network: str) -> list[AdvertisedVerb]:
         """Return its reads on a network that need neither an argument nor a motion."""

@@ -61,6 +61,7 @@ def test_page_shows_a_recording_and_sends_each_word_that_fits(page: Any, served:
     shown.locator("a.name").click()
     works(page, "Begin", "End")
     page.get_by_text("Put things back, then press Begin.").wait_for()
+    assert page.locator("button.verb[data-verb='redoEpisode'] .does").inner_text() == "own, changes"
     picture(page, "recording-waits")
     button(page, "Begin").click()
     eventually(lambda: served.feed.asked("beginEpisode") == [{}], what="the word")

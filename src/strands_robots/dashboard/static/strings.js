@@ -183,6 +183,7 @@ export const S = {
   run: "Run",
   reads: "reads",
   moves: "moves",
+  changes: "changes",
   stops: "stops",
   required: "required",
   badJson: (name) => `${name} is no JSON.`,

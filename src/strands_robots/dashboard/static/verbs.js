@@ -39,7 +39,7 @@ export class Verbs {
     this.forms = new Map();
     this.names = new Set(forms.map((form) => form.name));
     this.buttons = new Map(forms.map((form) => {
-      const kind = STOPS.includes(form.name) ? S.stops : form.kind === "read" ? S.reads : S.moves;
+      const kind = STOPS.includes(form.name) ? S.stops : form.kind === "read" ? S.reads : form.changes ? S.changes : S.moves;
       const button = el("button", { type: "button", class: "verb", "data-verb": form.name }, el("code", { text: form.name }), " ", el("span", { class: "does", "data-kind": form.kind, text: form.own ? S.ownKind(kind) : kind }));
       button.addEventListener("click", () => this.choose(form));
       return [form.name, button];
