@@ -539,7 +539,7 @@ class HandControl:
 
 
 class LeadTold:
-    """What is heard of the lead of a held robot.
+    """Listener to the lead of a held robot.
 
     Args:
         control: of the page.

@@ -188,8 +188,9 @@ class PageLead:
 
     @property
     def _leads(self) -> bool:
-        """True while the hand leads; until the robot has answered to a turn, its state is of the one before."""
+        """True while the hand leads."""
         lead = self._lead
+        # Until the robot has answered to a turn, its state is of the one before.
         return lead.leads and (lead.state.turn < lead.turn or lead.state.state == "led")
 
     def _grip(self) -> None:
