@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -37,6 +38,19 @@ def test_leads_that_are_over_do_not_add_up(arm: Any, monkeypatch: pytest.MonkeyP
     assert len(arm.tasks.by_leader) <= 4
     assert len(arm.teleop_status()["leaders"]) <= 4
     assert "is none" in text_of(arm.lead_to(ids[0], 2))
+
+
+def test_hold_does_not_move_a_joint_that_stands_beyond_its_range(arm: Any) -> None:
+    device = arm.device
+    device.positions["pan.pos"] = 130.0
+    opened = arm.lead("hand")
+    for seq in range(1, 6):
+        arm.lead_to(opened["lead_id"], seq, targets={"lift.pos": 10.0}, made=time.monotonic(), told=opened["now"])
+        eventually(lambda: arm.lead_to(opened["lead_id"], 0)["written"], every=0.002)
+    held = eventually(lambda: (now := arm.lead_to(opened["lead_id"], 0))["state"] == "held" and now, every=0.002)
+    assert "no fresh command" in held["why"]
+    assert {write.action["pan.pos"] for write in device.writes} == {130.0}
+    assert arm.tasks.by_leader["hand"].counts["out_of_range_steps"] == 0
 
 
 def test_command_of_a_lead_that_is_over_is_refused(arm: Any) -> None:

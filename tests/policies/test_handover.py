@@ -78,6 +78,22 @@ def test_leader_that_runs_beyond_the_range_turns_around_at_once() -> None:
     assert seat.led(1, pan=0.06)["pan"] == pytest.approx(0.99)
 
 
+@pytest.mark.parametrize("guide", ["positions", "differences"])
+def test_joint_beyond_its_range_is_held_there_and_comes_back_without_a_jump(guide: str) -> None:
+    seat = Seat(guide=guide)
+    seat.joints["pan"] = 1.5
+    seat.led(1, count=3, pan=1.5, lift=0.0)
+    assert seat.joints["pan"] == 1.5, "a grip does not move it"
+    seat.beat(0.5)
+    assert (seat.lead.state, seat.joints["pan"]) == ("held", 1.5), "nor does a hold"
+    seat.led(1, pan=1.6)
+    seat.led(2, pan=1.6)
+    assert seat.led(2, pan=1.9)["pan"] == 1.5, "no leader leads it further out"
+    back = [seat.led(2, pan=1.9 - 0.05 * beat)["pan"] for beat in range(1, 30)]
+    assert max(abs(after - before) for before, after in zip([1.5, *back], back, strict=False)) <= STEP + 1e-9
+    assert seat.led(2, pan=1.9)["pan"] <= 1.0, "and not out again"
+
+
 def test_leader_takes_over_from_a_policy_and_its_plan_is_dropped() -> None:
     policy = ScriptedPolicy([[{"pan": 0.1}, {"pan": 0.2}, {"pan": 0.3}], {"pan": -0.1}])
     seat = Seat(policy)

@@ -113,6 +113,9 @@ class Led(Protocol):
     turn: TurnOfDriver
     """Driver of the last control step."""
 
+    reach: Ranges
+    """The body's ranges, out to a joint that stands beyond them: to hold it there must not move it."""
+
 
 @runtime_checkable
 class Noting(Protocol):

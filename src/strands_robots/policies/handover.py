@@ -296,6 +296,8 @@ class LedPolicy:
         self.led_by = ""
         """The leader while it has taken over from the policy; see :class:`Led`."""
         self.turn = TurnOfDriver("", lead.leader)
+        self.reach: Ranges = {}
+        """The ranges of this beat; see :class:`Led`."""
         self.follows_instruction = getattr(policy, "follows_instruction", True)
         self.errors = self.event_errors = 0
         self.last_error = ""
@@ -341,7 +343,7 @@ class LedPolicy:
         return {**own, **(policy.counts() if isinstance(policy, Counted) else self._last_counts)}
 
     def reset(self, instruction: str, ranges: Ranges) -> None:
-        self._instruction, self._ranges = instruction, dict(ranges)
+        self._instruction, self._ranges, self.reach = instruction, dict(ranges), dict(ranges)
         self._speeds = speeds_across(ranges, self._max_speed, LEADER_UNBOUNDED_PER_S)
         if self._policy is not None:
             self._policy.reset(instruction, ranges)
@@ -367,6 +369,7 @@ class LedPolicy:
             # Written at each beat: a recording then has frames of it. Nothing is before the first turn.
             return dict(self._place) or []
         if beat.state == "policy":
+            self.reach = self._ranges
             return self._of_policy(observation, anew=beat.begins)
         try:
             return self._led(observation, beat)
@@ -398,10 +401,16 @@ class LedPolicy:
         """Return the action that keeps the robot where it is."""
         self._drop_plan()
         present = numbers(observation)
+        held = (key for key in self._ranges if is_velocity(key) or key in present)
+        place = {key: 0.0 if is_velocity(key) else present[key] for key in held}
+        self.reach = self._out_to(place)
+        return place
+
+    def _out_to(self, place: Action) -> Ranges:
+        """Return the ranges, wide enough for a place beyond them."""
         return {
-            key: 0.0 if is_velocity(key) else min(max(present[key], low), high)
+            key: (min(low, place.get(key, low)), max(high, place.get(key, high)))
             for key, (low, high) in self._ranges.items()
-            if is_velocity(key) or key in present
         }
 
     def _drop_plan(self) -> None:
@@ -434,9 +443,11 @@ class LedPolicy:
             self._place = self._held(observation)
             # Those that the robot does not tell are bounded from where they were sent.
             self._last, self._from = {**self._wrote, **self._place}, {}
+        # A joint beyond its range stays where it is or comes back, and goes no further out.
+        self.reach = self._out_to(self._last)
         if self._guide == "differences":
             wanted = self._moved(wanted)
-        target = checked_action(wanted, self._ranges)
+        target = checked_action(wanted, self.reach)
         bounded = limited(target, self._last, self._speeds, self._period)
         self._last = {**self._last, **bounded}
         return {**self._place, **{key: self._last[key] for key in target}}
@@ -450,7 +461,7 @@ class LedPolicy:
                 continue
             if key not in self._place:
                 raise ValidationError(f"{shown(key)} cannot be led by differences: the robot does not tell it.")
-            low, high = self._ranges[key]
+            low, high = self.reach[key]
             apart = self._from.setdefault(key, value - self._last[key])
             # Beyond the range the leader turns around where the robot is, not where it would be.
             moved[key] = min(max(value - apart, low), high)

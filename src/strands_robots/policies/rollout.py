@@ -366,7 +366,7 @@ class Rollout:
                 continue
             if chunk:
                 wanted = chunk.popleft()
-                checked = checked_action(wanted, bounds)
+                checked = checked_action(wanted, bounds if self._led is None else self._led.reach)
                 self.out_of_range_steps += any(checked[key] != wanted[key] for key in checked)
                 action = self._limited(checked, observation) if self._speeds else checked
                 sent = self._body.send_action(action, self._permit)

@@ -238,3 +238,22 @@ def test_led_arm_is_stopped_from_the_network(bus: FeetechBus, calibration: Path,
             finally:
                 ended.set()
                 by_hand.join()
+
+
+def test_led_arm_that_stands_beyond_its_range_is_not_moved_by_a_grip_or_a_hold(bus: FeetechBus, arm: Any) -> None:
+    pan = bus.servos[1]
+    pan.shaft += 700.0
+    pan.put("goal_position", pan.get("goal_position") + 700)
+    robot = arm(joint_ranges={"shoulder_pan.pos": (-20.0, 20.0)})
+    assert robot.get_state()["joints"]["shoulder_pan.pos"] > 40.0
+    stands, opened = pan.shaft, robot.lead("hand")
+    lift = opened["joints"]["shoulder_lift.pos"]
+    for seq in range(1, 20):
+        robot.lead_to(
+            opened["lead_id"], seq, targets={"shoulder_lift.pos": lift}, made=time.monotonic(), told=opened["now"]
+        )
+        time.sleep(0.02)
+    eventually(lambda: robot.lead_to(opened["lead_id"], 0)["state"] == "held")
+    assert robot.lead_to(opened["lead_id"], 0)["written"]["shoulder_pan.pos"] > 40.0
+    assert robot.halt("test ended").stopped
+    assert abs(pan.shaft - stands) < 5.0
