@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -13,6 +14,7 @@ from fixtures.waiting import eventually
 from strands_robots import lead_mixin
 from strands_robots.envelope import is_error, text_of
 from strands_robots.hardware import HardwareRobot
+from strands_robots.policies.rollout import MOTIONS_HELD
 
 
 @pytest.fixture
@@ -51,6 +53,25 @@ def test_hold_does_not_move_a_joint_that_stands_beyond_its_range(arm: Any) -> No
     assert "no fresh command" in held["why"]
     assert {write.action["pan.pos"] for write in device.writes} == {130.0}
     assert arm.tasks.by_leader["hand"].counts["out_of_range_steps"] == 0
+
+
+def test_led_robot_whose_motions_were_held_goes_on_by_a_new_turn_alone(arm: Any) -> None:
+    opened, numbers = arm.lead("hand", spare_s=60.0), itertools.count(1)
+
+    def sends(turn: int) -> Any:
+        moment = time.monotonic()
+        targets = {"pan.pos": 90.0}
+        return arm.lead_to(opened["lead_id"], next(numbers), turn=turn, targets=targets, made=moment, told=moment)
+
+    eventually(lambda: sends(1)["state"] == "led" and arm.device.writes, every=0.01)
+    arm.gate.hold(0.05)
+    held = eventually(lambda: (now := sends(1))["state"] == "held" and now, every=0.01)
+    assert held["why"] == MOTIONS_HELD
+    stood = eventually(lambda: not arm.gate.held and arm.device.positions["pan.pos"], every=0.01)
+    steps = arm.tasks.by_leader["hand"].step_count
+    eventually(lambda: sends(1) and arm.tasks.by_leader["hand"].step_count > steps + 5, every=0.01)
+    assert arm.device.positions["pan.pos"] == pytest.approx(stood)
+    eventually(lambda: sends(2)["state"] == "led" and arm.device.positions["pan.pos"] > stood + 5, every=0.01)
 
 
 def test_command_of_a_lead_that_is_over_is_refused(arm: Any) -> None:

@@ -116,6 +116,9 @@ class Led(Protocol):
     reach: Ranges
     """The body's ranges, out to a joint that stands beyond them: to hold it there must not move it."""
 
+    def hold(self, why: str) -> None:
+        """Let nobody drive until the next turn; returns at once."""
+
 
 @runtime_checkable
 class Noting(Protocol):

@@ -383,6 +383,10 @@ class LedPolicy:
         self._wrote = {**self._wrote, **action}
         self.lead.wrote(action)
 
+    def hold(self, why: str) -> None:
+        """Hold the robot until the next turn; see :class:`Led`."""
+        self.lead.hold(why)
+
     def interrupt(self) -> None:
         policy = self._policy
         if policy is not None:

@@ -51,6 +51,9 @@ START_S = 2.0
 STOP_JOIN_S = 2.0
 """Seconds that a stop of one robot waits for its loop."""
 
+MOTIONS_HELD = "its motions were held, as after a pause of its process"
+"""Reason of a led robot's hold by its gate."""
+
 STILL_JOIN_S = 0.05
 """Seconds that a stop waits for the loop of a robot that cannot move any more."""
 
@@ -400,12 +403,18 @@ class Rollout:
 
     def _held(self) -> bool:
         """Wait for the end of a hold; return True if there was one since the last call."""
-        if self._moving and self._permit.held:
+        on = self._permit.held
+        if on and self._led is not None:
+            self._led.hold(MOTIONS_HELD)
+        if on and self._moving:
             # A velocity goes on by itself until another one is written.
             self._moving = False
             self._body.hold(self._permit)
         self._permit.wait()
         before, self._holds = self._holds, self._permit.request.gate.holds
+        if self._holds != before and self._led is not None:
+            # A turn that began meanwhile was begun by somebody who had not seen the hold.
+            self._led.hold(MOTIONS_HELD)
         return self._holds != before
 
     def _limited(self, action: Action, observation: Mapping[str, Any]) -> Action:
