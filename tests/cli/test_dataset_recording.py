@@ -187,7 +187,8 @@ def test_stop_of_the_recording_is_an_episode_without_success_and_its_end(tmp_pat
             record_attempts(Screen(console=Console(file=io.StringIO())), arm, recording, attempts)
         assert recording.episodes == 1
     stopper.join(10)
-    assert not tables.read_frames(tmp_path / data_file(0))["next.success"].any()
+    frames = tables.read_frames(tmp_path / data_file(0))
+    assert (frames["next.success"].any(), frames["stop"][-1]) == (False, 1)
 
 
 def test_recording_that_is_stopped_as_it_starts_begins_nothing(tmp_path: Path, arm: Arm) -> None:

@@ -11,6 +11,7 @@ from fixtures.waiting import eventually
 from strands_robots.cli.recorder_device import RecorderDevice, recorder_driver
 from strands_robots.cli.recording_state import RecordingState, Said, Stage
 from strands_robots.safety.lockout import LockoutLatch
+from strands_robots.safety.scope import Scope
 
 
 class Bench:
@@ -55,13 +56,22 @@ def test_locked_recorder_begins_nothing_and_ends_what_its_robot_does_not(bench: 
     latch = LockoutLatch("recorder-arm-1")
     bench.driver.robot.gate.attach(latch)
     latch.engage("e" * 32, "desk", "smoke")
-    bench.driver.robot.halt("emergency stop of desk")
+    assert bench.driver.robot.halt("emergency stop of desk").stopped
     assert bench.state.halted == "", "the robot's own stop is seen first, where it is stopped as well"
     eventually(lambda: bench.state.halted, what="the end of the attempt")
     bench.state.wait_for_begin(None)
     refused = bench.call("beginEpisode")
     assert (refused["status"], refused["locked"]) == ("error", True)
     assert bench.state.words.said() is None
+
+
+def test_emergency_stop_of_the_recorder_alone_ends_the_attempt_at_once(bench: Bench) -> None:
+    latch = LockoutLatch("recorder-arm-1")
+    bench.driver.robot.gate.attach(latch)
+    latch.engage("e" * 32, "desk", "smoke", Scope.named(["recorder-arm-1"]))
+    verdict = bench.driver.robot.halt("emergency stop of desk")
+    assert bench.state.halted
+    assert verdict.stopped is False, "its robot is not halted yet"
 
 
 def test_locked_recorder_ends_all_the_same_and_asks_for_no_lease(bench: Bench) -> None:

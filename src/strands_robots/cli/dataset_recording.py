@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from strands_robots.cli.attempt_progress import AttemptProgress
 from strands_robots.cli.output import CliError, Screen, wait_until
 from strands_robots.cli.recording_state import RecordingState, Said, Stage, Words
-from strands_robots.datasets.recorded import ATTEMPT_ENDED
+from strands_robots.datasets.recorded import ATTEMPT_ENDED, HALTED
 from strands_robots.recording.file import Pictures, Recorder
 from strands_robots.safety.stopping import StopVerdict
 
@@ -322,8 +322,8 @@ def _attempt(
             if led.stopped:
                 ends.append((led.stopped_by, None))
                 return
-            # What ends an attempt here is no stop of it.
-            recorder.take(led.name, ATTEMPT_ENDED, {})
+            # What ends an attempt here is no stop of it, but for a stop of the recording.
+            recorder.take(led.name, HALTED if halts else ATTEMPT_ENDED, {})
             ends.append(("", led.halt("attempt ended")))
 
         with progress.shown(screen):

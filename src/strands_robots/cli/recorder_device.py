@@ -15,6 +15,7 @@ from strands_robots.cli.serve import PAGE_CALLER
 from strands_robots.envelope import Envelope, success
 from strands_robots.safety.authorization import Authorization
 from strands_robots.safety.gate import gate_of
+from strands_robots.safety.scope import SCOPE
 from strands_robots.utils import MissingExtraError, ValidationError
 from strands_robots.verb_declaration import verb
 
@@ -80,16 +81,22 @@ class RecorderDevice:
         return self._state.press(END, Said.END)
 
     def get_task_status(self) -> dict[str, Any]:
-        """Return an attempt as a task; a locked recorder leads nothing any more."""
+        """Return an attempt as a task, until its robot is halted."""
         facts = self._state.facts()
-        runs = self._state.runs and gate_of(self).lockout(RECORDER) is None
+        runs = self._state.runs and not self._stopped_with_its_robot
         text = f"episode {facts['episode']} of {facts['episodes']}, {facts['stage']}"
         return success(text, task_status="running" if runs else "idle", instruction=text)
 
     def halt(self, reason: str = "") -> None:
         """End the attempt that runs; its status tells when the robot is halted."""
-        locked = gate_of(self).lockout(RECORDER) is not None
-        self._state.halt(f"the recording was stopped: {reason}", ROBOT_FIRST_S if locked else 0.0)
+        after_s = ROBOT_FIRST_S if self._stopped_with_its_robot else 0.0
+        self._state.halt(f"the recording was stopped: {reason}", after_s)
+
+    @property
+    def _stopped_with_its_robot(self) -> bool:
+        """True while an emergency stop of more than named robots locks it."""
+        locked = gate_of(self).lockout(RECORDER)
+        return locked is not None and not locked.get(SCOPE, {}).get("only")
 
 
 @contextmanager

@@ -55,7 +55,10 @@ SOON_S = 1e-5
 _WEIGHT = (LOCKED_OUT, STOPPED, EMERGENCY)
 """Of two in one frame the later one here counts: what was refused is of the lockout."""
 
-_STOPS = {"halted": STOPPED, "locked": EMERGENCY, "emergencyStop": EMERGENCY, REFUSED: LOCKED_OUT}
+HALTED = "halted"
+"""Event of a recording: its robot was halted, and not as the end of the attempt."""
+
+_STOPS = {HALTED: STOPPED, "locked": EMERGENCY, "emergencyStop": EMERGENCY, REFUSED: LOCKED_OUT}
 ATTEMPT_ENDED = "attemptEnded"
 """Event of a recording: the person who records has ended the attempt. What follows is none of it."""
 
