@@ -142,7 +142,7 @@ def record(
     ):
         frames = None if names == [NO_CAMERAS] else chosen_frames(led.robot, names)
         attempts = Attempts(episodes, driver.begin, fps, longest, pause_s, success, asked, state)
-        record_attempts(screen, LocalAttempts(led, frames, driver), session, attempts)
+        record_attempts(screen, LocalAttempts(led, frames, driver, names), session, attempts)
         count = session.episodes
     _tell_dataset(screen, folder, count)
 

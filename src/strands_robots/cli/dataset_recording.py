@@ -7,7 +7,7 @@ import select
 import sys
 import termios
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Protocol
@@ -142,6 +142,10 @@ class AttemptRobot(Protocol):
     @property
     def has_cameras(self) -> bool:
         """True where pictures are recorded."""
+
+    @property
+    def cameras(self) -> Collection[str]:
+        """Names of its cameras in the recording, of which each has to deliver."""
 
     def recorded(self, recorder: Recorder, fps: int, pictures: Pictures | None) -> AbstractContextManager[object]:
         """Record it in the block, and hand the pictures of its cameras over."""
@@ -292,9 +296,11 @@ def _attempt(
         progress = AttemptProgress(recorder, attempts.fps, encoder)
         pictures = None if encoder is None else progress.take_picture
         recorded.enter_context(led.recorded(recorder, attempts.fps, pictures))
-        if encoder is not None and not encoder.wait_for_pictures(FIRST_PICTURE_S):
+        if encoder is not None and (silent := encoder.wait_for_pictures(led.cameras, FIRST_PICTURE_S)):
+            # The first attempt decides which cameras the dataset has.
             raise CliError(
-                f"No camera delivered a picture within {FIRST_PICTURE_S:g} s; --cameras none records without."
+                f"No picture of {', '.join(silent)} came within {FIRST_PICTURE_S:g} s; --cameras names those to "
+                "record, or none."
             )
         task, began = _begun(attempts), time.monotonic()
         state.enter(Stage.RECORDING, progress.row)

@@ -158,6 +158,11 @@ class FarRobot:
         return bool(self._cameras)
 
     @property
+    def cameras(self) -> Sequence[str]:
+        """Names of its cameras in the recording."""
+        return [each.replace("/", ".") for each in self._cameras]
+
+    @property
     def stopped(self) -> bool:
         """True where others stopped or locked it in this attempt."""
         task = self._attempt

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import Any
@@ -183,10 +183,13 @@ class LocalAttempts:
         led: the robot, served.
         frames: takes its pictures; None for none.
         driver: of its attempts.
+        cameras: names of those that are recorded; None for all that ``frames`` has.
     """
 
-    def __init__(self, led: LedRobot, frames: Frames | None, driver: Driver) -> None:
-        self._led, self._frames, self._driver = led, frames, driver
+    def __init__(
+        self, led: LedRobot, frames: Frames | None, driver: Driver, cameras: Sequence[str] | None = None
+    ) -> None:
+        self._led, self._frames, self._driver, self._cameras = led, frames, driver, cameras or ()
 
     @property
     def name(self) -> str:
@@ -207,6 +210,13 @@ class LocalAttempts:
     def has_cameras(self) -> bool:
         """True where pictures are recorded."""
         return self._frames is not None
+
+    @property
+    def cameras(self) -> Sequence[str]:
+        """Names of its cameras in the recording, and of those that it lacks."""
+        found = [] if self._frames is None else [str(name) for name in self._frames()]
+        lacking = (each for each in self._cameras if {each, each.replace("/", ".")}.isdisjoint(found))
+        return [*found, *lacking]
 
     @contextmanager
     def recorded(self, recorder: Recorder, fps: int, pictures: Pictures | None) -> Iterator[None]:

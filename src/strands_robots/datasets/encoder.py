@@ -13,7 +13,7 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Self
@@ -62,9 +62,9 @@ class CameraEncoder:
 
         self._failed, self._running = "", False
         self._begun = self._ended = False
-        self._delivered = threading.Event()
         self._cameras: dict[str, _Camera] = {}
         self._lock = threading.Lock()
+        self._delivered = threading.Condition(self._lock)
         self._process: subprocess.Popen[bytes] | None = None
         self._socket, self._received = socket.socket(), b""
 
@@ -133,9 +133,6 @@ class CameraEncoder:
             known = self._cameras.get(camera) or self._made(camera, sides)
             if sides != known.sides:
                 raise ValidationError(f"pictures of {camera} must be {known.sides} as its first one, not {sides}.")
-            known.offered += 1
-            if known.offered > 1:
-                self._delivered.set()
             slot = -1 if self._failed else known.put(pixels)
             if slot < 0:
                 self.dropped[camera] += 1
@@ -143,12 +140,18 @@ class CameraEncoder:
             self._send({"picture": camera, "slot": slot, "length": pixels.size, "at": moment})
             return not self._failed
 
-    def wait_for_pictures(self, longest_s: float) -> bool:
-        """Wait until the cameras of the running attempt deliver; False where none does.
+    def wait_for_pictures(self, cameras: Collection[str], longest_s: float) -> list[str]:
+        """Wait until cameras have delivered; return those that have not.
 
-        Cameras that are read in turn have all delivered once one of them has twice.
+        Where none is named any camera will do, and "any camera" is returned where none has.
         """
-        return self._delivered.wait(longest_s)
+
+        def silent() -> list[str]:
+            return [each for each in cameras if each not in self._cameras] or ["any camera"] * (not self._cameras)
+
+        with self._delivered:
+            self._delivered.wait_for(lambda: not silent(), longest_s)
+            return silent()
 
     def close(self) -> None:
         """End the process. Twice is once."""
@@ -167,7 +170,6 @@ class CameraEncoder:
         with self._lock:
             self._forget()
             self.dropped.clear()
-            self._delivered.clear()
             self._failed, self._begun, self._ended, self._running = "", False, False, True
             self._send({"begin": str(folder.absolute()), "fps": self._fps})
         if not self._wait(lambda: self._begun, BEGIN_S):
@@ -203,6 +205,7 @@ class CameraEncoder:
             self._send(order, made.descriptor)
         finally:
             os.close(made.descriptor)
+        self._delivered.notify_all()
         return made
 
     def _forget(self) -> None:
@@ -269,7 +272,6 @@ class _Camera:
     """Memory of one camera's pictures, which the other process reads."""
 
     def __init__(self, sides: tuple[int, int] | None) -> None:
-        self.offered = 0
         self.sides, self.size = sides, JPEG_BYTES if sides is None else sides[0] * sides[1] * 3
         self.descriptor = _shared(memory_bytes(self.size))
         self._memory = mmap.mmap(self.descriptor, memory_bytes(self.size))

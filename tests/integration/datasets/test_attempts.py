@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import resource
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,18 +16,19 @@ from rich.console import Console
 
 from strands_robots.cli import dataset_recording
 from strands_robots.cli.dataset_recording import Attempts, record_attempts
+from strands_robots.cli.local_recording import Driver, LocalAttempts
 from strands_robots.cli.output import CliError, Screen
 from strands_robots.datasets.session import RecordingSession
 from strands_robots.recording.file import Pictures, Recorder
 
 
 class FilmedRobot:
-    """A robot of one step, which its camera shows in pictures of some width; none for 0."""
+    """A robot of one step, which its camera shows in pictures of some width; none for 0. Others show nothing."""
 
     name, stopped, stopped_by, has_cameras = "arm-1", False, "", True
 
-    def __init__(self, width: int) -> None:
-        self._width = width
+    def __init__(self, width: int, *others: str) -> None:
+        self._width, self.cameras = width, ("top", *others)
         self.begun = False
 
     @contextmanager
@@ -103,8 +104,20 @@ def test_camera_whose_pictures_cannot_be_encoded_ends_the_attempt_by_name(tmp_pa
     assert (tmp_path / ".running" / "aside-000000.mcap").exists()
 
 
-def test_nothing_is_led_where_no_camera_delivers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("robot", "silent"), [(FilmedRobot(0), "top"), (FilmedRobot(64, "wrist", "side"), "wrist, side")]
+)
+def test_nothing_is_led_where_a_camera_does_not_deliver(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, robot: FilmedRobot, silent: str
+) -> None:
     monkeypatch.setattr(dataset_recording, "FIRST_PICTURE_S", 0.05)
-    robot = FilmedRobot(0)
-    assert "No camera delivered a picture within 0.05 s" in recorded(robot, tmp_path)
+    assert f"No picture of {silent} came within 0.05 s" in recorded(robot, tmp_path)
     assert not robot.begun
+
+
+def test_camera_that_is_asked_for_and_not_there_is_waited_for_by_name() -> None:
+    led: Any = None
+    frames = {"top": None, "arm.wrist": None}
+    driver = Driver(lambda: None, ExitStack())
+    assert LocalAttempts(led, lambda: frames, driver).cameras == ["top", "arm.wrist"]
+    assert LocalAttempts(led, lambda: frames, driver, ["arm/wrist", "side"]).cameras == ["top", "arm.wrist", "side"]
