@@ -75,14 +75,18 @@ def test_page_draws_each_joint_and_the_pictures_of_the_episodes_that_are_asked_f
 def test_page_marks_stops_and_the_frames_in_which_a_person_led(tmp_path: Path) -> None:
     features = {name: Feature("float32", (2,), ("pan", "lift")) for name in ("observation.state", "action")}
     features |= {"stop": Feature("int64"), "intervention": Feature("bool"), "next.success": Feature("bool")}
+    features["actor"] = Feature("int64")
     rows = np.arange(60, dtype=np.float32).reshape(30, 2)
     columns = {"observation.state": rows, "action": rows + 1, "next.success": np.zeros(30, dtype=bool)}
     columns["stop"] = np.where(np.arange(30) == 29, 2, 0).astype(np.int64)
     columns["intervention"] = (np.arange(30) >= 10) & (np.arange(30) < 20)
+    columns["actor"] = np.where(columns["intervention"], 2, 1).astype(np.int64)
     with Dataset(tmp_path / "set", DatasetInfo(30, features, "arm")) as dataset:
         dataset.save(DatasetEpisode("reach", columns))
     page = dataset_page(tmp_path / "set")
     assert page.count('<rect class="led"') == page.count('<polyline class="stopped"') == 2
+    assert (page.count('<rect class="by1"'), page.count('<rect class="by2"')) == (4, 2), "who acted, below each plot"
+    assert "</span>&nbsp;policy, <span" in page
     assert "emergency stop</td>" in page
     assert "33 %</td>" in page
 

@@ -1,6 +1,6 @@
 """Page of a dataset: one HTML file without script, network or other files.
 
-Each drawn episode has its plots of state and action, its pictures, and where it was stopped or led by a person.
+Each drawn episode has its plots of state and action, its pictures, where it was stopped, and who acted.
 """
 
 from __future__ import annotations
@@ -20,7 +20,18 @@ from numpy.typing import NDArray
 from strands_robots.datasets import tables
 from strands_robots.datasets.check import DatasetFinding, check_dataset
 from strands_robots.datasets.layout import DatasetError, DatasetInfo, data_file, episodes_file, video_file
-from strands_robots.datasets.recorded import ACTION, AGE, EMERGENCY, INTERVENTION, STATE, STOP, STOPPED, SUCCESS
+from strands_robots.datasets.recorded import (
+    ACTION,
+    ACTOR,
+    ACTORS,
+    AGE,
+    EMERGENCY,
+    INTERVENTION,
+    STATE,
+    STOP,
+    STOPPED,
+    SUCCESS,
+)
 from strands_robots.datasets.video import pictures_of
 from strands_robots.utils import ValidationError, optional_module, whole
 
@@ -41,16 +52,17 @@ PICTURES_MAX = 8
 
 PICTURE_WIDTH = 160
 
-_WIDTH, _HEIGHT = 320, 84
+_WIDTH, _HEIGHT, _BAND = 320, 84, 8
 
 STOPS = {STOPPED: "stopped", EMERGENCY: "emergency stop", 3: "refused while locked"}
 """Values of the feature ``stop`` in words."""
 
 _STYLE = """
 :root{color-scheme:light dark;--back:#fff;--text:#1b1f24;--soft:#5b6470;--line:#d5dae0;--state:#0b63c4;--action:#b3541e;
---stop:#c01c28;--led:#7a3ea855}
+--stop:#c01c28;--led:#7a3ea855;--by1:#2d7a46;--by2:#7a3ea8;--by3:#a8780c;--by4:#0e7f8c}
 @media(prefers-color-scheme:dark){:root{--back:#14171b;--text:#e6e9ed;--soft:#9aa4b0;--line:#343b44;--state:#6cb1ff;
---action:#f0a070;--stop:#ff6b74;--led:#b78ae655}}
+--action:#f0a070;--stop:#ff6b74;--led:#b78ae655;
+--by1:#63c384;--by2:#b78ae6;--by3:#e0b44c;--by4:#57c7d4}}
 body{margin:0 auto;max-width:72rem;padding:1rem;background:var(--back);color:var(--text);
 font:15px/1.45 system-ui,sans-serif}
 h1{font-size:1.3rem}p,li{color:var(--soft)}
@@ -62,6 +74,8 @@ svg{width:100%;height:auto;border:1px solid var(--line);border-radius:4px;displa
 .strip{display:flex;flex-wrap:wrap;gap:.4rem}.strip img{border-radius:4px;max-width:10rem;display:block}
 .state{stroke:var(--state)}.action{stroke:var(--action);stroke-dasharray:4 3}.stopped{stroke:var(--stop)}
 .led{fill:var(--led)}polyline{fill:none;stroke-width:1.6;vector-effect:non-scaling-stroke}
+.by0{color:var(--line)}.by1{color:var(--by1)}.by2{color:var(--by2)}.by3{color:var(--by3)}.by4{color:var(--by4)}
+rect[class^=by]{fill:currentColor}
 .wrong,.stop{color:var(--stop);font-weight:600}summary{cursor:pointer;padding:.3rem 0}
 """
 
@@ -178,7 +192,9 @@ def _drawn(folder: Path, info: DatasetInfo, episode: _Episode) -> Iterator[str]:
         return
     title = f"Episode {episode.number}: {episode.task}, {episode.count / info.fps:.1f} s"
     yield f"<details{' open' if episode.number == 0 else ''}><summary><strong>{escape(title)}</strong></summary>"
-    yield "<p>Line: state. Dashed: action. Red: a stop. Shaded: led by a person.</p>"
+    legend = ", ".join(f'<span class="by{code}">&#9632;</span>&nbsp;{ACTORS[code]}' for code in _acting(episode))
+    band = f" Band below: who acted ({legend})." if legend else ""
+    yield f"<p>Line: state. Dashed: action. Red: a stop. Shaded: led by a person.{band}</p>"
     yield '<div class="plots">'
     for name in info.features[STATE].names if STATE in info.features else ():
         state, action = (_joint(info, episode, key, name) for key in (STATE, ACTION))
@@ -202,6 +218,12 @@ def _stops(episode: _Episode) -> dict[int, int]:
     return {int(at): int(column[at]) for at in np.flatnonzero(column)[:FOUND_MAX]}
 
 
+def _acting(episode: _Episode) -> list[int]:
+    """Return the codes of those who acted; none of a dataset that does not tell."""
+    column = episode.column(ACTOR)
+    return [code for code in range(len(ACTORS)) if column.ndim == 1 and (column == code).any()]
+
+
 def _plot(name: str, state: NDArray[np.float64], action: NDArray[np.float64], episode: _Episode) -> str:
     lines = [values for values in (state, action) if len(values)]
     low, high = min(values.min() for values in lines), max(values.max() for values in lines)
@@ -221,6 +243,13 @@ def _plot(name: str, state: NDArray[np.float64], action: NDArray[np.float64], ep
         f'<rect class="led" x="{x(begin)}" y="0" width="{_WIDTH * (end - begin) / last:.1f}" height="{_HEIGHT}"/>'
         for begin, end in _spans(episode.column(INTERVENTION))
     )
+    acted = "".join(
+        f'<rect class="by{code}" x="{x(begin)}" y="{_HEIGHT + 2}" width="{_WIDTH * (end - begin) / last:.1f}" '
+        f'height="{_BAND}"><title>{ACTORS[code]}</title></rect>'
+        for code in _acting(episode)
+        for begin, end in _spans(episode.column(ACTOR) == code)
+    )
+    height = _HEIGHT + 2 + _BAND if acted else _HEIGHT
     stops = "".join(
         f'<polyline class="stopped" points="{x(at)},0 {x(at)},{_HEIGHT}"><title>{escape(STOPS.get(code, ""))}</title>'
         "</polyline>"
@@ -228,7 +257,7 @@ def _plot(name: str, state: NDArray[np.float64], action: NDArray[np.float64], ep
     )
     shown = f"{name}: {low:.4g} to {high:.4g}"
     return (
-        f'<figure><svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{escape(shown)}">{led}'
+        f'<figure><svg viewBox="0 0 {_WIDTH} {height}" role="img" aria-label="{escape(shown)}">{led}{acted}'
         f"{line(state, 'state')}{line(action, 'action')}{stops}</svg><figcaption>{escape(shown)}</figcaption></figure>"
     )
 
