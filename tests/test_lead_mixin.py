@@ -14,6 +14,7 @@ from fixtures.waiting import eventually
 from strands_robots import lead_mixin
 from strands_robots.envelope import is_error, text_of
 from strands_robots.hardware import HardwareRobot
+from strands_robots.policies.handover import LedPolicy
 from strands_robots.policies.rollout import MOTIONS_HELD
 
 
@@ -78,3 +79,25 @@ def test_command_of_a_lead_that_is_over_is_refused(arm: Any) -> None:
     answer = arm.lead_to(led_once(arm, "hand"), 2, targets={"pan.pos": 90.0})
     assert is_error(answer)
     assert answer["state"] == "over"
+
+
+def test_command_that_was_read_before_a_hold_is_not_carried_out_after_it(
+    arm: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    act, held_at = LedPolicy.act, list[float]()
+
+    def acts(policy: LedPolicy, observation: Any) -> Any:
+        action = act(policy, observation)
+        if policy.lead.state == "led" and not held_at:
+            held_at.append(arm.device.positions["pan.pos"])
+            arm.gate.hold(0.05)
+        return action
+
+    monkeypatch.setattr(LedPolicy, "act", acts)
+    opened = arm.lead("hand", spare_s=60.0)
+    moment = time.monotonic()
+    arm.lead_to(opened["lead_id"], 1, turn=1, targets={"pan.pos": 90.0}, made=moment, told=moment)
+    eventually(lambda: held_at)
+    steps = arm.tasks.by_leader["hand"].step_count
+    eventually(lambda: arm.tasks.by_leader["hand"].step_count > steps + 3, every=0.01)
+    assert arm.device.positions["pan.pos"] == pytest.approx(held_at[0])

@@ -349,7 +349,7 @@ class Rollout:
         chunk: deque[Action] = deque()
         tick = 0
         while self._permit.valid:
-            if self._held():
+            if self._held(chunk):
                 started = self._clock.now() - tick * self._period
                 continue
             # The duration starts with the first tick: loading a policy is not part of it.
@@ -364,7 +364,7 @@ class Rollout:
                 if actions is None:
                     return "completed"
                 chunk.extend([actions] if isinstance(actions, Mapping) else actions)
-            if self._held():
+            if self._held(chunk):
                 started = self._clock.now() - tick * self._period
                 continue
             if chunk:
@@ -388,7 +388,7 @@ class Rollout:
                 # The first inference is part of loading.
                 began = started = self._clock.now()
                 tick = 0
-            if self._held():
+            if self._held(chunk):
                 # Steps that were missed meanwhile are not made up for: the plan goes on from here.
                 started = self._clock.now() - tick * self._period
             tick = self._next(tick, started)
@@ -401,8 +401,12 @@ class Rollout:
             self._turn = turn = self._led.turn
             self._notify("turn", state=turn.state, error=turn.why, led_by=turn.leader)
 
-    def _held(self) -> bool:
-        """Wait for the end of a hold; return True if there was one since the last call."""
+    def _held(self, chunk: deque[Action]) -> bool:
+        """Wait for the end of a hold; return True if there was one since the last call.
+
+        Args:
+            chunk: what would be written next; a leader's command of before is never carried out.
+        """
         on = self._permit.held
         if on and self._led is not None:
             self._led.hold(MOTIONS_HELD)
@@ -415,6 +419,7 @@ class Rollout:
         if self._holds != before and self._led is not None:
             # A turn that began meanwhile was begun by somebody who had not seen the hold.
             self._led.hold(MOTIONS_HELD)
+            chunk.clear()
         return self._holds != before
 
     def _limited(self, action: Action, observation: Mapping[str, Any]) -> Action:
