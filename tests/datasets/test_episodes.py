@@ -16,7 +16,7 @@ from fixtures.episodes import CAMERA, FPS, INFO, JOINTS, episode
 from strands_robots.datasets import Dataset, DatasetEpisode, DatasetError, DatasetInfo, Feature, tables
 from strands_robots.datasets.check import check_dataset
 from strands_robots.datasets.fit import RobotJoints, robot_findings
-from strands_robots.datasets.layout import STATS, data_file, read_info
+from strands_robots.datasets.layout import STATS, data_file, episodes_file, read_info
 from strands_robots.utils import ValidationError
 
 
@@ -201,3 +201,15 @@ def test_check_looks_at_a_robot_of_one_joint(tmp_path: Path) -> None:
     ranges = {"ranges": {"pan": [-0.5, 0.5]}, "observation_features": {"pan": ""}, "action_features": {"pan": ""}}
     outside = robot_findings(tmp_path, info, RobotJoints.of("table", ranges))
     assert [each.wrong for each in outside] == [True, True]
+
+
+def test_later_row_has_no_column_that_the_first_one_lacks(tmp_path: Path) -> None:
+    folder = tmp_path / "set"
+    with Dataset(folder, INFO) as dataset:
+        dataset.save(replace(episode(dataset), policy="mock"))
+    row = tables.read_row(folder / episodes_file(0))
+    assert row.pop("policy") == "mock"
+    tables.write_episode(folder / episodes_file(0), row, {})
+    with Dataset(folder) as dataset:
+        dataset.save(replace(episode(dataset), policy="mock"))
+    assert "policy" not in tables.read_row(folder / episodes_file(1)), "LeRobot would not load it"

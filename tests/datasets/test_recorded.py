@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from strands_robots.cli.app import build
 from strands_robots.datasets import Dataset, tables
-from strands_robots.datasets.layout import data_file, read_info
+from strands_robots.datasets.layout import data_file, episodes_file, read_info
 from strands_robots.datasets.recorded import (
     ACTORS,
     LED_BY_RECORDING,
@@ -153,6 +153,7 @@ def test_frames_say_who_acted_and_what_was_refused(tmp_path: Path) -> None:
     assert again.features["action"].units == ("degrees",)
     assert again.features["observation.state"].units == ("degrees", "")
     assert again.features["actor"].about == {"codes": list(ACTORS)}
+    assert tables.read_row(out / episodes_file(0))["policy"] == "mock, pi"
 
 
 def test_lockout_is_of_the_task_that_it_ended_not_of_the_next_one(tmp_path: Path) -> None:

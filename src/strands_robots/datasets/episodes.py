@@ -52,6 +52,9 @@ RECORDING = ".mcap"
 TASK_MAX = 1000
 """Longest task, in characters."""
 
+POLICY = "policy"
+"""Column of an episode's row, of our own: the policy that acted."""
+
 FRAMES_MAX = 1_000_000
 """Most frames of one episode."""
 
@@ -64,11 +67,13 @@ class DatasetEpisode:
         task: what was to be done, in words.
         columns: by feature, ``(n,)`` numbers or ``(n, width)`` vectors, for each feature that is no video.
         videos: by feature, each of n pictures.
+        policy: name of the policy that acted; several are divided by commas, and an empty one is none.
     """
 
     task: str
     columns: Mapping[str, NDArray[Any]]
     videos: Mapping[str, Video] = field(default_factory=dict)
+    policy: str = ""
 
 
 class DatasetHold:
@@ -305,6 +310,9 @@ class Dataset:
         for name in episode.videos:
             row |= place_of(number, f"videos/{name}")
             row |= {f"videos/{name}/from_timestamp": 0.0, f"videos/{name}/to_timestamp": count / self.info.fps}
+        # LeRobot 0.4.4 and 0.6.1 load no dataset of which a later row has a column more than the first.
+        if not number or POLICY in tables.read_row(self.folder / episodes_file(0)):
+            row[POLICY] = episode.policy
         return row | place_of(number, "meta/episodes")
 
     def _with(self, found: Mapping[str, Statistics]) -> dict[str, Statistics]:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from strands_robots.datasets import tables
 from strands_robots.datasets.check import DatasetFinding, check_dataset
+from strands_robots.datasets.episodes import POLICY
 from strands_robots.datasets.layout import DatasetError, DatasetInfo, data_file, episodes_file, video_file
 from strands_robots.datasets.recorded import (
     ACTION,
@@ -94,6 +95,10 @@ class _Episode:
         return ", ".join(map(str, tasks)) if isinstance(tasks, Sequence) and not isinstance(tasks, str) else str(tasks)
 
     @property
+    def policy(self) -> str:
+        return str(self.row.get(POLICY) or "")
+
+    @property
     def count(self) -> int:
         return len(self.frames.get("frame_index", ()))
 
@@ -164,22 +169,23 @@ def _findings(found: Sequence[DatasetFinding]) -> Iterator[str]:
 
 
 def _list(info: DatasetInfo, episodes: Sequence[_Episode]) -> Iterator[str]:
-    yield '<div class="wide"><table><thead><tr><th>Episode</th><th>Task</th><th>Seconds</th><th>Success</th>'
+    yield '<div class="wide"><table><thead><tr><th>Episode</th><th>Task</th><th>Policy</th><th>Seconds</th><th>Success</th>'
     yield "<th>Stops</th><th>Led by a person</th><th>Oldest state, ms</th></tr></thead><tbody>"
     for each in episodes:
         ages = each.column(f"{AGE}state")
         cells = (
             str(each.number),
             each.task,
+            each.policy,
             f"{each.count / info.fps:.1f}",
             ("yes" if each.column(SUCCESS).any() else "no") if SUCCESS in each.frames else "",
             ", ".join(STOPS.get(code, str(code)) for code in _stops(each).values()),
             f"{100 * each.column(INTERVENTION).mean():.0f} %" if each.column(INTERVENTION).any() else "",
             f"{ages.max():.0f}" if len(ages) else "",
         )
-        stop = ' class="stop"' if cells[4] else ""
+        stop = ' class="stop"' if cells[5] else ""
         yield "<tr>" + "".join(
-            f"<td{stop if index == 4 else ''}>{escape(cell)}</td>" for index, cell in enumerate(cells)
+            f"<td{stop if index == 5 else ''}>{escape(cell)}</td>" for index, cell in enumerate(cells)
         )
         yield "</tr>"
     yield "</tbody></table></div>"

@@ -79,7 +79,7 @@ class Attempt:
     ``steps`` are moments in seconds, observations and actions by name; ``pictures`` moments and JPEG by camera.
     ``person`` is True where a person led all of it, and ``led`` of the steps in which a leader had its turn; ``videos``
     are by camera, where its pictures were encoded as they came. ``actors`` are of the steps, as :data:`ACTORS` counts
-    them; ``units`` are by joint, where the robot states them.
+    them; ``units`` are by joint, where the robot states them; ``policies`` are those that acted, by name.
     """
 
     instruction: str = ""
@@ -91,6 +91,7 @@ class Attempt:
     led: list[bool] = field(default_factory=list)
     actors: list[int] = field(default_factory=list)
     units: Mapping[str, str] = field(default_factory=dict)
+    policies: dict[str, None] = field(default_factory=dict)
 
 
 def attempts_of(path: Path, robot: str | None = None) -> list[Attempt]:
@@ -151,7 +152,7 @@ class _AttemptReader:
         self._found: list[Attempt] = []
         self._attempt = Attempt()
         self._before: Attempt | None = None
-        self._actor, self._replayed = UNKNOWN, False
+        self._actor, self._policy, self._replayed = UNKNOWN, "", False
         self._units: dict[str, str] = {}
 
     def read(self, events: Iterable[RecordedEvent]) -> list[Attempt]:
@@ -189,6 +190,8 @@ class _AttemptReader:
         attempt.units = self._units
         attempt.led.append(attempt.person or (bool(led_by) and not self._replayed))
         actor = BY_LEADER if led_by or attempt.person else _actor(event.payload.get("policy"), self._actor)
+        if actor == BY_POLICY and (policy := event.payload.get("policy") or self._policy):
+            attempt.policies[str(policy)] = None
         attempt.actors.append(BY_RECORDING if self._replayed and actor in (BY_LEADER, UNKNOWN) else actor)
 
     def _take_task(self, event: RecordedEvent) -> None:
@@ -196,7 +199,8 @@ class _AttemptReader:
         if begins and self._attempt.steps and not self._whole:
             self._end()
         if begins:
-            self._actor = _actor(event.payload.get("policy_provider"))
+            self._policy = str(event.payload.get("policy_provider") or "")
+            self._actor = _actor(self._policy)
         elif event.payload.get("state") == "stopped":
             self._take_stop(event.at, STOPPED)
         self._attempt.instruction = str(event.payload.get("instruction") or self._attempt.instruction)
@@ -287,7 +291,8 @@ def save_attempt(dataset: Dataset, attempt: Attempt, task: str, *, success: bool
             columns[f"{SAME}{camera}"] = (rows["same"] > 0) & (np.arange(count) > 0)
             continue
         videos[name] = _encoded(dataset, attempt.pictures.get(camera, []), camera, moments, columns)
-    return dataset.save(DatasetEpisode(task or attempt.instruction or "unnamed", columns, videos))
+    policy = ", ".join(attempt.policies)
+    return dataset.save(DatasetEpisode(task or attempt.instruction or "unnamed", columns, videos, policy))
 
 
 def moments_of(attempt: Attempt, fps: int) -> NDArray[np.float64]:

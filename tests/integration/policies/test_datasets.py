@@ -34,7 +34,9 @@ def without_videos(tmp_path: Path) -> Path:
     with Dataset(folder, replace(INFO, features=features)) as dataset:
         for number in range(EPISODES):
             made = episode(dataset, FRAMES, f"task {number % 2}")
-            dataset.save(DatasetEpisode(made.task, {**made.columns, ACTOR: np.full(FRAMES, number)}))
+            policy = "mock" if number else ""
+            columns = {**made.columns, ACTOR: np.full(FRAMES, number)}
+            dataset.save(DatasetEpisode(made.task, columns, policy=policy))
     return folder
 
 
@@ -70,6 +72,7 @@ def test_lerobot_reads_each_frame_with_its_task_and_names(without_videos: Path) 
     frame = dataset[FRAMES + 3]
     assert frame["observation.state"].tolist() == [3.0, 4.0, 5.0]
     assert int(frame["actor"]) == 1
+    assert dataset.meta.episodes[1]["policy"] == "mock"
     assert (frame["task"], int(frame["episode_index"]), int(frame["frame_index"])) == ("task 1", 1, 3)
     assert bool(dataset[FRAMES - 1]["next.success"]) is True
     assert dataset.meta.features["action"]["names"] == list(JOINTS)
