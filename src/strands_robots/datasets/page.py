@@ -169,8 +169,8 @@ def _findings(found: Sequence[DatasetFinding]) -> Iterator[str]:
 
 
 def _list(info: DatasetInfo, episodes: Sequence[_Episode]) -> Iterator[str]:
-    yield '<div class="wide"><table><thead><tr><th>Episode</th><th>Task</th><th>Policy</th><th>Seconds</th><th>Success</th>'
-    yield "<th>Stops</th><th>Led by a person</th><th>Oldest state, ms</th></tr></thead><tbody>"
+    yield '<div class="wide"><table><thead><tr><th>Episode</th><th>Task</th><th>Policy</th><th>Seconds</th>'
+    yield "<th>Success</th><th>Stops</th><th>Led by a person</th><th>Oldest state, ms</th></tr></thead><tbody>"
     for each in episodes:
         ages = each.column(f"{AGE}state")
         cells = (
