@@ -111,13 +111,14 @@ def record(
         raise ValidationError("--policies goes with --policy and a robot of this command; a served one has its own.")
     if leader in (None, PAGE) and of_leader:
         raise ValidationError("--leader-id and --leader-calibration go with a leader arm.")
+    hand = HandLeader(screen, leader or "", of_leader, keys)
     if leader == PAGE or not (no_network or is_own(robot)):
         if no_network or any(each is not None for each in (follower_id, calibration, peer_id)):
             raise ValidationError(
                 f"--robot must be the id of a served robot, without options of one of this command, not {robot}."
             )
-        hand = HandLeader(screen, leader, of_leader, keys) if leader not in (None, PAGE) else None
-        with served_robot(screen, network, robot, policy or "", task, names, hand) as far:
+        led_from_here = None if leader in (None, PAGE) else hand
+        with served_robot(screen, network, robot, policy or "", task, names, led_from_here) as far:
             attempts = Attempts(episodes, partial(far.begin, longest), fps, longest, pause_s, success, asked, state)
             _record_served(screen, folder, far, task, attempts, buttons)
         return
@@ -128,11 +129,11 @@ def record(
         resolve_provider(policy)
     kind, arm = robot.partition("@")[0], arm_options("", follower_id, calibration)
     if policy and leader:
-        drives = partial(turns_drive, screen, policy, task, longest, HandLeader(screen, leader, of_leader, keys))
+        drives = partial(turns_drive, screen, policy, task, longest, hand)
     elif policy:
         drives = partial(policy_drives, screen, policy, task, longest)
     else:
-        drives = partial(leader_drives, screen, leader or "", robot, of_leader, keys)
+        drives = partial(leader_drives, screen, hand, robot)
     with (
         RecordingSession(folder, fps, task, kind, lambda said: screen.say(said, "yellow")) as session,
         made_follower(screen, robot, arm, None, how) as led,

@@ -211,6 +211,11 @@ class HandLeader:
         self._attempt = ExitStack()
 
     @property
+    def method(self) -> str:
+        """Its kind, as :class:`TeleopOptions` has it."""
+        return self.name if self._manual else "arm"
+
+    @property
     def person(self) -> bool:
         """True where a person leads."""
         return not isinstance(self._lasting, RecordedLeader)
@@ -223,6 +228,30 @@ class HandLeader:
                 self._lasting = stack.enter_context(connected_leader(self.name, None, self._options))
             stack.callback(self.end)
             yield
+
+    def ready(self, name: str, follower: Any, bounds: Ranges) -> Any:
+        """Return the leader, ready for an attempt, which :meth:`end` ends.
+
+        Args:
+            name: of the robot, for the screen.
+            follower: the robot; what a hand moves begins where it is.
+            bounds: its ranges.
+
+        Raises:
+            ValidationError: the leader leads joints that it does not have.
+        """
+        source, keys = self._lasting, self._keys
+        if self._manual:
+            pressed = (lambda key: None) if keys is None else keys.pressed
+            source = self._attempt.enter_context(connected_leader(self.name, follower, self._options, pressed))
+        elif isinstance(source, RecordedLeader):
+            source.rewind()
+        check_keys(name, source, bounds)
+        announce(self._screen, self.name, name, source)
+        if keys is not None and self.name == "keyboard":
+            keys.leading = True
+            self._attempt.callback(setattr, keys, "leading", False)
+        return source
 
     def begin(self, robot: Leadable, policy: str, task: str, seconds: float | None, ended: Ended, **how: Any) -> None:
         """Lead the robot, or let its policy have the first turn.
@@ -244,15 +273,7 @@ class HandLeader:
         if policy:
             how = {"policy_provider": policy, "instruction": task, "guide": "differences", **how}
         lead = self._attempt.enter_context(robot.lead(self.leader_id, **how))
-        follower = FollowerElsewhere(lead)
-        source = self._lasting
-        if self._manual:
-            pressed = (lambda key: None) if self._keys is None else self._keys.pressed
-            source = self._attempt.enter_context(connected_leader(self.name, follower, self._options, pressed))
-        elif isinstance(source, RecordedLeader):
-            source.rewind()
-        check_keys(robot.id, source, lead.ranges)
-        announce(self._screen, self.name, robot.id, source)
+        source = self.ready(robot.id, FollowerElsewhere(lead), lead.ranges)
         moved = MOVED_MANUAL if self._manual else MOVED_ARM
         asked = self._keys is not None
         hand = self._hand = Hand(lead, source, moved=moved, ended=ended, told=self._tell, asked=asked)
@@ -262,9 +283,6 @@ class HandLeader:
             if policy:
                 key = "v" if self.name == "keyboard" else "t Enter"
                 self._screen.say(f"It takes over when it moves; {key} takes over and gives back.")
-            if self.name == "keyboard":
-                self._keys.leading = True
-                self._attempt.callback(setattr, self._keys, "leading", False)
 
     def cease(self) -> None:
         """Send no more commands; waits for nothing, as a stop may follow."""

@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-from strands_robots.cli.dataset_recording import Keys
 from strands_robots.cli.far_hand import HandLeader, LeadableHere
 from strands_robots.cli.leading import (
     LEADER,
-    MANUAL,
     TeleopOptions,
-    announce,
     begin,
     begin_policy,
-    check_keys,
-    connected_leader,
     load_policy,
 )
 from strands_robots.cli.led_robot import LedRobot
@@ -29,7 +24,6 @@ from strands_robots.policies.rollout import Rollout
 from strands_robots.recording.cameras import Frames
 from strands_robots.recording.file import Pictures, Recorder, RobotRecording
 from strands_robots.safety.stopping import StopVerdict
-from strands_robots.teleoperators import RecordedLeader
 
 CAMERAS_HZ_MAX = 60
 
@@ -131,49 +125,30 @@ class TurnsTask:
 
 
 @contextmanager
-def leader_drives(  # noqa: PLR0917 - one leader, and what is done with it
-    screen: Screen, leader: str, robot: str, options: dict[str, Any], keys: Keys | None, led: LedRobot
-) -> Iterator[Driver]:
+def leader_drives(screen: Screen, hand: HandLeader, robot: str, led: LedRobot) -> Iterator[Driver]:
     """Have a leader lead the robot in each attempt of the block.
 
+    Its own control loop reads the leader, so that a frame has the command of its beat.
+
     Args:
-        screen: where its keys are told.
-        leader: as the command line has it.
+        screen: where a resume is told.
+        hand: the leader.
         robot: as the command line has it.
-        options: of a leader arm.
-        keys: of the person; None for nobody.
         led: the robot.
 
     Raises:
         ConnectionError: a leader arm cannot be connected.
-        ValidationError: it leads joints that the robot lacks.
     """
-    manual, turn = leader in MANUAL, ExitStack()
-    how = TeleopOptions(leader if manual else "arm")
+    turn = ExitStack()
 
-    def connected() -> AbstractContextManager[Any]:
-        return connected_leader(leader, led.robot, options, (lambda key: None) if keys is None else keys.pressed)
+    def lead() -> Any:
+        turn.callback(hand.end)
+        source = hand.ready(robot, led.robot, led.robot.body().bounds)
+        begin(screen, led, hand.name, source, TeleopOptions(hand.method), publish=False)
+        return led.robot.tasks.by_leader[LEADER]
 
-    # What a hand moves begins each attempt where the robot then is.
-    with nullcontext() if manual else connected() as lasting:
-        recorded = isinstance(lasting, RecordedLeader)
-        if not manual:
-            check_keys(robot, lasting, led.robot.body().bounds)
-            announce(screen, leader, robot, lasting)
-
-        def lead() -> Any:
-            source: Any = turn.enter_context(connected()) if manual else lasting
-            if manual:
-                announce(screen, leader, robot, source)
-            if keys is not None and leader == "keyboard":
-                keys.leading = True
-                turn.callback(setattr, keys, "leading", False)
-            if recorded:
-                source.rewind()
-            begin(screen, led, leader, source, how, publish=False)
-            return led.robot.tasks.by_leader[LEADER]
-
-        yield Driver(lead, turn, LED_BY_RECORDING if recorded else LED_BY_PERSON)
+    with hand.connected():
+        yield Driver(lead, turn, LED_BY_PERSON if hand.person else LED_BY_RECORDING)
 
 
 class LocalAttempts:
