@@ -6,16 +6,21 @@ finds plug-ins by the names of distributions, and the classes of a configuration
 
 from __future__ import annotations
 
+import io
 import os
 import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from fixtures.feetech_bus.patience import be_patient
 from fixtures.replayed_cameras import BITS, SCENES, scenes, stamp
 from lerobot.cameras import Camera, CameraConfig
 from lerobot.teleoperators import Teleoperator, TeleoperatorConfig
+from PIL import Image
+
+from strands_robots.recording.cameras import jpeg
 
 # LeRobot gives a recording up where a busy machine keeps the emulated servos for 50 ms: that beat is a long one then.
 be_patient()
@@ -32,7 +37,9 @@ class Replayed(Camera):  # type: ignore[misc]
 
     def __init__(self, config: ReplayedConfig) -> None:
         super().__init__(config)
-        self._scenes = scenes(SCENES, config.width, config.height)
+        # As a webcam delivers them: else the way over a network would leave the encoder of the set less to do.
+        encoded = (jpeg("scene", each) for each in scenes(SCENES, config.width, config.height))
+        self._scenes = [np.asarray(Image.open(io.BytesIO(each))) for each in encoded]
         self._open = False
 
     @property
