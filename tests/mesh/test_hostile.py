@@ -200,6 +200,7 @@ def seeds(peers: Fleet, signer: Signer) -> dict[str, dict[str, Any]]:
         "strands/lead/input/leader": {**common, "seq": 1, "action": {"j": 1.0}},
         "strands/lead/camera/front": {**common, "encoding": "jpeg", "data": "AAAA"},
         "strands/lead/hand/left/state": common,
+        "strands/lead/turn": {**common, "state": "led", "leader": "hand", "why": ""},
         **{f"strands/lead/{name}": common for name in sensors},
     }
 

@@ -219,7 +219,7 @@ def floods(attacker: Attacker) -> dict[str, Callable[[int], tuple[str, object]]]
     """The worst messages for each topic that pass its decoder."""
     zid, now, assertion = attacker.zid, time.time(), {"v": 1, "epoch": "0" * 32, "targets": ["sim-1"], "nonce": "n"}
     frame = {"peer_id": "console", "device": "leader", "method": "arm", "t": now, "action": {"j": 1.0}}
-    telemetry = ("pose", "imu", "odom", "health", "lidar_summary", "lidar_state", "map_info", "state", "stream")
+    telemetry = ("pose", "imu", "odom", "health", "lidar_summary", "lidar_state", "map_info", "state", "stream", "turn")
     sensors = {name: name.replace("_", "/") for name in telemetry}
     made: dict[str, Callable[[int], tuple[str, object]]] = {
         "input": lambda n: ("strands/console/input/leader", {**frame, "seq": n}),
