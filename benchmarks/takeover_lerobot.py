@@ -72,10 +72,20 @@ class Loop:
     Attributes:
         beats: when each turn's loop read its leader, in monotonic seconds.
         ages: age of each picture when it was recorded, in seconds.
+        dropped: pictures that LeRobot's encoder was too slow for.
     """
 
     beats: list[list[float]] = field(default_factory=list)
     ages: list[float] = field(default_factory=list)
+    dropped: int = 0
+
+    def see(self, numbers: Sequence[int], moments: Sequence[float]) -> None:
+        """Add a camera's recorded pictures, by their numbers, and the beats of the loop."""
+        if len(numbers) == len(moments):
+            self.ages += [age_s(number, moment) for number, moment in zip(numbers, moments, strict=True)]
+        else:
+            # Which beat each of the others belongs to is not known.
+            self.dropped += len(moments) - len(numbers)
 
     @property
     def periods(self) -> list[float]:
@@ -121,8 +131,9 @@ def loop_row(ours: Loop, theirs: Loop, seconds: float) -> Row:
 def shown(loop: Loop) -> str:
     """Return the figures of one side."""
     period = f"p50 {percentile(loop.periods, 0.5):.1f} p99 {percentile(loop.periods):.1f} ms"
-    age = f"{1000 * percentile(loop.ages, 0.5):.0f}, p99 {1000 * percentile(loop.ages):.0f} ms"
-    return f"{loop.rate:.2f} Hz; {period}; pictures {age} old"
+    age = f"{1000 * percentile(loop.ages, 0.5):.0f}, p99 {1000 * percentile(loop.ages):.0f} ms old" if loop.ages else ""
+    dropped = f", {loop.dropped} dropped by LeRobot's encoder" if loop.dropped else ""
+    return f"{loop.rate:.2f} Hz; {period}; pictures {age}{dropped}"
 
 
 class Recordings:
@@ -177,9 +188,7 @@ class Recordings:
         moments = [float(each) for each in beats.read_text().splitlines()]
         loop.beats.append(moments)
         for video in sorted(root.glob("videos/**/*.mp4")):
-            loop.ages += [
-                age_s(stamped(picture), moment) for picture, moment in zip(pictures_of(video), moments, strict=False)
-            ]
+            loop.see([stamped(picture) for picture in pictures_of(video)], moments)
 
 
 def age_s(number: int, moment: float) -> float:

@@ -79,3 +79,11 @@ def test_age_of_a_picture_is_known_by_its_number() -> None:
     number = int(1000.0 * FPS)
     assert age_s(number % 2**16, 1000.05) == pytest.approx(0.05)
     assert age_s(2**16 - 1, 2**16 / FPS) == pytest.approx(1 / FPS), "the numbers begin anew"
+
+
+def test_pictures_that_the_encoder_dropped_have_no_age() -> None:
+    loop = Loop([[0.0, 0.1]])
+    loop.see([0, 2], [0.0, 0.1])
+    assert loop.ages == [0.0, pytest.approx(0.1 - 2 / FPS)]
+    loop.see([2], [0.0, 0.1])
+    assert (len(loop.ages), loop.dropped) == (2, 1)
