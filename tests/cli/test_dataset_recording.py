@@ -7,6 +7,7 @@ import io
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -32,7 +33,7 @@ FPS = 30
 class Arm:
     """A robot without cameras, of ten steps an attempt."""
 
-    name, has_cameras, stopped_by = "arm-1", False, "stop by alice."
+    name, has_cameras, stopped_by, locked = "arm-1", False, "stop by alice.", ""
 
     def __init__(self) -> None:
         self.stopped, self.held = False, 0
@@ -118,6 +119,13 @@ def test_leader_that_failed_costs_no_saved_episode(tmp_path: Path, arm: Arm) -> 
     assert tables.read_frames(tmp_path / "data/chunk-000/file-001.parquet")["next.success"].tolist() == [False] * 10
 
 
+def worth(folder: Path) -> list[tuple[bool, int]]:
+    """Return of each episode whether it is a success, and whether a stop ends it."""
+    files = [folder / data_file(number) for number in range(9)]
+    frames = [tables.read_frames(file) for file in files if file.exists()]
+    return [(bool(each["next.success"].any()), int(each["stop"][-1])) for each in frames]
+
+
 class Steady:
     """A task that runs until it is told to end."""
 
@@ -180,15 +188,15 @@ def test_begin_that_comes_as_the_pause_is_over_judges_no_attempt(tmp_path: Path,
 def test_stop_of_the_recording_is_an_episode_without_success_and_its_end(tmp_path: Path, arm: Arm) -> None:
     device = RecorderDevice(state := RecordingState(), "arm-1", "wave")
     attempts = Attempts(9, Steady, FPS, None, 0.0, success=True, state=state)
-    stopper = threading.Thread(target=lambda: (eventually(lambda: state.runs), device.halt("stop by desk")))
+    records = partial(eventually, lambda: device.get_recording()["state"] == "recording")
+    stopper = threading.Thread(target=lambda: (records(), device.halt("stop by desk")))
     stopper.start()
     with session(tmp_path) as recording:
         with pytest.raises(CliError, match="the recording was stopped: stop by desk"):
             record_attempts(Screen(console=Console(file=io.StringIO())), arm, recording, attempts)
         assert recording.episodes == 1
     stopper.join(10)
-    frames = tables.read_frames(tmp_path / data_file(0))
-    assert (frames["next.success"].any(), frames["stop"][-1]) == (False, 1)
+    assert worth(tmp_path) == [(False, 1)]
 
 
 def test_recording_that_is_stopped_as_it_starts_begins_nothing(tmp_path: Path, arm: Arm) -> None:
@@ -206,3 +214,117 @@ def test_recording_that_is_stopped_as_it_starts_begins_nothing(tmp_path: Path, a
     ):
         record_attempts(Screen(console=Console(file=io.StringIO())), arm, recording, attempts)
     assert began == []
+
+
+STOPPED = "the recording was stopped: stop by desk"
+
+
+def attempts_of(state: RecordingState, began: list[Steady], **how: Any) -> Attempts:
+    def begin() -> Steady:
+        began.append(Steady())
+        return began[-1]
+
+    return Attempts(
+        9, begin, FPS, how.pop("seconds", None), how.pop("pause_s", 0.0), how.pop("success", True), **how, state=state
+    )
+
+
+def recorded(arm: Arm, folder: Path, attempts: Attempts) -> str:
+    """Record on this thread; return why it failed."""
+    with session(folder) as recording:
+        try:
+            record_attempts(Screen(console=Console(file=io.StringIO())), arm, recording, attempts)
+        except CliError as failed:
+            return failed.reason
+    return ""
+
+
+@pytest.mark.parametrize("asked", [False, True], ids=["by_time", "by_a_person"])
+def test_stop_while_it_waits_lets_no_attempt_begin(tmp_path: Path, arm: Arm, asked: bool) -> None:
+    class Late(RecordingState):
+        def wait_for_begin(self, begins_at: float | None) -> None:
+            super().wait_for_begin(begins_at)
+            device.halt("stop by desk")
+            self.words.take(Said.SUCCESS)
+
+    device = RecorderDevice(state := Late(), "arm-1", "wave")
+    began: list[Steady] = []
+    assert recorded(arm, tmp_path, attempts_of(state, began, asked=asked)) == f"Nothing more is recorded: {STOPPED}."
+    assert (began, arm.held) == ([], 0)
+
+
+def test_locked_robot_stays_on_its_network_after_a_stop_while_it_waits(tmp_path: Path, arm: Arm) -> None:
+    state, arm.locked = RecordingState(), "locked by desk"
+    state.halt(STOPPED)
+    assert recorded(arm, tmp_path, attempts_of(state, [])) == f"Nothing more is recorded: {STOPPED}."
+    assert arm.held == 1
+
+
+@pytest.mark.parametrize("stage", [Stage.ENDING, Stage.SAVING])
+def test_stop_after_the_word_ends_the_recording_and_leaves_the_word(tmp_path: Path, arm: Arm, stage: Stage) -> None:
+    class Late(RecordingState):
+        def enter(self, entered: Stage, progress: Any = None) -> None:
+            super().enter(entered, progress)
+            if entered is Stage.RECORDING:
+                self.words.take(Said.SUCCESS)
+            if entered is stage:
+                self.halt(STOPPED)
+
+    began: list[Steady] = []
+    assert recorded(arm, tmp_path, attempts_of(Late(), began)) == f"Nothing more is recorded: {STOPPED}."
+    assert (len(began), worth(tmp_path)) == (1, [(True, 0)])
+
+
+def test_stop_counts_before_a_word_of_the_same_moment(tmp_path: Path, arm: Arm) -> None:
+    class Both(RecordingState):
+        def enter(self, entered: Stage, progress: Any = None) -> None:
+            super().enter(entered, progress)
+            if entered is Stage.RECORDING:
+                self.words.take(Said.SUCCESS)
+                self.halt(STOPPED)
+
+    assert recorded(arm, tmp_path, attempts_of(Both(), [])) == f"The attempt failed: {STOPPED}"
+    assert worth(tmp_path) == [(False, 1)]
+
+
+@pytest.mark.parametrize("asked", [False, True], ids=["by_time", "by_a_person"])
+def test_recorder_that_is_locked_begins_nothing_until_it_is_resumed(tmp_path: Path, arm: Arm, asked: bool) -> None:
+    state, began, locked = RecordingState(), list[Steady](), ["recorder-arm-1 is locked by desk"]
+    state.locked = lambda: "".join(locked)
+    attempts = attempts_of(state, began, asked=asked)
+    thread = threading.Thread(target=recorded, args=(arm, tmp_path, attempts))
+    thread.start()
+    eventually(lambda: state.facts()["state"] == "waiting", what="the pause")
+    state.words.take(Said.SUCCESS)
+    eventually(lambda: state.facts()["said"] == f"No attempt begins: {locked[0]}", what="the reason")
+    assert began == []
+    eventually(lambda: state.words.said() is None, what="the word, which is spent")
+    locked.clear()
+    if asked:
+        state.words.take(Said.SUCCESS)
+    eventually(lambda: state.facts()["state"] == "recording", what="the attempt")
+    state.words.take(Said.END)
+    thread.join(10)
+    assert (len(began), thread.is_alive()) == (1, False)
+
+
+def test_end_that_comes_with_another_word_is_not_lost(tmp_path: Path, arm: Arm) -> None:
+    class Twice(RecordingState):
+        def wait_for_begin(self, begins_at: float | None) -> None:
+            super().wait_for_begin(begins_at)
+            for word in self.said_at_begin:
+                self.words.take(word)
+
+        def enter(self, entered: Stage, progress: Any = None) -> None:
+            super().enter(entered, progress)
+            for word in (Said.SUCCESS, Said.END) if entered is Stage.RECORDING else ():
+                self.words.take(word)
+
+        said_at_begin: tuple[Said, ...] = (Said.SUCCESS, Said.END)
+
+    began: list[Steady] = []
+    assert recorded(arm, tmp_path, attempts_of(Twice(), began, asked=True)) == ""
+    assert began == []
+    Twice.said_at_begin = (Said.SUCCESS,)
+    assert recorded(arm, tmp_path, attempts_of(Twice(), began, asked=True)) == ""
+    assert (len(began), worth(tmp_path)) == (1, [(True, 0)]), "the first word judges, and the end ends"

@@ -15,6 +15,7 @@ from strands_robots.cli import far_recording
 from strands_robots.cli.far_recording import FarRobot, FarTask
 from strands_robots.cli.led_robot import halted_first
 from strands_robots.cli.output import CliError
+from strands_robots.cli.recording_state import RecordingState
 from strands_robots.errors import NoAnswerError, RobotError
 from strands_robots.fleet.adapter import RobotEvent
 from strands_robots.recording.file import Recorder
@@ -196,6 +197,21 @@ def test_policy_whose_end_nobody_tells_is_no_success(arm: ServedArm, robot: FarR
     arm.answers = lambda: {"task_status": "idle"}
     ended(task)
     assert (task.voided, robot.stopped) == (True, False)
+
+
+def test_policy_that_is_loading_is_not_started_after_a_stop_of_the_recording(arm: ServedArm, robot: FarRobot) -> None:
+    state, tries = RecordingState(), list[str]()
+
+    def loading() -> None:
+        tries.append("start")
+        if len(tries) == 2:
+            state.halt("the recording was stopped: stop by desk")
+        raise RobotError("its policy is loading", envelope={"loading": True})
+
+    arm.start = loading
+    with pytest.raises(CliError, match="Nothing began: the recording was stopped: stop by desk"):
+        robot.begin(30, state.check)
+    assert len(tries) == 2
 
 
 def test_start_that_is_not_answered_halts_the_robot(arm: ServedArm, robot: FarRobot) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 from typing import Any
 
 import pytest
@@ -19,7 +20,8 @@ class Bench:
 
     def __init__(self) -> None:
         self.state = RecordingState()
-        self.driver = recorder_driver(RecorderDevice(self.state, "arm-1", "wave"), "recorder-arm-1")
+        self.device = RecorderDevice(self.state, "arm-1", "wave")
+        self.driver = recorder_driver(self.device, "recorder-arm-1")
         self.state.enter(Stage.RECORDING)
 
     def call(self, verb: str, caller: str | None = "dashboard", **arguments: object) -> dict[str, Any]:
@@ -56,13 +58,42 @@ def test_locked_recorder_begins_nothing_and_ends_what_its_robot_does_not(bench: 
     latch = LockoutLatch("recorder-arm-1")
     bench.driver.robot.gate.attach(latch)
     latch.engage("e" * 32, "desk", "smoke")
-    assert bench.driver.robot.halt("emergency stop of desk").stopped
-    assert bench.state.halted == "", "the robot's own stop is seen first, where it is stopped as well"
-    eventually(lambda: bench.state.halted, what="the end of the attempt")
+    ends: list[str] = []
+    watcher = threading.Thread(
+        target=lambda: (
+            eventually(lambda: bench.state.halting),
+            ends.append(bench.state.halted),
+            eventually(lambda: bench.state.halted, what="the end of the attempt"),
+            bench.state.enter(Stage.SAVING),
+        )
+    )
+    watcher.start()
+    verdict = bench.driver.robot.halt("emergency stop of desk")
+    watcher.join(10)
+    assert ends == [""], "the robot's own stop is seen first, where it is stopped as well"
+    assert verdict.stopped, "once the attempt is over"
     bench.state.wait_for_begin(None)
     refused = bench.call("beginEpisode")
     assert (refused["status"], refused["locked"]) == ("error", True)
     assert bench.state.words.said() is None
+
+
+def test_stop_of_one_recorder_waits_for_no_robot_that_an_older_stop_has_locked(bench: Bench) -> None:
+    latch = LockoutLatch("recorder-arm-1")
+    bench.driver.robot.gate.attach(latch)
+    latch.engage("e" * 32, "desk", "smoke")
+    bench.device.halt("emergency stop of desk")
+    assert bench.state.halted == ""
+    bench.device.halt("stop by desk")
+    assert bench.state.halted == "the recording was stopped: stop by desk"
+
+
+def test_begin_of_a_recorder_that_was_locked_before_is_named_to_the_terminal(bench: Bench) -> None:
+    assert bench.state.refusal == ""
+    latch = LockoutLatch("recorder-arm-1")
+    bench.driver.robot.gate.attach(latch)
+    latch.engage("e" * 32, "desk", "smoke")
+    assert bench.state.refusal.startswith("recorder-arm-1 is locked by the emergency stop of desk")
 
 
 def test_emergency_stop_of_the_recorder_alone_ends_the_attempt_at_once(bench: Bench) -> None:
@@ -78,6 +109,7 @@ def test_locked_recorder_ends_all_the_same_and_asks_for_no_lease(bench: Bench) -
     latch = LockoutLatch("recorder-arm-1")
     bench.driver.robot.gate.attach(latch)
     latch.engage("e" * 32, "desk", "smoke")
-    bench.call("acquireControl", "other", holder="other", kind="agent")
+    bench.driver.pipeline.leases.of().acquire("other", "agent", 10.0)
+    assert bench.call("getControl")["holder"] == "other"
     assert bench.call("endRecording")["status"] == "success"
     assert bench.state.words.said() is Said.END

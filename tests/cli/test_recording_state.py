@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from strands_robots.cli.output import CliError
 from strands_robots.cli.recorder_device import RecorderDevice
 from strands_robots.cli.recording_state import RecordingState, Said, Stage
 from strands_robots.envelope import is_error, text_of
@@ -80,16 +81,32 @@ def test_who_looks_sees_how_far_it_is(state: RecordingState, device: RecorderDev
     assert device.get_task_status()["task_status"] == "idle"
 
 
-def test_stop_of_a_recording_ends_the_attempt_that_runs(state: RecordingState, device: RecorderDevice) -> None:
-    state.wait_for_begin(None)
+@pytest.mark.parametrize("stage", [each for each in Stage if each is not Stage.OVER])
+def test_stop_of_a_recording_is_kept_whatever_its_stage(
+    state: RecordingState, device: RecorderDevice, stage: Stage
+) -> None:
+    state.enter(stage)
+    assert state.halted == ""
     device.halt("stop by desk")
-    assert state.halted == "", "nothing runs that it could end"
-    state.enter(Stage.STARTING)
-    assert device.get_task_status()["task_status"] == "running"
-    device.halt("stop by desk")
-    state.enter(Stage.RECORDING)
+    state.enter(Stage.SAVING)
+    state.wait_for_begin(0.0)
     assert state.halted == "the recording was stopped: stop by desk"
-    state.enter(Stage.ENDING)
-    assert device.get_task_status()["task_status"] == "running", "the robot is not halted yet"
+    assert "the recording was stopped: stop by desk" in text_of(device.begin_episode())
+    with pytest.raises(CliError, match="Nothing began: the recording was stopped: stop by desk"):
+        state.check()
+
+
+def test_stop_is_confirmed_once_the_robot_of_an_attempt_is_halted(
+    state: RecordingState, device: RecorderDevice
+) -> None:
+    def asked() -> dict[str, Any]:
+        raise AssertionError("a stop waits for no figures of the attempt")
+
+    state.enter(Stage.STARTING)
+    state.enter(Stage.RECORDING, asked)
+    device.halt("stop by desk")
+    for leads in (Stage.RECORDING, Stage.ENDING):
+        state.enter(leads, asked)
+        assert device.get_task_status()["task_status"] == "running"
     state.enter(Stage.SAVING)
     assert device.get_task_status()["task_status"] == "idle"

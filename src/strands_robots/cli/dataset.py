@@ -119,7 +119,8 @@ def record(
             )
         led_from_here = None if leader in (None, PAGE) else hand
         with served_robot(screen, network, robot, policy or "", task, names, led_from_here) as far:
-            attempts = Attempts(episodes, partial(far.begin, longest), fps, longest, pause_s, success, asked, state)
+            begin = partial(far.begin, longest, state.check)
+            attempts = Attempts(episodes, begin, fps, longest, pause_s, success, asked, state)
             _record_served(screen, folder, far, task, attempts, buttons)
         return
     how = Serving.of(network, peer_id, None, alone=no_network)
@@ -129,9 +130,9 @@ def record(
         resolve_provider(policy)
     kind, arm = robot.partition("@")[0], arm_options("", follower_id, calibration)
     if policy and leader:
-        drives = partial(turns_drive, screen, policy, task, longest, hand)
+        drives = partial(turns_drive, screen, policy, task, longest, hand, state.check)
     elif policy:
-        drives = partial(policy_drives, screen, policy, task, longest)
+        drives = partial(policy_drives, screen, policy, task, longest, state.check)
     else:
         drives = partial(leader_drives, screen, hand, robot)
     with (

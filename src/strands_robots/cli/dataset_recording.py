@@ -140,6 +140,10 @@ class AttemptRobot(Protocol):
         """The reason of the stop, with its caller."""
 
     @property
+    def locked(self) -> str:
+        """By whom a robot of this process is locked; empty for any other."""
+
+    @property
     def has_cameras(self) -> bool:
         """True where pictures are recorded."""
 
@@ -185,6 +189,11 @@ def _record(
     while saved < attempts.count:
         state.count(attempts.count, saved)
         if not _ready(screen, attempts, saved, pause_s):
+            if state.halting:
+                if led.locked:
+                    # It is resumed on its network.
+                    led.hold(screen)
+                raise CliError(f"Nothing more is recorded: {state.halting}.")
             return
         pause_s = attempts.pause_s
         ended = _attempt(screen, led, session, attempts, encoder)
@@ -210,18 +219,18 @@ def _record(
             saved += not lacking
         if ended.failed:
             raise CliError(f"The attempt failed: {ended.failed}")
-        if ended.said is Said.END or ended.interrupted:
+        if ended.last:
             return
 
 
 @dataclass(frozen=True, slots=True)
 class _Ended:
-    """End of one attempt: what was said of it, who stopped it, why it failed."""
+    """End of one attempt: its word, who stopped it, its failure; is it the last."""
 
     said: Said
     stopped_by: str
     failed: str
-    interrupted: bool
+    last: bool
     verdict: StopVerdict | None
 
 
@@ -231,21 +240,28 @@ def _ready(screen: Screen, attempts: Attempts, saved: int, pause_s: float) -> bo
     attempts.state.wait_for_begin(begins_at)
     if attempts.asked:
         screen.say(f"Attempt {saved + 1} of {attempts.count}: {words.begins}", "bold")
-    said = list[Said]()
+    said, told, state = list[Said](), list[str](), attempts.state
 
     def over() -> str:
-        word = words.said()
-        if word is not None:
-            said.append(word)
-            return "said"
-        return "" if begins_at is None or time.monotonic() < begins_at else "over"
+        said.extend(words.spoken())
+        if Said.END in said or state.halted:
+            return "ended"
+        due = bool(said) or (begins_at is not None and time.monotonic() >= begins_at)
+        if due and (why := state.refusal):
+            if said or why not in told:
+                told.append(why)
+                attempts.tell(screen, f"No attempt begins: {why}", "bold red")
+            if said:
+                said.clear()
+                state.wait_for_begin(begins_at)
+            return ""
+        return "begins" if due else ""
 
     why = wait_until(screen, over)
-    attempts.state.enter(Stage.STARTING)
-    while (late := words.said()) is not None:
-        # It came with the begin, and judges no attempt.
-        said.append(late)
-    return why != "Ctrl-C." and Said.END not in said
+    state.enter(Stage.STARTING)
+    # What came with the begin judges no attempt.
+    said.extend(words.spoken())
+    return why == "begins" and Said.END not in said
 
 
 @contextmanager
@@ -272,17 +288,6 @@ def _unwritten(session: RecordingSession, why: str) -> CliError:
     return CliError(f"{why.rstrip('.')}. Episodes that are saved: {session.episodes}. {kept_in}")
 
 
-def _begun(attempts: Attempts) -> Any:
-    """Begin to lead; return the task.
-
-    Raises:
-        CliError: it was refused, or the recording was stopped meanwhile.
-    """
-    if halted := attempts.state.halted:
-        raise CliError(f"Nothing began: {halted}.")
-    return attempts.begin()
-
-
 def _attempt(
     screen: Screen, led: AttemptRobot, session: RecordingSession, attempts: Attempts, encoder: CameraEncoder | None
 ) -> _Ended:
@@ -302,19 +307,19 @@ def _attempt(
                 f"No picture of {', '.join(silent)} came within {FIRST_PICTURE_S:g} s; --cameras names those to "
                 "record, or none."
             )
-        task, began = _begun(attempts), time.monotonic()
+        state.check()
+        task, began = attempts.begin(), time.monotonic()
         state.enter(Stage.RECORDING, progress.row)
         if attempts.asked:
             screen.say(state.words.judges)
 
         def over() -> str:
-            word = state.words.said()
-            if word is not None:
-                said.append(word)
-                return "said"
             if halted := state.halted:
                 halts.append(halted)
                 return "halted"
+            said.extend(() if state.halting else state.words.spoken())
+            if said:
+                return "said"
             if attempts.seconds is not None and time.monotonic() - began >= attempts.seconds:
                 return "time"
             if task.voided:
@@ -335,13 +340,14 @@ def _attempt(
         with progress.shown(screen):
             why = wait_until(screen, over, at_end=end)
             state.enter(Stage.SAVING)
-    if why in ("time", "ended") and (late := state.words.said()) is not None:
-        # It was said before the end was seen.
-        said.append(late)
+    # Some of it may have been said before the end was seen.
+    said.extend(state.words.spoken())
     stopped_by, verdict = ends[0]
     done = attempts.success and why in ("time", "ended") and not task.error
-    word = said[0] if said else Said.SUCCESS if done else Said.FAILURE
-    ended = _Ended(word, stopped_by, task.error or "".join(halts), why == "Ctrl-C.", verdict)
+    judged = said[0] if said and why in ("said", "time", "ended") else None
+    word = judged or (Said.SUCCESS if done else Said.FAILURE)
+    last = Said.END in said or why == "Ctrl-C."
+    ended = _Ended(word, stopped_by, task.error or "".join(halts), last, verdict)
     return ended if encoder is None else _with_pictures(screen, encoder, ended)
 
 

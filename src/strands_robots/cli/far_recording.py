@@ -9,7 +9,7 @@ from __future__ import annotations
 import base64
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from typing import Any
@@ -133,6 +133,9 @@ class FarRobot:
         self._attempt: FarTask | None = None
         self._recorder: Recorder | None = None
 
+    locked = ""
+    """Empty: whoever locked it, its own process keeps it on the network."""
+
     @property
     def name(self) -> str:
         """Its id in recordings."""
@@ -174,8 +177,12 @@ class FarRobot:
         task = self._attempt
         return "" if task is None or not self.stopped else task.stopped_by or f"{self.name} was stopped."
 
-    def begin(self, seconds: float | None) -> FarTask:
+    def begin(self, seconds: float | None, check: Callable[[], object] = lambda: None) -> FarTask:
         """Begin an attempt, and start the policy where it has one.
+
+        Args:
+            seconds: longest time of the attempt; None for as long as it lasts.
+            check: raises :class:`CliError` where it may no longer begin; asked before each try.
 
         Raises:
             NotBegunError: the robot refused it.
@@ -188,7 +195,7 @@ class FarRobot:
         task = self._attempt = FarTask()
         if self._policy or self._hand is not None:
             try:
-                self._start_loaded(task, seconds)
+                self._start_loaded(task, seconds, check)
             except RefusalError as refused:
                 why = said(refused)
                 task.end(why)
@@ -201,10 +208,11 @@ class FarRobot:
         threading.Thread(target=self._watch, args=(task,), name=f"attempt {self.name}", daemon=True).start()
         return task
 
-    def _start_loaded(self, task: FarTask, seconds: float | None) -> None:
+    def _start_loaded(self, task: FarTask, seconds: float | None, check: Callable[[], object]) -> None:
         """Start, also where the robot has yet to load its policy."""
         until = time.monotonic() + LOADING_S
         while True:
+            check()
             try:
                 self._start(task, seconds)
             except RefusalError as refused:

@@ -100,8 +100,13 @@ def begin_policy(screen: Screen, led: LedRobot, policy: str, task: str, seconds:
     return started
 
 
-def load_policy(screen: Screen, policy: str) -> None:
+def load_policy(screen: Screen, policy: str, check: Callable[[], object] = lambda: None) -> None:
     """Wait until a policy is loaded, which may take a large one minutes.
+
+    Args:
+        screen: where it is told.
+        policy: its name.
+        check: raises :class:`CliError` where nothing may begin any more; asked to the end.
 
     Raises:
         ValidationError: there is no such policy.
@@ -109,12 +114,14 @@ def load_policy(screen: Screen, policy: str) -> None:
     """
     made, told = create_policy(policy), False
     while isinstance(made, Warmable) and (problem := made.warm()) is not None:
+        check()
         if problem:
             raise CliError(f"The policy {policy} could not be loaded: {problem}.")
         if not told:
             screen.say(f"The policy {policy} is loading.")
             told = True
         time.sleep(POLL_S)
+    check()
 
 
 def _refused(screen: Screen, led: LedRobot, why: str) -> CliError:

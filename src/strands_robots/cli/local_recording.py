@@ -44,8 +44,12 @@ class Driver:
 
 
 @contextmanager
-def policy_drives(screen: Screen, policy: str, task: str, seconds: float | None, led: LedRobot) -> Iterator[Driver]:
+def policy_drives(  # noqa: PLR0917 - one policy, and what is done with it
+    screen: Screen, policy: str, task: str, seconds: float | None, check: Callable[[], object], led: LedRobot
+) -> Iterator[Driver]:
     """Have a policy drive the robot in each attempt of the block.
+
+    ``check`` raises :class:`CliError` where none may begin any more.
 
     Raises:
         ValidationError: there is no such policy.
@@ -54,7 +58,7 @@ def policy_drives(screen: Screen, policy: str, task: str, seconds: float | None,
 
     def started() -> Any:
         # Loaded already but after a failure: the next attempt waits for it, not the caller.
-        load_policy(screen, policy)
+        load_policy(screen, policy, check)
         return begin_policy(screen, led, policy, task, seconds)
 
     load_policy(screen, policy)
@@ -64,9 +68,17 @@ def policy_drives(screen: Screen, policy: str, task: str, seconds: float | None,
 
 @contextmanager
 def turns_drive(  # noqa: PLR0917 - one leader, one policy, and what is done with them
-    screen: Screen, policy: str, task: str, seconds: float | None, hand: HandLeader, led: LedRobot
+    screen: Screen,
+    policy: str,
+    task: str,
+    seconds: float | None,
+    hand: HandLeader,
+    check: Callable[[], object],
+    led: LedRobot,
 ) -> Iterator[Driver]:
     """Have a policy drive in each attempt of the block, and a leader take over.
+
+    ``check`` raises :class:`CliError` where none may begin any more.
 
     Raises:
         ConnectionError: a leader arm cannot be connected.
@@ -76,7 +88,7 @@ def turns_drive(  # noqa: PLR0917 - one leader, one policy, and what is done wit
     turn = ExitStack()
 
     def begun() -> Any:
-        load_policy(screen, policy)
+        load_policy(screen, policy, check)
         turn.callback(hand.end)
         failures = list[str]()
 
@@ -85,10 +97,11 @@ def turns_drive(  # noqa: PLR0917 - one leader, one policy, and what is done wit
             if not halted:
                 failures.append(why)
 
-        try:
-            hand.begin(LeadableHere(led.robot), policy, task, seconds, ended)
-        except RefusalError as refused:
-            raise CliError(said(refused)) from refused
+        with led.held_by(hand.leader_id, lambda: hand.leader_id in led.robot.tasks.leading()):
+            try:
+                hand.begin(LeadableHere(led.robot), policy, task, seconds, ended)
+            except RefusalError as refused:
+                raise CliError(said(refused)) from refused
         return TurnsTask(led.robot.tasks.by_leader[hand.leader_id], failures)
 
     load_policy(screen, policy)
@@ -180,6 +193,11 @@ class LocalAttempts:
     def stopped_by(self) -> str:
         """The reason of the stop, with its caller."""
         return self._led.stopped_by
+
+    @property
+    def locked(self) -> str:
+        """By whom it is locked; empty while it is free."""
+        return self._led.locked if self._led.peer_id else ""
 
     @property
     def has_cameras(self) -> bool:

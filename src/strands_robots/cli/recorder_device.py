@@ -12,7 +12,7 @@ from strands_robots.cli.output import CliError, Screen
 from strands_robots.cli.own_robot import device_of, peer_of
 from strands_robots.cli.recording_state import BEGIN, END, KEEP, REDO, RecordingState, Said
 from strands_robots.cli.serve import PAGE_CALLER
-from strands_robots.envelope import Envelope, success
+from strands_robots.envelope import Envelope, success, text_of
 from strands_robots.safety.authorization import Authorization
 from strands_robots.safety.gate import gate_of
 from strands_robots.safety.scope import SCOPE
@@ -22,7 +22,7 @@ from strands_robots.verb_declaration import verb
 RECORDER = "recorder"
 """Kind of the device, on every network."""
 
-ROBOT_FIRST_S = 1.0
+ROBOT_FIRST_S = 0.3
 """Seconds in which a robot that an emergency stop locks as well is seen to be stopped, and ends the attempt itself."""
 
 
@@ -43,6 +43,7 @@ class RecorderDevice:
     def __init__(self, state: RecordingState, robot: str, task: str) -> None:
         self.tool_name_str = RECORDER
         self._state, self._robot, self._task = state, robot, task
+        state.locked = self._locked
 
     @verb(motion=False)
     def get_recording(self) -> dict[str, Any]:
@@ -82,21 +83,24 @@ class RecorderDevice:
 
     def get_task_status(self) -> dict[str, Any]:
         """Return an attempt as a task, until its robot is halted."""
-        facts = self._state.facts()
-        runs = self._state.runs and not self._stopped_with_its_robot
-        text = f"episode {facts['episode']} of {facts['episodes']}, {facts['stage']}"
-        return success(text, task_status="running" if runs else "idle", instruction=text)
+        text = self._state.summary
+        return success(text, task_status="running" if self._state.runs else "idle", instruction=text)
 
     def halt(self, reason: str = "") -> None:
-        """End the attempt that runs; its status tells when the robot is halted."""
-        after_s = ROBOT_FIRST_S if self._stopped_with_its_robot else 0.0
-        self._state.halt(f"the recording was stopped: {reason}", after_s)
+        """End the recording; its status tells when the robot of an attempt is halted."""
+        # A lockout of before has let no attempt begin, so the first one that is seen is this stop's.
+        waits = not self._state.halting and self._robot_is_stopped_as_well
+        self._state.halt(f"the recording was stopped: {reason}", ROBOT_FIRST_S if waits else 0.0)
 
     @property
-    def _stopped_with_its_robot(self) -> bool:
+    def _robot_is_stopped_as_well(self) -> bool:
         """True while an emergency stop of more than named robots locks it."""
         locked = gate_of(self).lockout(RECORDER)
         return locked is not None and not locked.get(SCOPE, {}).get("only")
+
+    def _locked(self) -> str:
+        locked = gate_of(self).lockout(BEGIN)
+        return "" if locked is None else text_of(locked).removeprefix(f"{BEGIN} is refused: ")
 
 
 @contextmanager

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from enum import Enum
 from typing import Any
 
+from strands_robots.cli.output import CliError
 from strands_robots.envelope import Envelope, error, success
 
 
@@ -46,6 +47,10 @@ class Words:
         """Return the next word; None while there is none."""
         return self._words.popleft() if self._words else None
 
+    def spoken(self) -> list[Said]:
+        """Return all words that are there, in order."""
+        return list(iter(self.said, None))
+
     def forget(self) -> None:
         """Forget what was said until now."""
         self._words.clear()
@@ -80,13 +85,18 @@ class RecordingState:
     """Stage of a recording; callable from any thread.
 
     A word from the network counts where it fits the stage, once: the loop that records takes it, as it takes a key's.
+    A stop counts in every stage, and is never forgotten: no attempt begins after it.
 
     Args:
         words: of the person, which the loop reads.
+
+    Attributes:
+        locked: returns by whom its device is locked; empty while it is free, or where it has none.
     """
 
     def __init__(self, words: Words | None = None) -> None:
         self.words = words or Words()
+        self.locked: Callable[[], str] = str
         self._lock = threading.Lock()
         self._stage = Stage.OPENING
         self._pressed = False
@@ -122,29 +132,51 @@ class RecordingState:
         """Enter a stage; ``progress`` returns the figures of its attempt."""
         with self._lock:
             self._stage, self._pressed, self._begins_at = stage, False, None
-            # A stop while it starts ends it as soon as it has.
-            self._halt = self._halt if stage in _LEADS else None
             self._progress = progress or (self._progress if stage in (Stage.ENDING, Stage.SAVING) else dict)
 
     def halt(self, reason: str, after_s: float = 0.0) -> None:
-        """End the attempt that runs, if any, in so many seconds; it is no success."""
+        """End the recording, and in so many seconds its attempt, as no success."""
         with self._lock:
-            if self._stage in _LEADS and self._halt is None:
-                self._halt = time.monotonic() + after_s, reason
+            ends = time.monotonic() + after_s
+            if self._halt is None or ends < self._halt[0]:
+                self._halt = ends, reason
+
+    @property
+    def halting(self) -> str:
+        """The reason of the stop; empty while there was none."""
+        return "" if self._halt is None else self._halt[1]
 
     @property
     def halted(self) -> str:
-        """The reason why the attempt has to end now; empty for none."""
-        with self._lock:
-            return self._halt[1] if self._halt is not None and time.monotonic() >= self._halt[0] else ""
+        """The same once what runs has to end."""
+        halt = self._halt
+        return halt[1] if halt is not None and time.monotonic() >= halt[0] else ""
+
+    @property
+    def refusal(self) -> str:
+        """The reason why no attempt may begin now; empty while one may."""
+        return self.halting or self.locked()
+
+    def check(self) -> None:
+        """Raise :class:`CliError` where no attempt may begin now."""
+        if why := self.refusal:
+            raise CliError(f"Nothing began: {why.rstrip('.')}.")
 
     @property
     def runs(self) -> bool:
         """True while an attempt may lead its robot."""
         return self._stage in _LEADS
 
+    @property
+    def summary(self) -> str:
+        """Its episode and stage; nothing of the attempt is asked."""
+        counts = self._counts
+        return f"episode {counts['episode']} of {counts['episodes']}, {self._stage.value}"
+
     def press(self, verb: str, word: Said) -> Envelope:
         """Take a word from the network; an error names the stage that it does not fit."""
+        if verb == BEGIN and (why := self.refusal):
+            return error(f"{verb} is refused: {why}", state=self._stage.name.lower())
         with self._lock:
             stage, fits = self._stage, _AT.get(self._stage, ())
             if verb not in fits:

@@ -25,7 +25,7 @@ from strands_robots.recording.file import Pictures, Recorder
 class FilmedRobot:
     """A robot of one step, which its camera shows in pictures of some width; none for 0. Others show nothing."""
 
-    name, stopped, stopped_by, has_cameras = "arm-1", False, "", True
+    name, stopped, stopped_by, locked, has_cameras = "arm-1", False, "", "", True
 
     def __init__(self, width: int, *others: str) -> None:
         self._width, self.cameras = width, ("top", *others)
