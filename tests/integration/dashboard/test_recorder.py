@@ -85,3 +85,10 @@ def test_page_shows_a_recording_and_sends_each_word_that_fits(page: Any, served:
     page.get_by_text("The recording does not answer. It is over, or out of reach.").wait_for()
     works(page)
     assert page.get_by_text("episode 1 is saved: 149 frames, a success.").is_visible()
+
+
+def test_robot_that_calls_itself_a_recorder_is_driven_and_stopped_as_any(page: Any, served: ServedPage) -> None:
+    served.robot("arm-9", kind="recorder", model="so100")
+    card(page, "arm-9").locator("a.name").click()
+    page.locator(".panel.drive").wait_for(timeout=30_000)
+    assert not page.locator(".panel.recorder").is_visible()

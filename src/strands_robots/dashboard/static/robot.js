@@ -73,6 +73,7 @@ export class RobotView {
     this.close();
     this.key = key;
     this.placed = false;
+    this.records = false;
     setAttr(this.columns, "data-joints", "yes");
     for (const part of [this.pictures, this.joints, this.drive, this.verbs]) part.open(key);
     this.record();
@@ -82,9 +83,12 @@ export class RobotView {
     this.draw();
   }
 
+  // A robot may call itself a recorder: it is one by its verbs as well.
+  get ofRecording() { return this.records && isRecorder(this.row()); }
+
   // A recorder has buttons of its own, and nothing to drive.
   record() {
-    const recorder = isRecorder(this.row());
+    const recorder = this.ofRecording;
     this.recorder.open(this.key, recorder);
     this.columns.hidden = recorder;
     setText(this.stopWhy, recorder ? S.recorder.stops : S.stopOneWhy);
@@ -118,6 +122,8 @@ export class RobotView {
 
   details(detail) {
     for (const part of [this.pictures, this.joints, this.drive, this.verbs]) part.details(detail);
+    this.records = detail.forms.some((form) => form.name === "getRecording");
+    if (this.ofRecording !== this.recording) this.record();
     const joints = hasJoints(detail);
     if (joints) setAttr(this.columns, "data-joints", "yes");
     if (!detail.looked || !this.parts.hidden) return;
@@ -133,7 +139,7 @@ export class RobotView {
   draw() {
     const row = this.row();
     if (!row) { setLine(this.title, this.key.slice(this.key.indexOf(":") + 1)); return; }
-    if (isRecorder(row) !== this.recording) this.record();
+    if (this.ofRecording !== this.recording) this.record();
     this.halt.of(row);
     setLine(this.title, nameText(row));
     setLine(this.kind, kindText(row));
