@@ -49,6 +49,8 @@ def main() -> None:
     """Obey until standard input closes."""
     recorders = Recorders()
     serve({"record": recorders.record, "kill": recorders.kill})
+    # Where the benchmark failed, one may still run.
+    recorders.kill()
 
 
 if __name__ == "__main__":
