@@ -92,7 +92,7 @@ _declare(
         "STRANDS_ROBOT_COMMAND_ALLOW",
         "list",
         "",
-        "Motion verbs the operator approves on real hardware: 'verb', 'verb@peer' or 'verb@peer:caller'.",
+        "Motion verbs the operator approves on real hardware: 'verb', 'verb@peer' or 'verb@peer:caller' (a glob).",
     ),
     Setting(
         "STRANDS_ROS2_COMMAND_ALLOW",

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from fixtures.waiting import eventually
 
-from strands_robots.cli.recorder_device import RecorderDevice, recorder_driver
+from strands_robots.cli.recorder_device import RecorderDevice, grant_page, recorder_driver
 from strands_robots.cli.recording_state import RecordingState, Said, Stage
 from strands_robots.safety.lockout import LockoutLatch
 from strands_robots.safety.scope import Scope
@@ -22,6 +22,7 @@ class Bench:
         self.state = RecordingState()
         self.device = RecorderDevice(self.state, "arm-1", "wave")
         self.driver = recorder_driver(self.device, "recorder-arm-1")
+        grant_page(self.driver.peer_id)
         self.state.enter(Stage.RECORDING)
 
     def call(self, verb: str, caller: str | None = "dashboard", **arguments: object) -> dict[str, Any]:
@@ -44,6 +45,29 @@ def test_page_alone_may_say_a_word_where_nobody_else_is_named(bench: Bench, monk
     assert bench.call("endRecording")["status"] == "error"
     assert bench.call("endRecording", "agent-1")["status"] == "success"
     assert bench.state.words.said() is Said.END
+
+
+def test_begin_is_a_motion_that_is_approved_for_the_page_alone(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DEVICE_CONNECT_RPC_ALLOW", "*,anonymous")
+    bench.state.wait_for_begin(None)
+    for other in ("agent-1", "mcp", "my-dashboard-1", None):
+        refused = bench.call("beginEpisode", other)
+        assert (refused["status"], "needs operator approval" in refused["reason"]) == ("error", True)
+    assert bench.state.words.said() is None
+    for page in ("dashboard", "dashboard-0a1b2c3d", "desk__dashboard-0a1b2c3d"):
+        assert bench.call("beginEpisode", page)["status"] == "success"
+        assert bench.state.words.said() is Said.SUCCESS
+        bench.state.wait_for_begin(None)
+    assert bench.call("endRecording", "agent-1")["status"] == "success", "a word that moves nothing needs none"
+
+
+def test_begin_is_refused_while_another_holds_the_recorder(bench: Bench) -> None:
+    bench.state.wait_for_begin(None)
+    leases = bench.driver.pipeline.leases
+    assert leases is not None
+    leases.of().acquire("alice", "human", 10.0)
+    assert "alice (human) holds control" in bench.call("beginEpisode")["reason"]
+    assert bench.state.words.said() is None
 
 
 @pytest.mark.parametrize("given", [{}, {"success": 1}, {"success": "yes"}, {"success": True, "episode": 3}])
@@ -109,7 +133,9 @@ def test_locked_recorder_ends_all_the_same_and_asks_for_no_lease(bench: Bench) -
     latch = LockoutLatch("recorder-arm-1")
     bench.driver.robot.gate.attach(latch)
     latch.engage("e" * 32, "desk", "smoke")
-    bench.driver.pipeline.leases.of().acquire("other", "agent", 10.0)
-    assert bench.call("getControl")["holder"] == "other"
+    leases = bench.driver.pipeline.leases
+    assert leases is not None
+    leases.of().acquire("other", "agent", 10.0)
+    assert leases.facts()["holder"] == "other"
     assert bench.call("endRecording")["status"] == "success"
     assert bench.state.words.said() is Said.END

@@ -60,6 +60,15 @@ def test_an_entry_may_name_the_caller(grants: Grants) -> None:
     assert approver.claim("execute", "arm-2", ("desk",)) is None
 
 
+def test_caller_of_an_entry_may_be_a_glob_which_no_unnamed_one_fits(grants: Grants) -> None:
+    approver = approval(grants, "execute@arm-1:desk-*", "reset@arm-1:*")
+    assert approver.claim("execute", "arm-1", ("desk-0a1b",)) is not None
+    assert approver.claim("reset", "arm-1", ("alice",)) is not None
+    for verb, callers in (("execute", ("my-desk-1",)), ("execute", ()), ("reset", ("anonymous",)), ("reset", ())):
+        assert approver.claim(verb, "arm-1", callers) is None
+    assert approval(grants, "reset@arm-1:anonymous").claim("reset", "arm-1", ("anonymous",)) is not None
+
+
 def test_the_bypass_approves_everything(grants: Grants) -> None:
     assert approval(grants, bypass=True).claim("reset", "arm-1") is not None
 

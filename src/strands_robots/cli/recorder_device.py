@@ -11,7 +11,7 @@ from strands_robots.cli.network import Network
 from strands_robots.cli.output import CliError, Screen
 from strands_robots.cli.own_robot import device_of, peer_of
 from strands_robots.cli.recording_state import BEGIN, END, KEEP, REDO, RecordingState, Said
-from strands_robots.cli.serve import PAGE_CALLER
+from strands_robots.cli.serve import PAGE_CALLER, added
 from strands_robots.envelope import Envelope, success, text_of
 from strands_robots.safety.authorization import Authorization
 from strands_robots.safety.gate import gate_of
@@ -26,11 +26,15 @@ ROBOT_FIRST_S = 0.3
 """Seconds in which a robot that an emergency stop locks as well is seen to be stopped, and ends the attempt itself."""
 
 
+PAGE_NAMES = (PAGE_CALLER, f"{PAGE_CALLER}-*", f"*__{PAGE_CALLER}-*")
+"""Names of the page: on Device Connect, on the mesh, and there under the name of its certificate."""
+
+
 class RecorderDevice:
     """A recording, as callers see and steer it.
 
-    Its verbs move nothing: what they cause is done by the recording, by the rules of its keys. A stop of it ends the
-    attempt that runs, which halts the robot.
+    What begins a motion is one: ``beginEpisode`` passes lease, lockout and approval. The other words move nothing.
+    A stop ends the recording, and the attempt that runs, which halts the robot.
 
     Args:
         state: of the recording.
@@ -54,12 +58,9 @@ class RecorderDevice:
         """
         return {"robot": self._robot, "task": self._task, **self._state.facts()}
 
-    @verb(motion=False, changes=True, name=BEGIN)
+    @verb(name=BEGIN)
     def begin_episode(self) -> Envelope:
         """Begin the next episode: the robot is led from now on."""
-        locked = gate_of(self).lockout(BEGIN)
-        if locked is not None:
-            return locked
         return self._state.press(BEGIN, Said.SUCCESS)
 
     @verb(motion=False, changes=True, name=KEEP)
@@ -122,6 +123,7 @@ def recorder_served(
         CliError: it is not on the network, and is needed there.
     """
     device, name = RecorderDevice(state, robot, task), f"{RECORDER}-{robot.replace('/', '-')}"
+    grant_page(name)
     with ExitStack() as stack:
         try:
             if on_mesh:
@@ -139,6 +141,12 @@ def recorder_served(
 
 
 NOT_SERVED = "The robot is not on the network: "
+
+
+def grant_page(name: str) -> None:
+    """Approve the begin for the page: who starts a recording wants its robot led."""
+    page = [f"{BEGIN}@{name}:{each}" for each in PAGE_NAMES]
+    settings.put("STRANDS_ROBOT_COMMAND_ALLOW", added(None, "STRANDS_ROBOT_COMMAND_ALLOW", page))
 
 
 def recorder_driver(device: RecorderDevice, name: str) -> Any:

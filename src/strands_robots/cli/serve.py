@@ -269,8 +269,8 @@ def serve(
 ) -> None:
     """Put a robot on the network. Ctrl-C or SIGTERM stops the robot first, then departs."""
     if drive_by_page:
-        rpc_allow = _added(rpc_allow, "DEVICE_CONNECT_RPC_ALLOW", (PAGE_CALLER,))
-        command_allow = _added(command_allow, "STRANDS_ROBOT_COMMAND_ALLOW", PAGE_VERBS)
+        rpc_allow = added(rpc_allow, "DEVICE_CONNECT_RPC_ALLOW", (PAGE_CALLER,))
+        command_allow = added(command_allow, "STRANDS_ROBOT_COMMAND_ALLOW", PAGE_VERBS)
         screen.say(f"The page may drive it: --rpc-allow {rpc_allow} --command-allow {command_allow}.")
     flags = {
         "DEVICE_CONNECT_RPC_ALLOW": rpc_allow,
@@ -328,7 +328,7 @@ def serve(
         _serve(screen, body, served, piped=until_stdin_closes)
 
 
-def _added(given: str | None, setting: str, entries: Sequence[str]) -> str:
+def added(given: str | None, setting: str, entries: Sequence[str]) -> str:
     """Return the allowed entries of a flag, or else of the environment, and more."""
     before = settings.raw(setting) if given is None else given
     named = [each.strip() for each in (before or "").split(",")]

@@ -165,7 +165,10 @@ _CLAIMED = ".claimed"
 
 def listed(verb: str, peer: str, allow: Sequence[str], callers: Collection[str] = ()) -> bool:
     """True when ``allow`` has the verb: for all, for this peer, or for a caller."""
-    return any(each in allow for each in (verb, f"{verb}@{peer}", *(f"{verb}@{peer}:{name}" for name in callers)))
+    here = f"{verb}@{peer}"
+    globs = [each.removeprefix(f"{here}:") for each in allow if each.startswith(f"{here}:")]
+    named = any(name in globs or (name != ANONYMOUS and matches(name, globs)) for name in callers)
+    return verb in allow or here in allow or named
 
 
 def digest(arguments: Mapping[str, Any]) -> str:
@@ -303,9 +306,9 @@ class Approval:
     """The operator's approval of the verbs of one robot that moves real hardware.
 
     A verb is approved by ``STRANDS_ROBOT_COMMAND_ALLOW`` (a comma list of ``verb``, ``verb@peer`` or
-    ``verb@peer:caller``), by ``BYPASS_TOOL_CONSENT``, or by a one-shot grant that an operator at the robot's own
-    machine issued with ``strands-robots grant VERB@PEER``. A grant may name the caller that it is for, and the digest
-    of the arguments: the yes to a question has both.
+    ``verb@peer:caller``, the caller a glob), by ``BYPASS_TOOL_CONSENT``, or by a one-shot grant that an operator at the
+    robot's own machine issued with ``strands-robots grant VERB@PEER``. A grant may name the caller that it is for, and
+    the digest of the arguments: the yes to a question has both.
 
     Args:
         read_list: gives the list of a setting by its name.

@@ -301,6 +301,8 @@ def test_page_begins_and_judges_the_attempts_of_a_recording_without_a_terminal(t
         for success in (True, False):
             say(recorder, "waiting", "beginEpisode")
             say(recorder, "recording", "keepEpisode", success=success)
+        refused = on("call", "recorder-arm-1", "beginEpisode", *at, code=1)[1][-1]
+        assert ("needs operator approval" if mesh else "no entry of DEVICE_CONNECT_RPC_ALLOW") in str(refused["reason"])
         if not mesh:
             refused = on("call", "recorder-arm-1", "endRecording", *at, code=1)[1][-1]
             assert "no entry of DEVICE_CONNECT_RPC_ALLOW fits it" in str(refused["reason"])
