@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import io
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -37,6 +37,7 @@ class Arm:
 
     def __init__(self) -> None:
         self.stopped, self.held = False, 0
+        self.at_hold: Callable[[], object] = lambda: None
 
     @contextmanager
     def recorded(self, recorder: Recorder, fps: int, pictures: Pictures | None) -> Iterator[None]:
@@ -50,6 +51,7 @@ class Arm:
 
     def hold(self, screen: Screen) -> None:
         self.held += 1
+        self.at_hold()
 
 
 @pytest.fixture
@@ -258,6 +260,21 @@ def test_locked_robot_stays_on_its_network_after_a_stop_while_it_waits(tmp_path:
     state.halt(STOPPED)
     assert recorded(arm, tmp_path, attempts_of(state, [])) == f"Nothing more is recorded: {STOPPED}."
     assert arm.held == 1
+
+
+def test_robot_that_is_locked_as_its_policy_loads_stays_on_its_network(tmp_path: Path, arm: Arm) -> None:
+    state = RecordingState()
+
+    def load() -> None:
+        arm.locked = "locked by desk"
+        state.halt(STOPPED, 0.1)
+        state.check()
+
+    told: list[tuple[bool, str]] = []
+    arm.at_hold = lambda: told.append((state.runs, state.facts()["said"]))
+    attempts = Attempts(9, load, FPS, None, 0.0, success=True, state=state)
+    assert recorded(arm, tmp_path, attempts) == f"Nothing began: {STOPPED}."
+    assert told == [(False, f"Nothing began: {STOPPED}.")], "its recorder confirms the stop meanwhile"
 
 
 @pytest.mark.parametrize("stage", [Stage.ENDING, Stage.SAVING])

@@ -13,6 +13,7 @@ from fixtures.leaders import ScriptedLeader
 from fixtures.waiting import eventually
 from rich.console import Console
 
+from strands_robots.cli import leading
 from strands_robots.cli.dataset_recording import Attempts, record_attempts
 from strands_robots.cli.far_hand import HandLeader
 from strands_robots.cli.led_robot import LedRobot
@@ -112,3 +113,21 @@ def test_stop_of_the_recording_halts_a_robot_that_is_led_in_turns(desk: Desk) ->
     desk.done()
     assert desk.failed == "The attempt failed: the recording was stopped: stop by desk"
     assert tables.read_frames(desk.folder / data_file(0))["stop"][-1] == 1
+
+
+def test_policy_that_is_loading_is_waited_for_no_longer_than_the_recording_lasts(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    state, asked = RecordingState(), list[str]()
+
+    class Loading:
+        def warm(self) -> str | None:
+            asked.append("loading")
+            if len(asked) == 2:
+                state.halt("the recording was stopped: stop by desk")
+            return "" if len(asked) < 9 else None
+
+    monkeypatch.setattr(leading, "create_policy", lambda name: Loading())
+    with pytest.raises(CliError, match="Nothing began: the recording was stopped: stop by desk"):
+        leading.load_policy(Screen(console=Console(file=io.StringIO())), "large", state.check)
+    assert len(asked) == 2

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from strands_robots.cli.attempt_progress import AttemptProgress
 from strands_robots.cli.output import CliError, Screen, wait_until
-from strands_robots.cli.recording_state import RecordingState, Said, Stage, Words
+from strands_robots.cli.recording_state import RecordingState, RecordingStoppedError, Said, Stage, Words
 from strands_robots.datasets.recorded import ATTEMPT_ENDED, HALTED
 from strands_robots.recording.file import Pictures, Recorder
 from strands_robots.safety.stopping import StopVerdict
@@ -178,6 +178,15 @@ def record_attempts(screen: Screen, led: AttemptRobot, session: RecordingSession
     with CameraEncoder(attempts.fps) if led.has_cameras else nullcontext() as encoder:
         try:
             _record(screen, led, session, attempts, encoder)
+        except RecordingStoppedError as stopped:
+            attempts.state.note(stopped.reason)
+            attempts.state.enter(Stage.STOPPED)
+            if attempts.state.halting:
+                # A stop of all reaches the robot a moment later, which is resumed on its network.
+                wait_until(screen, lambda: attempts.state.halted)
+            if led.locked:
+                led.hold(screen)
+            raise
         finally:
             attempts.state.enter(Stage.OVER)
 
@@ -190,10 +199,7 @@ def _record(
         state.count(attempts.count, saved)
         if not _ready(screen, attempts, saved, pause_s):
             if state.halting:
-                if led.locked:
-                    # It is resumed on its network.
-                    led.hold(screen)
-                raise CliError(f"Nothing more is recorded: {state.halting}.")
+                raise RecordingStoppedError(f"Nothing more is recorded: {state.halting}.")
             return
         pause_s = attempts.pause_s
         ended = _attempt(screen, led, session, attempts, encoder)

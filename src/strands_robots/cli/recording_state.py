@@ -78,6 +78,11 @@ _LEADS = frozenset({Stage.STARTING, Stage.RECORDING, Stage.ENDING})
 _AT = {Stage.WAITING: (BEGIN, END), Stage.RECORDING: (KEEP, REDO, END)}
 """Verbs that fit a stage."""
 
+
+class RecordingStoppedError(CliError):
+    """Failure of a recording that was stopped, or is locked, while no attempt ran."""
+
+
 Progress = Callable[[], Mapping[str, Any]]
 
 
@@ -158,9 +163,9 @@ class RecordingState:
         return self.halting or self.locked()
 
     def check(self) -> None:
-        """Raise :class:`CliError` where no attempt may begin now."""
+        """Raise :class:`RecordingStoppedError` where no attempt may begin now."""
         if why := self.refusal:
-            raise CliError(f"Nothing began: {why.rstrip('.')}.")
+            raise RecordingStoppedError(f"Nothing began: {why.rstrip('.')}.")
 
     @property
     def runs(self) -> bool:
