@@ -110,3 +110,8 @@ def test_stop_is_confirmed_once_the_robot_of_an_attempt_is_halted(
         assert device.get_task_status()["task_status"] == "running"
     state.enter(Stage.SAVING)
     assert device.get_task_status()["task_status"] == "idle"
+
+
+def test_stop_without_a_reason_is_told_in_a_whole_sentence(state: RecordingState, device: RecorderDevice) -> None:
+    device.halt()
+    assert state.halted == "the recording was stopped"

@@ -91,7 +91,8 @@ class RecorderDevice:
         """End the recording; its status tells when the robot of an attempt is halted."""
         # A lockout of before has let no attempt begin, so the first one that is seen is this stop's.
         waits = not self._state.halting and self._robot_is_stopped_as_well
-        self._state.halt(f"the recording was stopped: {reason}", ROBOT_FIRST_S if waits else 0.0)
+        why = "the recording was stopped" + (f": {reason}" if reason else "")
+        self._state.halt(why, ROBOT_FIRST_S if waits else 0.0)
 
     @property
     def _robot_is_stopped_as_well(self) -> bool:
