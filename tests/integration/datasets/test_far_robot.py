@@ -292,6 +292,8 @@ def test_page_begins_and_judges_the_attempts_of_a_recording_without_a_terminal(t
         stack.callback(child.communicate)
         stack.callback(child.kill)
         eventually(lambda: "recorder-arm-1" in str(on("peers", *at, code=None)[1]), within=60)
+        refused = on("call", "recorder-arm-1", "beginEpisode", *at, code=1)[1][-1]
+        assert ("needs operator approval" if mesh else "no entry of DEVICE_CONNECT_RPC_ALLOW") in str(refused["reason"])
         there = stack.enter_context(Network(port=port, mesh=mesh).joined(source="dashboard"))
         recorder = Fleet(there)["recorder-arm-1"]
         say(recorder, "waiting", "beginEpisode")
@@ -301,8 +303,6 @@ def test_page_begins_and_judges_the_attempts_of_a_recording_without_a_terminal(t
         for success in (True, False):
             say(recorder, "waiting", "beginEpisode")
             say(recorder, "recording", "keepEpisode", success=success)
-        refused = on("call", "recorder-arm-1", "beginEpisode", *at, code=1)[1][-1]
-        assert ("needs operator approval" if mesh else "no entry of DEVICE_CONNECT_RPC_ALLOW") in str(refused["reason"])
         if not mesh:
             refused = on("call", "recorder-arm-1", "endRecording", *at, code=1)[1][-1]
             assert "no entry of DEVICE_CONNECT_RPC_ALLOW fits it" in str(refused["reason"])
