@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 from fixtures.command_line import Machine
-from fixtures.page_driving import hold_until, take
+from fixtures.page_driving import end_turns, hand_leads, hold_until, policy_drives, take
 from fixtures.page_site import PageServer, picture, shows
 from fixtures.waiting import eventually
 
@@ -57,14 +57,11 @@ def test_joint_buttons_move_an_arm_that_is_served_for_the_page(chrome: Any, tmp_
                 lambda: abs(float(shown.inner_text().split("\u00b0")[0]) - pan()) < 2, what="what is shown is so"
             )
             page.fill("#turn-task", "wave")
-            page.get_by_role("button", name="Let the policy drive").click()
-            page.locator(".turn-said", has_text="THE POLICY DRIVES").wait_for()
-            led = page.locator(".turn-said", has_text="YOU LEAD")
-            hold_until(page, button, lambda: led.count() == 1, "the page takes over")
+            policy_drives(page)
+            hand_leads(page, button)
             page.mouse.up()
             picture(page, "real-arm-led")
-            page.get_by_role("button", name="End", exact=True).click()
-            page.locator(".turn-said", has_text="Over: it stands").wait_for()
+            end_turns(page)
     finally:
         if server is not None:
             server.close()

@@ -11,13 +11,11 @@ from typing import Any, NamedTuple
 
 import pytest
 from fixtures.command_line import Machine
-from fixtures.page_driving import answer, hold_until, take
+from fixtures.page_driving import answer, end_turns, hand_leads, hold_until, policy_drives, take, turn_said
 from fixtures.page_site import PageServer, picture, shows
 from fixtures.waiting import eventually
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(300)]
-
-STATE = ".turn-said"
 
 
 class Site(NamedTuple):
@@ -49,10 +47,6 @@ def site(request: pytest.FixtureRequest, chrome: Any, tmp_path_factory: pytest.T
         yield Site(page, request.param)
 
 
-def said(page: Any, words: str) -> None:
-    page.locator(STATE, has_text=words).wait_for(timeout=30_000)
-
-
 def test_push_takes_over_from_the_policy_and_a_button_gives_back(site: Site) -> None:
     page, network = site
 
@@ -63,39 +57,41 @@ def test_push_takes_over_from_the_policy_and_a_button_gives_back(site: Site) -> 
     shows(page, "/\\d/.test(document.querySelector('.bar .value')?.textContent)")
     start = pan()
     page.fill("#turn-task", "wave")
-    page.get_by_role("button", name="Let the policy drive").click()
-    said(page, "THE POLICY DRIVES")
+    policy_drives(page)
     picture(page, "turn-policy")
-    eventually(lambda: abs(pan() - start) > 0.5, what="the policy moves the arm")
+    shows(page, f"Math.abs(parseFloat(document.querySelector('.bar .value').textContent) - {start}) > 0.5")
 
+    hand_leads(page, button)
     before = pan()
-    hold_until(page, button, lambda: "YOU LEAD" in page.locator(STATE).inner_text(), "the page leads")
     hold_until(page, button, lambda: pan() > before + 3, "the arm goes where it is pushed")
     page.mouse.up()
     picture(page, "turn-led")
-    page.locator(".drive .said", has_text="Let go (released)").wait_for()
+    page.locator(".drive .said", has_text="Let go (").wait_for()
 
-    page.get_by_role("button", name="Give back to the policy").click()
-    said(page, "THE POLICY DRIVES")
-    page.get_by_role("button", name="End", exact=True).click()
-    said(page, "Over: it stands")
+    policy_drives(page)
+    end_turns(page)
 
 
 def test_hand_that_drives_by_pictures_is_held_where_they_show_nothing_new(site: Site) -> None:
     page, network = site
-    page.select_option("#turn-camera", "front")
-    page.get_by_role("button", name="Let the policy drive").click()
-    said(page, "THE POLICY DRIVES")
-    shows(page, "document.querySelector('.pictures .camera').src.startsWith('blob:')")
     button = page.locator("button.jog[aria-label='shoulder_pan +']")
-    hold_until(page, button, lambda: "YOU LEAD" in page.locator(STATE).inner_text(), "the page leads by pictures")
-    page.mouse.up()
-    # It stands, so its camera has nothing new.
-    said(page, "HELD: the newest picture of page is")
+
+    def stands_by_old_pictures() -> bool:
+        if "the newest picture of page is" not in turn_said(page):
+            policy_drives(page)
+            hand_leads(page, button)
+            # It stands, so its camera has nothing new.
+            page.mouse.up()
+            page.locator(".turn-said", has_text="HELD").wait_for()
+        return "the newest picture of page is" in turn_said(page)
+
+    page.select_option("#turn-camera", "front")
+    policy_drives(page)
+    shows(page, "document.querySelector('.pictures .camera').src.startsWith('blob:')")
+    eventually(stands_by_old_pictures, 90.0, "it is held for its old pictures")
     picture(page, "turn-held")
-    page.get_by_role("button", name="Give back to the policy").click()
-    said(page, "THE POLICY DRIVES")
+    policy_drives(page)
     page.keyboard.press("Space")
     answer(page, "arm-1", "stopped", network)
-    said(page, "Over")
+    eventually(lambda: turn_said(page).startswith("Over"), 30.0, "the end of the turns")
     shows(page, "!document.querySelector('.pictures .camera').src.startsWith('blob:')")
