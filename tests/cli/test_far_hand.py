@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
+from fixtures.desk import desk
 from fixtures.waiting import eventually
 
 from strands_robots.cli.far_hand import Hand, LeadableHere
@@ -52,11 +53,8 @@ class Desk:
 
 @pytest.fixture
 def world() -> Iterator[Simulation]:
-    made = Simulation(tool_name="desk")
-    made.add_robot("so100")
-    yield made
-    made.halt("test over")
-    made.cleanup()
+    with desk() as made:
+        yield made
 
 
 @pytest.fixture(autouse=True)

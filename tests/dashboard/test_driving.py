@@ -362,9 +362,12 @@ async def test_lost_control_ends_the_lead_and_stops_no_other_holder(page: Page) 
 async def test_halt_of_a_led_robot_waits_for_nothing_of_the_lead(page: Page) -> None:
     await page.take()
     await led(page)
+    assert page.control.begin(KEY, JOG) == ""
     page.control.cease(KEY, "it was halted")
+    assert {"type": "let_go", "key": KEY, "why": "it was halted"} in page.told
     assert any(each.get("state") == "over" and each["why"] == "it was halted" for each in page.told)
     await until(lambda: any("end" in each for each in page.feed.asked("leadTo")), what="the end of the lead")
+    assert {each.get("turn", 0) for each in page.feed.asked("leadTo")} <= {0, 1}, "it is not gripped once more"
     assert "does not lead" in page.control.give_back(KEY)
 
 

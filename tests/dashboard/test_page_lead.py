@@ -9,6 +9,7 @@ from contextlib import asynccontextmanager
 from typing import Any
 
 import pytest
+from fixtures.desk import desk
 from fixtures.waiting import eventually_async, until
 
 from strands_robots.cli.far_hand import LeadableHere
@@ -21,11 +22,8 @@ from strands_robots.simulation import Simulation
 
 @pytest.fixture
 def world() -> Iterator[Simulation]:
-    made = Simulation(tool_name="desk")
-    made.add_robot("so100")
-    yield made
-    made.halt("test over")
-    made.cleanup()
+    with desk() as made:
+        yield made
 
 
 class Led:

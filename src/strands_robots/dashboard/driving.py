@@ -288,12 +288,15 @@ class HandControl:
         held = self._held.get(key)
         if held is None:
             return
-        self.release(key, why)
         lead, held.lead = held.lead, None
         if lead is not None:
+            # A push that is released sends where the robot stands; nothing is sent any more.
             lead.cease()
             self._keep(lead.end())
+            if lead.pushes:
+                self.tell_let_go(key, why)
             self.tell_turn(key, "over", why)
+        self.release(key, why)
 
     def tell_turn(self, key: str, state: str, why: str, **more: Any) -> None:
         """Tell the page who drives a robot."""
