@@ -91,6 +91,19 @@ def state_directory(state_directories: Path, monkeypatch: pytest.MonkeyPatch) ->
     flush_audit(0.5)
 
 
+@pytest.fixture(autouse=True)
+def settings_put_are_taken_back(state_directory: Path) -> Iterator[None]:
+    """What a command sets for its process ends with the test; how pictures are made is found once for all."""
+    names = [setting.name for setting in settings.declared() if setting.name != "MUJOCO_GL"]
+    before = {name: os.environ.get(name) for name in names}
+    yield
+    for name, value in before.items():
+        if value is None:
+            os.environ.pop(name, None)
+        elif os.environ.get(name) != value:
+            os.environ[name] = value
+
+
 class _WrittenLog:
     """The log as a test reads it, once the records of the safety plane are in it."""
 

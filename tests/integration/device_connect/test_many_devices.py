@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import gc
 import logging
 import threading
@@ -315,8 +316,15 @@ def test_rounds_of_joins_and_leaves_leave_no_object(link: LinkConfig) -> None:
     before = objects()
     for number in range(2, 6):
         turn(number)
-    # Of anything that is kept for each device there would be forty more.
-    assert {name: more for name, more in (objects() - before).items() if more >= 40} == {}
+
+    def kept() -> dict[str, int]:
+        return {name: more for name, more in (objects() - before).items() if more >= 40}
+
+    # Of anything that is kept for each device there would be forty more. What hangs on a robot is found by the
+    # collection after the one that finds the robot.
+    with contextlib.suppress(AssertionError):
+        eventually(lambda: not kept(), what="the end of what the robots had")
+    assert kept() == {}
 
 
 def test_last_device_ends_the_thread_and_the_next_one_starts_it_again(link: LinkConfig) -> None:
