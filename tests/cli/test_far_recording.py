@@ -117,6 +117,29 @@ def test_end_of_an_attempt_is_no_stop_of_others(arm: ServedArm, robot: FarRobot)
     assert (robot.stopped, robot.stopped_by, task.voided, task.error) == (False, "", False, "")
 
 
+def test_leader_elsewhere_halts_its_own_motion_and_only_a_lockout_ends_the_attempt(
+    arm: ServedArm, recorder: Recorder
+) -> None:
+    world: Any = arm
+    robot = FarRobot(world, world, "", "", "wave", None)
+    with robot.recorded(recorder, 30, None):
+        task = robot.begin(None)
+        for _ in range(2):
+            arm.tells("taskComplete", STOPPED)
+        looks: list[None] = []
+
+        def look() -> Mapping[str, Any]:
+            looks.append(None)
+            return {"task_status": "idle"}
+
+        arm.answers = look
+        eventually(lambda: len(looks) > 3, within=5, what="some looks at it since")
+        assert (task.running, robot.stopped) == (True, False)
+        arm.answers = lambda: {"task_status": "idle", "locked": True}
+        ended(task)
+        assert robot.stopped_by == "arm-1 is locked by an emergency stop."
+
+
 def test_answer_that_comes_late_says_nothing_of_the_next_attempt(
     arm: ServedArm, robot: FarRobot, recorder: Recorder
 ) -> None:

@@ -317,6 +317,9 @@ class FarRobot:
     def _ended(self, task: FarTask, payload: Mapping[str, Any]) -> None:
         """Note the end of a motion of the robot."""
         state = payload.get("state")
+        if not self._policy and self._hand is None:
+            # Others lead it, and let a jog go or end a turn by a halt. A lockout ends the attempt.
+            return
         if state == "stopped":
             # Whether it is locked as well is asked on another thread: this one is the network's.
             task.halted.set()

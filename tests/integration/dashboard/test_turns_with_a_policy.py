@@ -7,13 +7,19 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
 from fixtures.command_line import Machine
-from fixtures.page_driving import answer, end_turns, hand_leads, hold_until, policy_drives, take, turn_said
+from fixtures.page_driving import answer, card, end_turns, hand_leads, hold_until, policy_drives, take, turn_said
 from fixtures.page_site import PageServer, picture, shows
 from fixtures.waiting import eventually
+
+from strands_robots.datasets import tables
+from strands_robots.datasets.check import check_dataset
+from strands_robots.datasets.layout import data_file
+from strands_robots.datasets.recorded import ACTORS
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(300)]
 
@@ -23,6 +29,7 @@ class Site(NamedTuple):
 
     page: Any
     network: str
+    machine: Machine
 
 
 @pytest.fixture(scope="module", params=["dc", "mesh"])
@@ -44,11 +51,11 @@ def site(request: pytest.FixtureRequest, chrome: Any, tmp_path_factory: pytest.T
         stack.callback(page.close)
         page.goto(server.url)
         page.locator(".card").wait_for(timeout=60_000)
-        yield Site(page, request.param)
+        yield Site(page, request.param, machine)
 
 
 def test_push_takes_over_from_the_policy_and_a_button_gives_back(site: Site) -> None:
-    page, network = site
+    page, network, _ = site
 
     def pan() -> float:
         return float(page.locator(".bar .value").first.inner_text().rstrip("\u00b0"))
@@ -73,7 +80,7 @@ def test_push_takes_over_from_the_policy_and_a_button_gives_back(site: Site) -> 
 
 
 def test_hand_that_drives_by_pictures_is_held_where_they_show_nothing_new(site: Site) -> None:
-    page, network = site
+    page, network, _ = site
     button = page.locator("button.jog[aria-label='shoulder_pan +']")
 
     def stands_by_old_pictures() -> bool:
@@ -95,3 +102,41 @@ def test_hand_that_drives_by_pictures_is_held_where_they_show_nothing_new(site: 
     answer(page, "arm-1", "stopped", network)
     eventually(lambda: turn_said(page).startswith("Over"), 30.0, "the end of the turns")
     shows(page, "!document.querySelector('.pictures .camera').src.startsWith('blob:')")
+
+
+def test_turns_of_the_page_are_one_episode_that_tells_the_policy_from_the_hand(site: Site, tmp_path: Path) -> None:
+    page, network, machine = site
+    folder, mesh = tmp_path / "set", ["--mesh"] if network == "mesh" else []
+    line = ["dataset", "record", str(folder), "--robot", "arm-1", "--task", "wave", "--leader", "page", "--json"]
+
+    def word(name: str) -> None:
+        card(page, "recorder-arm-1", network).locator("a.name").click(timeout=60_000)
+        page.locator(".recorder").get_by_role("button", name=name, exact=True).click(timeout=30_000)
+
+    with machine.start(*line, "--cameras", "none", "--episodes", "1", *mesh) as recorder, ExitStack() as stack:
+        stack.callback(recorder.kill)
+        word("Begin")
+        page.go_back()
+        button = take(page, "shoulder_pan +", network=network)
+        # A jog that is let go is a halt as well.
+        hold_until(page, button, lambda: "held" in button.get_attribute("class").split(), "the arm is jogged")
+        page.mouse.up()
+        page.fill("#turn-task", "wave")
+        for _ in range(2):
+            policy_drives(page)
+            hand_leads(page, button)
+            page.mouse.up()
+        policy_drives(page)
+        end_turns(page)
+        page.go_back()
+        word("Keep as success")
+        told, _ = recorder.communicate(timeout=60)
+    info, found = check_dataset(folder)
+    assert (info.episodes, [each for each in found if each.wrong]) == (1, []), told
+    frames = tables.read_frames(folder / data_file(0))
+    by_hand = frames["intervention"]
+    assert by_hand.any() and not by_hand.all()
+    assert set(frames["actor"][by_hand].tolist()) == {ACTORS.index("leader")}
+    assert ACTORS.index("policy") in frames["actor"][~by_hand].tolist()
+    assert set(frames["stop"].tolist()) <= {0, 1}, "no emergency stop"
+    assert frames["next.success"][-1]
