@@ -39,6 +39,7 @@ class Seat:
         action = self.policy.act(self.joints)
         if isinstance(action, dict):
             self.joints |= action
+            self.policy.wrote(action)
         return action
 
     def led(self, turn: int, count: int = 1, **joints: Any) -> Any:
@@ -116,6 +117,19 @@ def test_silence_holds_within_a_beat_and_only_a_new_turn_goes_on() -> None:
     assert seat.led(1, pan=-0.5) == held, "the turn is over, and the place is kept"
     assert seat.lead.counts.unled == 1
     assert seat.led(2, pan=0.49)["pan"] == pytest.approx(0.5 - 0.01, abs=STEP)
+
+
+@pytest.mark.parametrize("wrong", [-0.9, 0.9])
+@pytest.mark.parametrize("when", ["at the hold", "before it"])
+def test_one_wrong_reading_moves_neither_a_held_robot_nor_one_that_is_taken_over(wrong: float, when: str) -> None:
+    seat = Seat()
+    seat.led(1, count=5, pan=0.2)
+    seat.joints["pan"] = wrong
+    if when == "before it":
+        assert seat.led(1, pan=0.2)["pan"] == 0.2
+    assert seat.beat(0.5)["pan"] == 0.2
+    seat.joints["pan"] = wrong
+    assert seat.led(2, pan=0.2)["pan"] == 0.2, "its first action goes from where it is"
 
 
 def test_what_comes_late_again_or_in_the_wrong_order_moves_nothing() -> None:

@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from statistics import median
 from typing import Any, Literal
 
 from strands_robots.policies.base import (
@@ -315,6 +316,7 @@ class LedPolicy:
         self._wrote: Action = {}
         self._from: dict[str, float] = {}
         self._place: Action = {}
+        self._present, self._before = dict[str, float](), dict[str, float]()
 
     @property
     def uses_cameras(self) -> bool:
@@ -355,7 +357,8 @@ class LedPolicy:
             PolicyError: the leader was lost.
         """
         beat = self.lead.beat()
-        self.lead.saw(numbers(observation))
+        self._before, self._present = self._present, numbers(observation)
+        self.lead.saw(self._present)
         if beat.state != "over":
             self.turn = TurnOfDriver(beat.state, self.lead.leader, beat.why)
         self.led_by = self.lead.leader if beat.state == "led" and self._policy is not None else ""
@@ -365,18 +368,18 @@ class LedPolicy:
             return None
         if beat.state == "held":
             if beat.begins:
-                self._place = self._held(observation)
+                self._place = self._held()
             # Written at each beat: a recording then has frames of it. Nothing is before the first turn.
             return dict(self._place) or []
         if beat.state == "policy":
             self.reach = self._ranges
             return self._of_policy(observation, anew=beat.begins)
         try:
-            return self._led(observation, beat)
+            return self._led(beat)
         except ValidationError as exc:
             self.errors, self.last_error = self.errors + 1, str(exc)
             self.lead.hold(f"{self.lead.leader}: {exc}")
-            return self._held(observation)
+            return self._held()
 
     def wrote(self, action: Mapping[str, float]) -> None:
         """Tell the leader what was written; see :class:`Noting`."""
@@ -401,12 +404,19 @@ class LedPolicy:
             self._policy = self._paced = self._restartable = None
             policy.close()
 
-    def _held(self, observation: Mapping[str, Any]) -> Action:
-        """Return the action that keeps the robot where it is."""
+    def _held(self) -> Action:
+        """Return the action that keeps the robot where it is.
+
+        One wrong reading moves nothing: of it, the reading before and the place that was written the middle counts.
+        """
         self._drop_plan()
-        present = numbers(observation)
-        held = (key for key in self._ranges if is_velocity(key) or key in present)
-        place = {key: 0.0 if is_velocity(key) else present[key] for key in held}
+        place: Action = {}
+        for key in self._ranges:
+            if is_velocity(key):
+                place[key] = 0.0
+            elif key in self._present:
+                known = [each[key] for each in (self._before, self._wrote) if key in each]
+                place[key] = median([self._present[key], *known]) if len(known) == 2 else self._present[key]
         self.reach = self._out_to(place)
         return place
 
@@ -440,11 +450,11 @@ class LedPolicy:
             self._chunk = [dict(answer)] if isinstance(answer, Mapping) else [dict(each) for each in answer]
         return self._chunk.pop(0) if self._chunk else []
 
-    def _led(self, observation: Mapping[str, Any], beat: Beat) -> Action:
+    def _led(self, beat: Beat) -> Action:
         wanted = checked_action(beat.action, dict.fromkeys(self._ranges, (-math.inf, math.inf)))
         if beat.begins:
             # Joints that it does not lead keep the place that they have now.
-            self._place = self._held(observation)
+            self._place = self._held()
             # Those that the robot does not tell are bounded from where they were sent.
             self._last, self._from = {**self._wrote, **self._place}, {}
         # A joint beyond its range stays where it is or comes back, and goes no further out.
