@@ -47,9 +47,12 @@ if find_spec("hypothesis"):
     hypothesis.settings.register_profile("ten-thousand", patient, max_examples=10_000)
     hypothesis.settings.load_profile("patient")
 
-# A shell starts background jobs with Ctrl-C ignored, and every process that a test starts would inherit that.
+# A shell starts background jobs with Ctrl-C ignored, and nohup ignores the end of a terminal; every process that a test
+# starts would inherit that.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
