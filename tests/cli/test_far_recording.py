@@ -222,6 +222,68 @@ def test_policy_whose_end_nobody_tells_is_no_success(arm: ServedArm, robot: FarR
     assert (task.voided, robot.stopped) == (True, False)
 
 
+@pytest.mark.parametrize("running", [True, False], ids=["it was seen to run", "it was not"])
+@pytest.mark.parametrize(
+    "status",
+    [{"task_status": "stopped"}, {"task_status": "idle", "outcomes": {"so100": {"task_status": "stopped"}}}],
+    ids=["arm", "world"],
+)
+def test_stop_that_only_the_status_tells_is_that_of_others_and_recorded(
+    arm: ServedArm, robot: FarRobot, recorder: Recorder, status: Mapping[str, Any], running: bool
+) -> None:
+    looked = threading.Event()
+    arm.answers = lambda: (looked.set(), {"task_status": "running"})[1] if running else status
+    task = robot.begin(30)
+    if running:
+        assert looked.wait(5)
+        arm.answers = lambda: status
+    ended(task)
+    assert (task.voided, robot.stopped_by) == (True, "arm-1 was stopped.")
+    assert recorder.counts["/arm-1/halted"] == 1
+
+
+@pytest.mark.parametrize(
+    ("outcome", "error"),
+    [
+        ({"task_status": "completed", "why": "it is done"}, ""),
+        ({"task_status": "error", "why": "no memory"}, "no memory"),
+    ],
+)
+def test_end_of_a_policy_that_only_the_status_tells_is_that_end(
+    arm: ServedArm, robot: FarRobot, outcome: Mapping[str, Any], error: str
+) -> None:
+    looked = threading.Event()
+    arm.answers = lambda: (looked.set(), {"running_policies": {"so100": {}}})[1]
+    task = robot.begin(30)
+    assert looked.wait(5)
+    arm.answers = lambda: {"running_policies": {}, "outcomes": {"so100": outcome}}
+    ended(task)
+    assert (task.error, task.voided, robot.stopped) == (error, False, False)
+
+
+def test_halt_of_others_motion_that_only_the_status_tells_is_recorded_once(arm: ServedArm, recorder: Recorder) -> None:
+    world: Any = arm
+    robot = FarRobot(world, world, "", "", "wave", None)
+    looks: list[None] = []
+
+    def answer(status: Mapping[str, Any]) -> Callable[[], Mapping[str, Any]]:
+        return lambda: (looks.append(None), status)[1]
+
+    def looked() -> None:
+        looks.clear()
+        eventually(lambda: len(looks) > 3, within=5, what="some looks at it")
+
+    with robot.recorded(recorder, 30, None):
+        task = robot.begin(None)
+        for times in (1, 2):
+            arm.answers = answer({"task_status": "running"})
+            looked()
+            arm.answers = answer({"task_status": "stopped"})
+            looked()
+            assert (task.running, robot.stopped, recorder.counts["/arm-1/halted"]) == (True, False, times)
+        robot.halt("test ended")
+
+
 def test_policy_that_is_loading_is_not_started_after_a_stop_of_the_recording(arm: ServedArm, robot: FarRobot) -> None:
     state, tries = RecordingState(), list[str]()
 

@@ -19,12 +19,12 @@ from strands_robots.cli.led_robot import NotBegunError
 from strands_robots.cli.network import one_robot
 from strands_robots.cli.output import CliError, Screen
 from strands_robots.cli.record import NO_CAMERAS
-from strands_robots.datasets.recorded import LED_BY_PERSON, LED_BY_RECORDING
+from strands_robots.datasets.recorded import HALTED, LED_BY_PERSON, LED_BY_RECORDING
 from strands_robots.errors import NoAnswerError, RefusalError, RobotError, UnreachableError
 from strands_robots.fleet.adapter import DEVICE_CONNECT, Detail, RobotEvent
 from strands_robots.fleet.networks import Networks
 from strands_robots.fleet.remote_robot import ROBOT_NAME, RemoteRobot
-from strands_robots.fleet.reports import runs, said
+from strands_robots.fleet.reports import outcome_of, runs, said
 from strands_robots.policies.handover import LOST_S
 from strands_robots.recording.cameras import OVERVIEW
 from strands_robots.recording.file import REFUSED, STEP, TURN, UNITS, Pictures, Recorder, beats, units_in
@@ -132,6 +132,7 @@ class FarRobot:
             self._units = units_in(world.features(), part)
         self._attempt: FarTask | None = None
         self._recorder: Recorder | None = None
+        self._tells_ends = False
 
     locked = ""
     """Empty: whoever locked it, its own process keeps it on the network."""
@@ -310,6 +311,7 @@ class FarRobot:
         if self._part and named not in (None, "", self._part):
             return
         task = self._attempt
+        self._tells_ends = self._tells_ends or event.name in _ENDS
         if event.name in _ENDS and task is not None and not task.halting:
             self._ended(task, event.payload)
         recorder.take(self.name, name, event.payload)
@@ -327,11 +329,29 @@ class FarRobot:
             failed = "" if state in (None, "", "completed") else f"its policy ended as {shown(state)}"
             task.end(str(payload.get("error") or failed))
 
+    def _untold(self, task: FarTask, status: Mapping[str, Any], *, ran: bool) -> None:
+        """Note the end of a motion by the robot's status; the mesh tells no ends."""
+        if ended := outcome_of(status, self._part):
+            self._ended(task, ended)
+            if ended["state"] == "stopped" and not task.halted.is_set():
+                # It is that of others, who go on.
+                self._note_halt()
+        elif self._policy and ran:
+            # Nobody knows whether it is a good one.
+            task.end(voided=True)
+
+    def _note_halt(self) -> None:
+        """Record a stop of others, where the network does not tell it."""
+        if self._recorder is not None and not self._tells_ends:
+            self._recorder.take(self.name, HALTED, {})
+
     def _stopped(self, task: FarTask, status: Mapping[str, Any]) -> None:
         """End an attempt at a robot that others stopped."""
         locked = status.get("locked") is True
         task.stopped_by = f"{self.name} is locked by an emergency stop." if locked else f"{self.name} was stopped."
-        if locked and self._recorder is not None:
+        if not locked:
+            self._note_halt()
+        elif self._recorder is not None:
             self._recorder.take(self.name, "locked", {"reason": task.stopped_by})
         task.end(voided=True)
 
@@ -361,10 +381,10 @@ class FarRobot:
             answered, now = time.monotonic(), runs(status, self._part)
             if halted or status.get("locked") is True:
                 self._stopped(task, status)
-            elif self._policy and ran and not now and not task.halted.wait(LOOK_S):
-                # A network that tells no ends of tasks: nobody knows whether it is a good one.
-                task.end(voided=True)
-            ran = ran or now
+            elif not now and (ran or self._policy) and not task.halted.wait(LOOK_S):
+                # Also where it was stopped before it was seen to run.
+                self._untold(task, status, ran=ran)
+            ran = now
 
     def _take_pictures(
         self, recorder: Recorder, camera: str, pictures: Pictures, fps: int, over: threading.Event

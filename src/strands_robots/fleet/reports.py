@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Awaitable, Callable, Mapping
 from typing import Any, Protocol, Self, TypeGuard
 
-from strands_robots.contract import RUNNING
+from strands_robots.contract import AT_REST, RUNNING
 from strands_robots.envelope import Envelope, RefusalReason, error, text_of
 from strands_robots.errors import (
     ApprovalError,
@@ -62,6 +62,21 @@ def runs(facts: Mapping[str, Any], robot_name: str = "") -> bool:
     if isinstance(running, Mapping):
         return robot_name in running if robot_name else bool(running)
     return str(facts.get("task_status", "")).lower() in RUNNING
+
+
+def outcome_of(facts: Mapping[str, Any], robot_name: str = "") -> dict[str, str]:
+    """Return how the last task of a robot, or of one of a world, ended by its status.
+
+    It has ``state`` and ``error``, and is empty where the status does not tell.
+    """
+    outcomes: object = facts.get("outcomes")
+    if isinstance(outcomes, Mapping):
+        rows = [outcomes.get(robot_name)] if robot_name else outcomes.values()
+        facts = next((each for each in rows if isinstance(each, Mapping)), {})
+    state = _text(facts.get("task_status")).lower()
+    if state not in AT_REST or state == "idle":
+        return {}
+    return {"state": state, "error": _text(facts.get("error") or facts.get("why")) if state == "error" else ""}
 
 
 def _text(value: object) -> str:
