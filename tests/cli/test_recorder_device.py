@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import asyncio
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import pytest
 from fixtures.waiting import eventually
 
-from strands_robots.cli.recorder_device import RecorderDevice, grant_page, recorder_driver
+from strands_robots.cli import recorder_device
+from strands_robots.cli.network import Network
+from strands_robots.cli.output import Screen
+from strands_robots.cli.recorder_device import RecorderDevice, grant_page, recorder_driver, recorder_served
 from strands_robots.cli.recording_state import RecordingState, Said, Stage
 from strands_robots.safety.lockout import LockoutLatch
 from strands_robots.safety.scope import Scope
@@ -139,3 +144,25 @@ def test_locked_recorder_ends_all_the_same_and_asks_for_no_lease(bench: Bench) -
     assert leases.facts()["holder"] == "other"
     assert bench.call("endRecording")["status"] == "success"
     assert bench.state.words.said() is Said.END
+
+
+@pytest.mark.parametrize("stopped", [True, False])
+@pytest.mark.parametrize("on_mesh", [True, False])
+def test_recorder_leaves_its_network_once_the_stop_that_ended_it_is_answered(
+    monkeypatch: pytest.MonkeyPatch, stopped: bool, on_mesh: bool
+) -> None:
+    order: list[object] = []
+
+    @contextmanager
+    def on_network(*_given: object) -> Iterator[None]:
+        yield
+        order.append("left")
+
+    monkeypatch.setattr(recorder_device, "device_of", on_network)
+    monkeypatch.setattr(recorder_device, "peer_of", on_network)
+    monkeypatch.setattr(recorder_device.time, "sleep", order.append)
+    state = RecordingState()
+    with recorder_served(Screen(), Network(), "arm-1", state, "wave", on_mesh=on_mesh, needed=True):
+        if stopped:
+            state.halt("the recording was stopped")
+    assert order == ([2.5 if on_mesh else 1.0] if stopped else []) + ["left"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import Any
@@ -24,6 +25,11 @@ RECORDER = "recorder"
 
 ROBOT_FIRST_S = 0.3
 """Seconds in which a robot that an emergency stop locks as well is seen to be stopped, and ends the attempt itself."""
+
+ANSWERED_S, ANSWERED_MESH_S = 1.0, 2.5
+"""Seconds in which a stop that ended the recording is answered: its lockout is written first.
+
+On the mesh it is asked again after 1.5 s, where its answer came before its presence."""
 
 
 PAGE_NAMES = (PAGE_CALLER, f"{PAGE_CALLER}-*", f"*__{PAGE_CALLER}-*")
@@ -138,7 +144,12 @@ def recorder_served(
             screen.say(why, "yellow")
         else:
             screen.say(f"The page has its buttons: {name}.")
-        yield
+        try:
+            yield
+        finally:
+            if state.halting:
+                # It leaves its network once the stop that ended it is answered.
+                time.sleep(ANSWERED_MESH_S if on_mesh else ANSWERED_S)
 
 
 NOT_SERVED = "The robot is not on the network: "
