@@ -169,3 +169,18 @@ def test_recording_that_leads_is_told_from_a_person(tmp_path: Path) -> None:
         recorder.take("arm-1", "streamStep", {"observation": {"pan": 1.0}, "action": {"pan": 1.0}}, BEGAN)
     (attempt,) = attempts_in(tmp_path / "a.mcap")
     assert (ACTORS[attempt.actors[0]], attempt.led) == ("recording", [False])
+
+
+def test_frames_of_a_hold_are_nobodys(tmp_path: Path) -> None:
+    file = tmp_path / "a.mcap"
+    turns = (("policy", ""), ("led", "hand"), ("held", ""), ("led", "hand"), ("policy", ""))
+    with Recorder(file) as recorder:
+        recorder.take("arm-1", "taskStarted", {"policy_provider": "mock"}, BEGAN - 0.01)
+        for turn, (state, led_by) in enumerate(turns):
+            recorder.take("arm-1", "turnChanged", {"state": state}, BEGAN + turn)
+            for step in range(2):
+                row = {"observation": {"pan": 1.0}, "action": {"pan": 1.0}, "led_by": led_by}
+                recorder.take("arm-1", "streamStep", row, BEGAN + turn + step / HZ)
+    (attempt,) = attempts_in(file, whole=True)
+    assert [ACTORS[code] for code in attempt.actors[::2]] == ["policy", "leader", "unknown", "leader", "policy"]
+    assert attempt.led[::2] == [False, True, False, True, False]

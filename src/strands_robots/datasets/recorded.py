@@ -24,6 +24,7 @@ from strands_robots.policies.base import numbers
 from strands_robots.recording.file import (
     REFUSED,
     STEP,
+    TURN,
     UNITS,
     RecordedEvent,
     RecordedPicture,
@@ -152,7 +153,7 @@ class _AttemptReader:
         self._found: list[Attempt] = []
         self._attempt = Attempt()
         self._before: Attempt | None = None
-        self._actor, self._policy, self._replayed = UNKNOWN, "", False
+        self._actor, self._policy, self._replayed, self._held = UNKNOWN, "", False, False
         self._units: dict[str, str] = {}
 
     def read(self, events: Iterable[RecordedEvent]) -> list[Attempt]:
@@ -162,6 +163,8 @@ class _AttemptReader:
                 self._take_step(each)
             elif each.event in _STARTS or each.event in _ENDS:
                 self._take_task(each)
+            elif each.event == TURN:
+                self._held = each.payload.get("state") == "held"
             elif (code := _STOPS.get(each.event)) is not None:
                 self._take_stop(each.at, code)
             elif each.event == ATTEMPT_ENDED:
@@ -185,17 +188,21 @@ class _AttemptReader:
 
     def _take_step(self, event: RecordedEvent) -> None:
         attempt, led_by = self._attempt, event.payload.get("led_by")
+        held = self._held and not led_by
         observation, action = (_numbers(event.payload.get(name)) for name in ("observation", "action"))
         attempt.steps.append((event.at, observation, action))
         attempt.units = self._units
         attempt.led.append(attempt.person or (bool(led_by) and not self._replayed))
         actor = BY_LEADER if led_by or attempt.person else _actor(event.payload.get("policy"), self._actor)
-        if actor == BY_POLICY and (policy := event.payload.get("policy") or self._policy):
+        if actor == BY_POLICY and not held and (policy := event.payload.get("policy") or self._policy):
             attempt.policies[str(policy)] = None
-        attempt.actors.append(BY_RECORDING if self._replayed and actor in (BY_LEADER, UNKNOWN) else actor)
+        if self._replayed and actor in (BY_LEADER, UNKNOWN):
+            actor = BY_RECORDING
+        # Nobody has a robot hold that waits for its leader.
+        attempt.actors.append(UNKNOWN if held else actor)
 
     def _take_task(self, event: RecordedEvent) -> None:
-        begins = event.event in _STARTS
+        begins, self._held = event.event in _STARTS, False
         if begins and self._attempt.steps and not self._whole:
             self._end()
         if begins:
