@@ -501,6 +501,7 @@ class RecordedLeader:
             raise ValidationError("frames must be in the order of their times, each later than the one before.")
         filled: Action = {}
         self._actions = [filled := {**filled, **action} for _, action in frames]
+        self.keys = tuple(filled)
         self._speed = number("speed", speed, above=0, high=10)
         self._now = now
         self._started_at: float | None = None

@@ -9,9 +9,11 @@ import pytest
 from fixtures.desk import desk
 from fixtures.waiting import eventually
 
-from strands_robots.cli.far_hand import Hand, LeadableHere
+from strands_robots.cli.far_hand import Hand, HandLeader, LeadableHere
+from strands_robots.cli.output import Screen
 from strands_robots.simulation import Simulation
-from strands_robots.teleoperators import LeaderFinished
+from strands_robots.teleoperators import LeaderFinished, RecordedLeader
+from strands_robots.utils import ValidationError
 
 
 class Arm:
@@ -133,3 +135,11 @@ def test_hold_waits_for_a_person_and_a_leader_alone_goes_on(world: Simulation, a
     desk.until("led")
     assert desk.ends == []
     desk.hand.close()
+
+
+def test_recording_of_joints_that_the_robot_lacks_is_refused_before_it_leads(world: Simulation) -> None:
+    recording = RecordedLeader([(0.0, {"shoulder_pan": 0.0}), (1.0, {"shoulder_pan": 0.2, "elbow": 0.2})])
+    leader = HandLeader(Screen(), "run.csv", {}, None, recording)
+    with pytest.raises(ValidationError, match="not elbow, which the leader leads"), leader.connected():
+        leader.begin(LeadableHere(world), "", "wave", None, lambda why, halted: None)
+    eventually(lambda: not world.teleoperating())

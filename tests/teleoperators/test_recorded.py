@@ -30,6 +30,7 @@ class Watch:
 def test_recording_is_played_at_its_own_times_and_ends() -> None:
     watch = Watch()
     leader = RecordedLeader([(5.0, {"a": 0.0, "b": 1.0}), (6.0, {"a": 10.0}), (8.0, {"b": 3.0})], now=watch)
+    assert leader.keys == ("a", "b")
     assert leader.get_action() == {"a": 0.0, "b": 1.0}
     watch.seconds += 0.5
     assert leader.get_action() == {"a": 5.0, "b": 1.0}
