@@ -216,6 +216,7 @@ def test_recording_that_is_stopped_as_it_starts_begins_nothing(tmp_path: Path, a
     ):
         record_attempts(Screen(console=Console(file=io.StringIO())), arm, recording, attempts)
     assert began == []
+    assert not recording.recording.exists(), "what nothing led is no attempt"
 
 
 STOPPED = "the recording was stopped: stop by desk"

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 from strands_robots.cli.attempt_progress import AttemptProgress
+from strands_robots.cli.led_robot import NotBegunError
 from strands_robots.cli.output import CliError, Screen, wait_until
 from strands_robots.cli.recording_state import RecordingState, RecordingStoppedError, Said, Stage, Words
 from strands_robots.datasets.recorded import ATTEMPT_ENDED, HALTED
@@ -202,7 +203,12 @@ def _record(
                 raise RecordingStoppedError(f"Nothing more is recorded: {state.halting}.")
             return
         pause_s = attempts.pause_s
-        ended = _attempt(screen, led, session, attempts, encoder)
+        try:
+            ended = _attempt(screen, led, session, attempts, encoder)
+        except (NotBegunError, RecordingStoppedError):
+            # Nothing was led: what was recorded is no attempt.
+            session.discard()
+            raise
         if ended.stopped_by:
             try:
                 _save(screen, session, attempts, success=False)
