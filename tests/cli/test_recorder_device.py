@@ -17,6 +17,7 @@ from strands_robots.cli.output import Screen
 from strands_robots.cli.recorder_device import RecorderDevice, grant_page, recorder_driver, recorder_served
 from strands_robots.cli.recording_state import RecordingState, Said, Stage
 from strands_robots.safety.lockout import LockoutLatch
+from strands_robots.safety.orders import COMES_UP_LOCKED
 from strands_robots.safety.scope import Scope
 
 
@@ -122,6 +123,8 @@ def test_begin_of_a_recorder_that_was_locked_before_is_named_to_the_terminal(ben
     latch = LockoutLatch("recorder-arm-1")
     bench.driver.robot.gate.attach(latch)
     latch.engage("e" * 32, "desk", "smoke")
+    assert bench.driver.robot.halt(COMES_UP_LOCKED).stopped
+    assert bench.state.halting == "", "it waits for the resume"
     assert bench.state.refusal.startswith("recorder-arm-1 is locked by the emergency stop of desk")
 
 

@@ -16,6 +16,7 @@ from strands_robots.cli.serve import PAGE_CALLER, added
 from strands_robots.envelope import Envelope, success, text_of
 from strands_robots.safety.authorization import Authorization
 from strands_robots.safety.gate import gate_of
+from strands_robots.safety.orders import COMES_UP_LOCKED
 from strands_robots.safety.scope import SCOPE
 from strands_robots.utils import MissingExtraError, ValidationError
 from strands_robots.verb_declaration import verb
@@ -95,6 +96,9 @@ class RecorderDevice:
 
     def halt(self, reason: str = "") -> None:
         """End the recording; its status tells when the robot of an attempt is halted."""
+        if reason == COMES_UP_LOCKED:
+            # By a stop of before this recording: it waits for the resume.
+            return
         # A lockout of before has let no attempt begin, so the first one that is seen is this stop's.
         waits = not self._state.halting and self._robot_is_stopped_as_well
         why = "the recording was stopped" + (f": {reason}" if reason else "")

@@ -44,6 +44,9 @@ REASON_MAX = 200
 NO_REASON = "fleet e-stop"
 """Reason of a stop on the mesh that states none."""
 
+COMES_UP_LOCKED = "it comes up locked"
+"""Reason of the halt of a robot that is locked by a stop of before."""
+
 ANSWERED = "answered"
 """Field of a repeated stop: the devices that its issuer asks for no further answer."""
 

@@ -17,7 +17,7 @@ from strands_robots.envelope import Envelope, error, success
 from strands_robots.safety.checkin import CheckIn
 from strands_robots.safety.gate import MotionGate
 from strands_robots.safety.lockout import Lockout, LockoutLatch
-from strands_robots.safety.orders import LISTENER, MISSED, RobotReport, StopOrder, new_epoch
+from strands_robots.safety.orders import COMES_UP_LOCKED, LISTENER, MISSED, RobotReport, StopOrder, new_epoch
 from strands_robots.safety.persistence import LockoutStore, Original, Originals, ResumedEpochs, StoredLockout
 from strands_robots.safety.process import undisturbed
 from strands_robots.safety.reporting import UNPACED, OnReport, Reporter, StopCount, StopRun
@@ -167,7 +167,7 @@ class Registered:
         for gate in self.gates:
             gate.revoke()
         logger.warning("%s comes up locked: epochs %s.", self.robot_id, ", ".join(self.epochs))
-        halted = self._plane.executor.submit(self.robot, self.robot_id, "it comes up locked")
+        halted = self._plane.executor.submit(self.robot, self.robot_id, COMES_UP_LOCKED)
         halted.add_done_callback(self._came_up)
 
     def leave_executor(self) -> None:
