@@ -123,7 +123,7 @@ def test_begin_of_a_recorder_that_was_locked_before_is_named_to_the_terminal(ben
     latch = LockoutLatch("recorder-arm-1")
     bench.driver.robot.gate.attach(latch)
     latch.engage("e" * 32, "desk", "smoke")
-    assert bench.driver.robot.halt(COMES_UP_LOCKED).stopped
+    bench.device.halt(COMES_UP_LOCKED)
     assert bench.state.halting == "", "it waits for the resume"
     assert bench.state.refusal.startswith("recorder-arm-1 is locked by the emergency stop of desk")
 
