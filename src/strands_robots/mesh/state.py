@@ -505,12 +505,14 @@ class StepPublisher:
             stamp = self._context.clock()
 
             def publish() -> None:
-                prefix = f"{event.robot}/" if len(robots_in(self._robot)) > 1 else ""
+                several = len(robots_in(self._robot)) > 1
+                prefix = f"{event.robot}/" if several else ""
                 observation = {prefix + key: value for key, value in event.observation.items()}
                 action = {prefix + key: value for key, value in event.action.items()}
                 about = {"instruction": event.instruction, "policy": event.policy}
                 led = {"led_by": event.led_by} if event.led_by else {}
-                self._put(stamp, event.step, observation, action, **about, **led)
+                named = {"robot_name": event.robot} if several else {}
+                self._put(stamp, event.step, observation, action, **about, **led, **named)
 
             self._executor.submit(publish)
         elif event.kind == "turn":

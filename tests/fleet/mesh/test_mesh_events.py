@@ -139,6 +139,21 @@ def test_recording_has_pictures_and_each_stop_of_the_fleet_once(followed: Follow
     eventually(lambda: ("arm-1", "state") in {(each.robot, each.name) for each in seen}, what="a state")
 
 
+def test_recorded_step_of_a_robot_of_a_world_has_its_own_joints(followed: Followed) -> None:
+    seen: list[RobotEvent] = []
+    end = followed.there.subscribe("cell-1", seen.append, Detail.ALL)
+    plain = {"step": 1, "observation": {"a/pan": 1.0}, "action": None}
+    for message in ({**plain, "robot_name": "left", "observation": {"left/pan": 1.0}}, plain, {"robot_name": "left"}):
+        followed.say("cell-1/stream", message)
+    eventually(lambda: len(seen) == 3, what="the steps")
+    assert [(each.payload.get("robot_name"), each.payload.get("observation")) for each in seen] == [
+        ("left", {"pan": 1.0}),
+        (None, {"a/pan": 1.0}),
+        ("left", None),
+    ]
+    end()
+
+
 def test_message_about_another_robot_than_its_topic_names_is_left_out(followed: Followed) -> None:
     followed.say("arm-1/state", {"peer_id": "arm-9", "joints": {"forged": 1.0}})
     followed.say("arm-1/presence", {"robot_id": "arm-9", "task_status": "forged"})

@@ -251,13 +251,27 @@ def _recorded(robot: str, on_event: OnEvent) -> dict[str, tuple[str, OnMessage]]
 
     return {
         topics.state(robot): ("state", _named("state", on_event)),
-        topics.stream(robot): (STREAM, _named(STEP, on_event)),
+        topics.stream(robot): (
+            STREAM,
+            lambda key, message: on_event(RobotEvent(_sender(key), STEP, _of_one_robot(message))),
+        ),
         topics.turn(robot): ("turn", _named(TURN, on_event)),
         topics.camera(robot, "*"): ("camera", picture),
         topics.safety_event(robot): ("safety_event", _named("safety_event", on_event)),
         topics.estop(): ("estop", of_fleet("emergencyStop")),
         topics.resume(): ("resume", of_fleet("resume")),
     }
+
+
+def _of_one_robot(message: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return a step of a robot of a world with its joints by their own names."""
+    prefix = f"{message.get('robot_name')}/"
+    own = {
+        name: {key.removeprefix(prefix): value for key, value in message[name].items()}
+        for name in ("observation", "action")
+        if isinstance(message.get(name), Mapping)
+    }
+    return {**message, **own} if "robot_name" in message else message
 
 
 def _named(name: str, on_event: OnEvent) -> OnMessage:
