@@ -81,6 +81,12 @@ def test_attempt_of_another_robot_is_refused_and_still_there(tmp_path: Path) -> 
             recording.keep(success=True)
         assert recording.recording.exists()
     assert read_info(tmp_path).episodes == 1
+    told: list[str] = []
+    with RecordingSession(tmp_path, 20, "wave", "so100", told.append) as again:
+        attempt(again.recording)
+        assert again.keep(success=True) is not None, "it is not in the way of the next ones"
+    assert "has another kind of episodes" in told[0]
+    assert (tmp_path / ".running" / "aside-000000.mcap").exists()
 
 
 def test_second_session_and_another_rate_are_refused(tmp_path: Path) -> None:

@@ -40,7 +40,8 @@ class RecordingSession:
         DatasetError: another process records into it, or it is a folder of others' files.
         ValidationError: a value outside its domain, or a dataset of another rate.
 
-    Entering it raises as :meth:`keep` does, where a killed process left an attempt of another kind.
+    Entering it raises as :meth:`keep` does, where the attempt that a killed process left cannot be written. One of
+    another kind is moved aside.
     """
 
     def __init__(self, folder: Path, fps: int, task: str, robot_type: str, tell: Callable[[str], None]) -> None:
@@ -151,6 +152,13 @@ class RecordingSession:
             kept = self.keep(success=False)
         except NoPictureError as lacking:
             self._tell(f"{lacking}.")
+            return
+        except ValidationError as unfit:
+            # It would be in the way of every recording to come.
+            aside = self._move_aside(current)
+            self._tell(
+                f"{str(unfit).rstrip('.')}: the attempt that was running is no episode, and was moved to {aside}."
+            )
             return
         if kept is None:
             self._tell("The attempt that was running has no whole second, and is removed.")
