@@ -76,6 +76,7 @@ def cell(peers: Fleet) -> Iterator[Cell]:
 
 def test_teleoperator_is_refused_while_an_agent_holds_the_robot(cell: Cell) -> None:
     held = cell.ask(cell.agent, "acquireControl")
+    assert cell.ask(cell.lead, "status")["control"]["holder"] == "agent"
     refused = cell.follow()
     assert "agent (agent) holds control" in str(refused)
     assert cell.ask(cell.agent, "releaseControl", lease_id=held["lease_id"])["status"] == "success"

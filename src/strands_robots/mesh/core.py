@@ -162,7 +162,11 @@ class Mesh(SensorLoopsMixin):
             "describe": lambda arguments, _: description_of(robot, self._own_verbs),
         }
         if robot is not None:
-            own["status"] = status_of(robot, lambda nonce: {**self._adapter.report("", nonce), **self._hearing.facts()})
+            own["status"] = status_of(
+                robot,
+                lambda nonce: {**self._adapter.report("", nonce), **self._hearing.facts()},
+                lambda: self._pipeline.leases,
+            )
             own["execute"] = execute_on(robot, context, lambda: self._pipeline.closed)
         self._pipeline = Pipeline.of(
             robot, lambda: peer, hardware=hardware, authorize=SenderCheck(context, hardware=hardware), own=own

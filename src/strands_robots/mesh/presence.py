@@ -459,6 +459,7 @@ class Children:
             raise TransportError("the mesh is not running.")
         context = replace(parent, peer_id=peer, audit=self._audit(peer))
         parents = dict.fromkeys(TELEOP_VERBS, self._ask_parent(name))
+        leases = None if self._pipeline.leases is None else self._pipeline.leases.only(name)
         pipeline = Pipeline.of(
             robot,
             lambda: peer,
@@ -468,13 +469,13 @@ class Children:
                 **self._own(peer),
                 **parents,
                 **self._arm_verbs(name),
-                "status": status_of(robot, partial(self._report, peer)),
+                "status": status_of(robot, partial(self._report, peer), lambda: leases),
                 "describe": lambda arguments, _: description_of(robot),
                 "execute": execute_on(robot, parent),
             },
             pending=self._pipeline.pending.of(name),
             shares=self._pipeline.shares,
-            leases=None if self._pipeline.leases is None else self._pipeline.leases.only(name),
+            leases=leases,
         )
         server = CommandReceiver(
             context,

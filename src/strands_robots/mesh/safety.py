@@ -35,6 +35,7 @@ from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope, none_know
 from strands_robots.safety.statements import Proof, Purpose, enrolled_peers, proof_of, record_heads
 from strands_robots.safety.stop_link import ESTOP, StopEvent
 from strands_robots.safety.stopping import Outcome, StopVerdict
+from strands_robots.serving.control_leases import ControlLeases
 from strands_robots.serving.peer_verbs import PEER_VERBS, peer_stop_answer
 from strands_robots.serving.pipeline import Own
 from strands_robots.serving.verbs import Arguments
@@ -67,16 +68,23 @@ OnAnswers = Callable[[list[dict[str, Any]]], None]
 """Gets the replies to an emergency stop so far, on the thread that collects them."""
 
 
-def status_of(robot: Robot, facts: Callable[[str], Mapping[str, Any]]) -> Own:
-    """Make the ``status`` of a peer: what the robot answers, with the safety facts.
+def status_of(
+    robot: Robot, facts: Callable[[str], Mapping[str, Any]], leases: Callable[[], ControlLeases | None]
+) -> Own:
+    """Make the ``status`` of a peer: the robot's answer, safety facts and holder.
 
     Args:
         facts: returns them for the nonce of the question.
+        leases: returns those of the robot.
     """
 
     def status(arguments: Arguments, request: MotionRequest | None) -> object:
         answer = PEER_VERBS["status"].call(robot, arguments)()
-        return {**answer, **facts(arguments.get("nonce", ""))} if isinstance(answer, Mapping) else answer
+        if not isinstance(answer, Mapping):
+            return answer
+        held = leases()
+        control = {} if held is None else {"control": held.facts()}
+        return {**answer, **facts(arguments.get("nonce", "")), **control}
 
     return status
 
