@@ -30,9 +30,10 @@ if importlib.util.find_spec("torch") is None or importlib.util.find_spec("lerobo
 
 from fixtures import lerobot_checkpoints as tiny
 from lerobot_robot_strands import StrandsRobot, StrandsRobotConfig
-from lerobot_robot_strands.ending import RobotEndedError
+from lerobot_robot_strands.ending import RobotEndedError, at_end
 from lerobot_robot_strands.newest import Newest
 from lerobot_robot_strands.served import feature
+from lerobot_teleoperator_strands import StrandsTeleoperator, StrandsTeleoperatorConfig
 
 ROOT = Path(__file__).parents[3]
 PAGE = (ROOT / "docs" / "lerobot.md").read_text("utf-8")
@@ -51,12 +52,36 @@ def commands(name: str) -> list[str]:
 @pytest.fixture(scope="module")
 def machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
     """A machine with the two robots of the page, whose settings this process has as well."""
-    folder = tmp_path_factory.mktemp("lerobot")
-    there = Machine(folder / "state", HF_LEROBOT_HOME=str(folder / "home"), HF_HUB_OFFLINE="1")
-    with pytest.MonkeyPatch.context() as patch, there.serving("arm-1"), there.serving("leader-1"):
-        for name in ("STRANDS_STATE_DIR", "STRANDS_DC_PORT", "STRANDS_MESH_PORT"):
-            patch.setenv(name, there.environment[name])
+    with pytest.MonkeyPatch.context() as patch, serving(tmp_path_factory.mktemp("lerobot")) as there:
+        join(there, patch)
         yield there
+
+
+@pytest.fixture(scope="module")
+def on_the_mesh(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
+    """Another machine, whose robots have the same ids on the native mesh."""
+    with serving(tmp_path_factory.mktemp("mesh"), "--mesh") as there:
+        yield there
+
+
+@pytest.fixture(params=["device_connect", "mesh"])
+def either(request: pytest.FixtureRequest, machine: Machine, monkeypatch: pytest.MonkeyPatch) -> Machine:
+    """The machine with the robots of one network, whose settings this process has as well."""
+    there: Machine = machine if request.param == "device_connect" else request.getfixturevalue("on_the_mesh")
+    join(there, monkeypatch)
+    return there
+
+
+@contextmanager
+def serving(folder: Path, *options: str) -> Iterator[Machine]:
+    there = Machine(folder / "state", HF_LEROBOT_HOME=str(folder / "home"), HF_HUB_OFFLINE="1")
+    with there.serving("arm-1", *options), there.serving("leader-1", *options):
+        yield there
+
+
+def join(there: Machine, patch: pytest.MonkeyPatch) -> None:
+    for name in ("STRANDS_STATE_DIR", "STRANDS_DC_PORT", "STRANDS_MESH_PORT"):
+        patch.setenv(name, there.environment[name])
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +119,9 @@ def begin(machine: Machine, folder: Path, line: list[str], out: IO[str]) -> subp
 def recording(machine: Machine, folder: Path, *more: str) -> Iterator[tuple[subprocess.Popen[Any], Path]]:
     """Run the page's recording in the block, from its second episode on; yield its process and what it says."""
     said = folder / "said.txt"
-    times = ["--dataset.num_episodes=9", "--dataset.episode_time_s=2", "--dataset.reset_time_s=0"]
+    times = ["--dataset.num_episodes=30", "--dataset.episode_time_s=1", "--dataset.reset_time_s=0"]
+    # The encoder of a busy machine may starve what reads.
+    times += ["--robot.max_age_s=5", "--teleop.max_age_s=5"]
     with said.open("w") as out:
         process = begin(machine, folder, [*commands("lerobot-record"), *times, *more], out)
     try:
@@ -148,10 +175,19 @@ def test_a_policy_drives_a_served_robot(machine: Machine, tmp_path: Path) -> Non
     assert joints(machine, "arm-1") != pytest.approx(before, abs=0.01)
 
 
-def test_a_stop_ends_a_recording_with_one_sentence_and_its_first_episode(machine: Machine, tmp_path: Path) -> None:
-    with recording(machine, tmp_path, "--dataset.root=stopped") as (process, said):
-        assert machine.run("stop", "arm-1").returncode == 0
+@pytest.mark.parametrize(("either", "stop"), [("device_connect", "stop arm-1"), ("mesh", "estop")], indirect=["either"])
+def test_a_recording_holds_its_robot_and_ends_at_a_stop_with_one_sentence_and_its_first_episode(
+    either: Machine, stop: str, tmp_path: Path
+) -> None:
+    with recording(either, tmp_path, "--dataset.root=stopped") as (process, said):
+        with pytest.raises(RobotEndedError, match=r"strands-robots.* holds control for"), robot():
+            pass
+        assert either.run(*stop.split()).returncode == 0
         assert process.wait(WITHIN_S) == 1
+    if stop == "estop":
+        with pytest.raises(RobotEndedError, match="arm-1 is locked by the emergency stop"), robot():
+            pass
+        assert either.run("resume", "--local").returncode == 0
     # LeRobot 0.4.4 logs one at its start, about a keyboard that is not there.
     assert "Traceback" not in said.read_text().partition("Stop recording")[2]
     assert "strands: arm-1/so100: The lead of lerobot is over: " in said.read_text().splitlines()[-1]
@@ -188,8 +224,7 @@ def test_a_real_arm_is_led_once_its_lease_and_its_lead_are_approved(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     there = Machine(tmp_path / "state")
-    for name in ("STRANDS_STATE_DIR", "STRANDS_DC_PORT", "STRANDS_MESH_PORT"):
-        monkeypatch.setenv(name, there.environment[name])
+    join(there, monkeypatch)
     calibration = write_calibration(tmp_path / "calibration.json")
     with BusProcess(tmp_path / "ttyACM0") as bus:
         words = ["so101", "--peer-id", "arm-1", "--port", bus.port, "--rpc-allow", "strands-robots", "--json"]
@@ -228,7 +263,8 @@ def test_another_holder_is_named_and_its_robot_left_alone(machine: Machine) -> N
         StrandsRobot(StrandsRobotConfig(peer_id="arm-1", camera_names=[])).connect()
 
 
-def test_an_action_goes_on_after_a_pause_and_returns_what_was_written(machine: Machine) -> None:
+@pytest.mark.usefixtures("either")
+def test_an_action_goes_on_after_a_pause_and_returns_what_was_written() -> None:
     with robot(camera_names=["overview", "so100/wrist"], camera_width=320, camera_height=240) as arm:
         assert set(arm.observation_features) == {*(f"{joint}.pos" for joint in JOINTS), "overview", "wrist"}
         seen = arm.get_observation()
@@ -255,6 +291,20 @@ def test_an_unknown_camera_and_an_unknown_robot_are_named(machine: Machine) -> N
         StrandsRobot(StrandsRobotConfig(peer_id="arm-9")).connect()
     with pytest.raises(ValueError, match="peer_id must name a robot"):
         StrandsRobot(StrandsRobotConfig(peer_id=""))
+
+
+@pytest.mark.usefixtures("machine")
+def test_a_command_that_has_ended_joins_no_network_again() -> None:
+    leader = StrandsTeleoperator(StrandsTeleoperatorConfig(peer_id="leader-1"))
+    leader.connect()
+    try:
+        for leave in tuple(at_end):
+            leave()
+        with pytest.raises(RobotEndedError, match="the state of leader-1 is"):
+            eventually(lambda: not leader.get_action(), every=0.03)
+        assert not at_end
+    finally:
+        leader.disconnect()
 
 
 def test_what_is_too_old_is_refused_by_name() -> None:

@@ -67,7 +67,7 @@ class StrandsRobot(MadeElsewhere, Robot):  # type: ignore[misc]
     @cached_property
     def _shapes(self) -> dict[str, tuple[int, ...]]:
         with told(self._served.id):
-            return {name: self._picture(camera).shape for name, camera in self.cameras.items()}
+            return {name: self._reader(camera)()[0].shape for name, camera in self.cameras.items()}
 
     @property
     def observation_features(self) -> dict[str, Any]:
@@ -111,7 +111,7 @@ class StrandsRobot(MadeElsewhere, Robot):  # type: ignore[misc]
 
     def _begin_reading(self, stack: ExitStack) -> None:
         far, age = self._served.id, self.config.max_age_s
-        self._state = Newest(f"the state of {far}", self._served.read, STATE_HZ, age)
+        self._state = Newest(f"the state of {far}", self._served.reader(), STATE_HZ, age)
         stack.callback(self._state.close)
         for name, camera in self.cameras.items():
             newest = Newest(
@@ -123,10 +123,8 @@ class StrandsRobot(MadeElsewhere, Robot):  # type: ignore[misc]
             newest.first()
 
     def _reader(self, camera: str) -> Any:
-        return lambda: (self._picture(camera), 0.0)
-
-    def _picture(self, camera: str) -> Any:
-        return self._served.remote.picture(camera, self.config.camera_width, self.config.camera_height)
+        remote, width, height = self._served.remote, self.config.camera_width, self.config.camera_height
+        return lambda: (remote.picture(camera, width, height), 0.0)
 
     def get_observation(self) -> dict[str, Any]:
         """Return the newest joints and pictures, without waiting.

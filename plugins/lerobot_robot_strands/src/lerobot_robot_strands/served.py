@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cached_property
 from typing import Any
@@ -115,14 +115,19 @@ class ServedRobot:
             raise RobotEndedError(f"strands: {self.id} tells no {which}, so LeRobot cannot use it.")
         return named
 
-    def read(self) -> tuple[dict[str, float], float]:
-        """Return its joints by their own names, and their age at its answer in seconds.
+    def reader(self) -> Callable[[], tuple[dict[str, float], float]]:
+        """Return what reads its joints by their own names, and their age at its answer in seconds.
 
-        Raises:
-            RefusalError: it does not answer.
+        It raises :class:`RefusalError` where the robot does not answer, and joins no network after :meth:`close`.
         """
-        answer = self.remote.state()
-        return plain_numbers(answer.get("joints")), plain_numbers({"age": answer.get("joints_age_s")}).get("age", 0.0)
+        remote = self.remote
+
+        def read() -> tuple[dict[str, float], float]:
+            answer = remote.state()
+            age = plain_numbers({"age": answer.get("joints_age_s")}).get("age", 0.0)
+            return plain_numbers(answer.get("joints")), age
+
+        return read
 
     def cameras(self, names: Sequence[str] | None) -> dict[str, str]:
         """Return the cameras that are used: LeRobot's name, and the robot's own.

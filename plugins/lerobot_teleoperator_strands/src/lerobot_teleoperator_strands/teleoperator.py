@@ -54,7 +54,7 @@ class StrandsTeleoperator(MadeElsewhere, Teleoperator):  # type: ignore[misc]
             raise RobotEndedError(f"strands: {self._served.id} is connected already.")
         if not self.action_features:
             return
-        state = Newest(f"the state of {self._served.id}", self._served.read, STATE_HZ, self.config.max_age_s)
+        state = Newest(f"the state of {self._served.id}", self._served.reader(), STATE_HZ, self.config.max_age_s)
         try:
             state.first()
         except RobotEndedError:
