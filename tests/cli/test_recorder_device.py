@@ -126,6 +126,8 @@ def test_begin_of_a_recorder_that_was_locked_before_is_named_to_the_terminal(ben
     bench.device.halt(COMES_UP_LOCKED)
     assert bench.state.halting == "", "it waits for the resume"
     assert bench.state.refusal.startswith("recorder-arm-1 is locked by the emergency stop of desk")
+    bench.device.halt("".join(COMES_UP_LOCKED.partition("up")))
+    assert bench.state.halting.endswith(COMES_UP_LOCKED), "a stop that says so is one"
 
 
 def test_emergency_stop_of_the_recorder_alone_ends_the_attempt_at_once(bench: Bench) -> None:

@@ -96,8 +96,8 @@ class RecorderDevice:
 
     def halt(self, reason: str = "") -> None:
         """End the recording; its status tells when the robot of an attempt is halted."""
-        if reason == COMES_UP_LOCKED:
-            # By a stop of before this recording: it waits for the resume.
+        if reason is COMES_UP_LOCKED:
+            # By a stop of before this recording: it waits for the resume. No stop of others has this very text.
             return
         # A lockout of before has let no attempt begin, so the first one that is seen is this stop's.
         waits = not self._state.halting and self._robot_is_stopped_as_well
