@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 from fixtures.waiting import eventually
@@ -108,6 +108,20 @@ def test_robot_that_was_stopped_stays_on_its_network_also_where_the_disk_is_full
     with session(tmp_path) as recording, pytest.raises(CliError, match="The disk is full"):
         record(arm, recording, 1)
     assert arm.held == 1
+
+
+def test_stop_that_is_known_for_a_lockout_by_the_end_is_told_as_one(tmp_path: Path) -> None:
+    class Late(Arm):
+        told: ClassVar = ["arm-1 was stopped.", "arm-1 is locked by an emergency stop."]
+
+        @property
+        def stopped_by(self) -> str:  # type: ignore[override]
+            return self.told.pop(0)
+
+    arm = Late()
+    arm.stopped = True
+    with session(tmp_path) as recording, pytest.raises(CliError, match="network: arm-1 is locked"):
+        record(arm, recording, 1)
 
 
 def test_leader_that_failed_costs_no_saved_episode(tmp_path: Path, arm: Arm) -> None:

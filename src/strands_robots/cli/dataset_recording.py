@@ -213,11 +213,13 @@ def _record(
             try:
                 _save(screen, session, attempts, success=False)
             finally:
-                state.note(f"Stopped from the network: {ended.stopped_by}")
+                # Whether it is locked as well may be known by now.
+                why = f"Stopped from the network: {led.stopped_by or ended.stopped_by}"
+                state.note(why)
                 state.enter(Stage.STOPPED)
                 # Also where the disk is full: a locked robot is resumed on its network.
                 led.hold(screen)
-            raise CliError(f"Stopped from the network: {ended.stopped_by}")
+            raise CliError(why)
         if ended.verdict is None or not ended.verdict.stopped:
             raise CliError("The follower did not confirm its stop; the attempt is saved at the next start.")
         if ended.said in (Said.REDO, Said.END):
@@ -343,6 +345,9 @@ def _attempt(
         def end() -> None:
             state.enter(Stage.ENDING)
             if led.stopped:
+                if halts:
+                    # Both were stopped; that of the robot may not be recorded yet.
+                    recorder.take(led.name, HALTED, {})
                 ends.append((led.stopped_by, None))
                 return
             # What ends an attempt here is no stop of it, but for a stop of the recording.
