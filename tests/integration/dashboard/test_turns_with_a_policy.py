@@ -28,6 +28,7 @@ class Site(NamedTuple):
     """A page and the network of its arm."""
 
     page: Any
+    url: str
     network: str
     machine: Machine
 
@@ -49,63 +50,12 @@ def site(request: pytest.FixtureRequest, chrome: Any, tmp_path_factory: pytest.T
         stack.callback(server.close)
         page = chrome.new_page(viewport={"width": 1280, "height": 1000})
         stack.callback(page.close)
-        page.goto(server.url)
-        page.locator(".card").wait_for(timeout=60_000)
-        yield Site(page, request.param, machine)
-
-
-def test_push_takes_over_from_the_policy_and_a_button_gives_back(site: Site) -> None:
-    page, network, _ = site
-
-    def pan() -> float:
-        return float(page.locator(".bar .value").first.inner_text().rstrip("\u00b0"))
-
-    button = take(page, "shoulder_pan +", network=network)
-    shows(page, "/\\d/.test(document.querySelector('.bar .value')?.textContent)")
-    start = pan()
-    page.fill("#turn-task", "wave")
-    policy_drives(page)
-    picture(page, "turn-policy")
-    shows(page, f"Math.abs(parseFloat(document.querySelector('.bar .value').textContent) - {start}) > 0.5")
-
-    hand_leads(page, button)
-    before = pan()
-    hold_until(page, button, lambda: pan() > before + 3, "the arm goes where it is pushed")
-    page.mouse.up()
-    picture(page, "turn-led")
-    page.locator(".drive .said", has_text="Let go (").wait_for()
-
-    policy_drives(page)
-    end_turns(page)
-
-
-def test_hand_that_drives_by_pictures_is_held_where_they_show_nothing_new(site: Site) -> None:
-    page, network, _ = site
-    button = page.locator("button.jog[aria-label='shoulder_pan +']")
-
-    def stands_by_old_pictures() -> bool:
-        if "the newest picture of page is" not in turn_said(page):
-            policy_drives(page)
-            hand_leads(page, button)
-            # It stands, so its camera has nothing new.
-            page.mouse.up()
-            page.locator(".turn-said", has_text="HELD").wait_for()
-        return "the newest picture of page is" in turn_said(page)
-
-    page.select_option("#turn-camera", "front")
-    policy_drives(page)
-    shows(page, "document.querySelector('.pictures .camera').src.startsWith('blob:')")
-    eventually(stands_by_old_pictures, 90.0, "it is held for its old pictures")
-    picture(page, "turn-held")
-    policy_drives(page)
-    page.keyboard.press("Space")
-    answer(page, "arm-1", "stopped", network)
-    eventually(lambda: turn_said(page).startswith("Over"), 30.0, "the end of the turns")
-    shows(page, "!document.querySelector('.pictures .camera').src.startsWith('blob:')")
+        yield Site(page, server.url, request.param, machine)
 
 
 def test_turns_of_the_page_are_one_episode_that_tells_the_policy_from_the_hand(site: Site, tmp_path: Path) -> None:
-    page, network, machine = site
+    page, url, network, machine = site
+    page.goto(url)
     folder, mesh = tmp_path / "set", ["--mesh"] if network == "mesh" else []
     line = ["dataset", "record", str(folder), "--robot", "arm-1", "--task", "wave", "--leader", "page", "--json"]
 
@@ -140,3 +90,54 @@ def test_turns_of_the_page_are_one_episode_that_tells_the_policy_from_the_hand(s
     assert ACTORS.index("policy") in frames["actor"][~by_hand].tolist()
     assert set(frames["stop"].tolist()) <= {0, 1}, "no emergency stop"
     assert frames["next.success"][-1]
+
+
+def test_push_takes_over_from_the_policy_and_a_button_gives_back(site: Site) -> None:
+    page, url, network, _ = site
+    page.goto(url)
+
+    def pan() -> float:
+        return float(page.locator(".bar .value").first.inner_text().rstrip("\u00b0"))
+
+    button = take(page, "shoulder_pan +", network=network)
+    shows(page, "/\\d/.test(document.querySelector('.bar .value')?.textContent)")
+    start = pan()
+    page.fill("#turn-task", "wave")
+    policy_drives(page)
+    picture(page, "turn-policy")
+    shows(page, f"Math.abs(parseFloat(document.querySelector('.bar .value').textContent) - {start}) > 0.5")
+
+    hand_leads(page, button)
+    before = pan()
+    hold_until(page, button, lambda: pan() > before + 3, "the arm goes where it is pushed")
+    page.mouse.up()
+    picture(page, "turn-led")
+    page.locator(".drive .said", has_text="Let go (").wait_for()
+
+    policy_drives(page)
+    end_turns(page)
+
+
+def test_hand_that_drives_by_pictures_is_held_where_they_show_nothing_new(site: Site) -> None:
+    page, _, network, _ = site
+    button = page.locator("button.jog[aria-label='shoulder_pan +']")
+
+    def stands_by_old_pictures() -> bool:
+        if "the newest picture of page is" not in turn_said(page):
+            policy_drives(page)
+            hand_leads(page, button)
+            # It stands, so its camera has nothing new.
+            page.mouse.up()
+            page.locator(".turn-said", has_text="HELD").wait_for()
+        return "the newest picture of page is" in turn_said(page)
+
+    page.select_option("#turn-camera", "front")
+    policy_drives(page)
+    shows(page, "document.querySelector('.pictures .camera').src.startsWith('blob:')")
+    eventually(stands_by_old_pictures, 90.0, "it is held for its old pictures")
+    picture(page, "turn-held")
+    policy_drives(page)
+    page.keyboard.press("Space")
+    answer(page, "arm-1", "stopped", network)
+    eventually(lambda: turn_said(page).startswith("Over"), 30.0, "the end of the turns")
+    shows(page, "!document.querySelector('.pictures .camera').src.startsWith('blob:')")
