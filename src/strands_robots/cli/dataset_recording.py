@@ -33,7 +33,8 @@ KEYS = "Enter keeps it as a success, f Enter as a failure, r Enter redoes it, q 
 KEYBOARD = "Enter keeps it as a success, x as a failure, z redoes it, c drops it and ends."
 """The same where single keys lead the robot, which takes the others."""
 
-_KEYBOARD = {"\n": Said.SUCCESS, "x": Said.FAILURE, "z": Said.REDO, "c": Said.END}
+# The terminal mode of Python 3.12.0 and 3.12.1 leaves Enter the carriage return that it is.
+_KEYBOARD = {"\n": Said.SUCCESS, "\r": Said.SUCCESS, "x": Said.FAILURE, "z": Said.REDO, "c": Said.END}
 
 
 class Keys(Words):

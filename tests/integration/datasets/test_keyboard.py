@@ -53,7 +53,7 @@ def test_keyboard_leads_each_attempt_from_where_the_robot_is(tmp_path: Path, ter
     terminal.shows("no success")
     attempt(terminal, folder, "a", "z")
     terminal.shows("Dropped")
-    attempt(terminal, folder, "a", "\n")
+    attempt(terminal, folder, "a", "\r")
     terminal.shows("a success")
     assert terminal.child.wait(30) == 0
     info, found = check_dataset(folder)
