@@ -406,6 +406,16 @@ class TestMeshOfOneProcess:
         assert settings.raw("STRANDS_MESH_PORT") == "7001"
 
     @pytest.mark.usefixtures("no_session")
+    @pytest.mark.parametrize("stated", [{}, {"STRANDS_MESH_PORT": "7002"}], ids=["environment", "profile"])
+    def test_peers_are_forgotten_once_their_mesh_is_left(self, stated: dict[str, str]) -> None:
+        fleet = MeshSettings(stated)
+        fleet.take()
+        # A robot that restarts meanwhile has another session, and would be taken for a stranger for 10 s.
+        assert session.update_peer("arm-1", "robot", "desk", {})
+        fleet.give_back()
+        assert session.get_peer("arm-1") is None
+
+    @pytest.mark.usefixtures("no_session")
     def test_fleet_of_another_profile_is_refused_meanwhile(self) -> None:
         one, other, none = MeshSettings({"STRANDS_MESH_PORT": "7002"}), MeshSettings({}), MeshSettings({})
         one.take()

@@ -643,7 +643,7 @@ def update_peer(peer_id: str, peer_type: str, hostname: str, caps: dict[str, Any
 
 
 def clear_peers() -> None:
-    """Remove every peer; for tests."""
+    """Remove every peer, as where the mesh was left."""
     _registry.clear()
 
 

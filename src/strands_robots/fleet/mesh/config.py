@@ -72,7 +72,8 @@ class MeshSettings:
         """Forget the peers of the mesh that this process was on."""
         from strands_robots.mesh import session  # noqa: PLC0415 - as above
 
-        if self._stated and not session.session_alive():
+        # Robots that restart meanwhile have other sessions, and would be taken for strangers.
+        if not session.session_alive():
             session.clear_peers()
 
 
