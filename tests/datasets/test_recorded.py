@@ -171,13 +171,14 @@ def test_recording_that_leads_is_told_from_a_person(tmp_path: Path) -> None:
     assert (ACTORS[attempt.actors[0]], attempt.led) == ("recording", [False])
 
 
-def test_frames_of_a_hold_are_nobodys(tmp_path: Path) -> None:
+@pytest.mark.parametrize("part", ["", "so100"], ids=["arm", "only robot of a world on the mesh"])
+def test_frames_of_a_hold_are_nobodys(tmp_path: Path, part: str) -> None:
     file = tmp_path / "a.mcap"
     turns = (("policy", ""), ("led", "hand"), ("held", ""), ("led", "hand"), ("policy", ""))
     with Recorder(file) as recorder:
         recorder.take("arm-1", "taskStarted", {"policy_provider": "mock"}, BEGAN - 0.01)
         for turn, (state, led_by) in enumerate(turns):
-            recorder.take("arm-1", "turnChanged", {"state": state}, BEGAN + turn)
+            recorder.take("arm-1", "turnChanged", {"state": state, "robot_name": part}, BEGAN + turn)
             for step in range(2):
                 row = {"observation": {"pan": 1.0}, "action": {"pan": 1.0}, "led_by": led_by}
                 recorder.take("arm-1", "streamStep", row, BEGAN + turn + step / HZ)

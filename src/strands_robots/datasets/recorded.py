@@ -132,7 +132,7 @@ def attempts_in(path: Path, robot: str | None = None, *, whole: bool = False) ->
         )
     chosen = robot or known[0]
     events = (each for each in items if isinstance(each, RecordedEvent))
-    attempts = _AttemptReader(chosen, whole=whole).read(each for each in events if each.robot in _names(chosen))
+    attempts = _AttemptReader(chosen, whole=whole).read(each for each in events if _is_of(each.robot, chosen))
     for each in items:
         if isinstance(each, RecordedPicture) and chosen.partition("/")[0] == each.device.partition("/")[0]:
             for attempt in attempts:
@@ -140,9 +140,13 @@ def attempts_in(path: Path, robot: str | None = None, *, whole: bool = False) ->
     return attempts
 
 
-def _names(robot: str) -> tuple[str, str]:
-    """Return the robot and the world that it is in."""
-    return robot, robot.partition("/")[0]
+def _is_of(named: str, robot: str) -> bool:
+    """Return True for an event of a robot, or of the world that it is in.
+
+    On the mesh the steps of a world's only robot are the world's, and its other events its own.
+    """
+    world = named.partition("/")[0]
+    return robot in (named, world) or named == robot.partition("/")[0]
 
 
 class _AttemptReader:
