@@ -16,7 +16,7 @@ from strands_robots import plug_ins
 from strands_robots.mesh.security import ValidationError, validate_command
 from strands_robots.mesh.transport.memory import MemoryTransport
 from strands_robots.safety.authorization import Grants
-from strands_robots.serving.peer_verbs import run_to_end
+from strands_robots.serving.peer_verbs import PEER_VERBS, run_to_end
 from strands_robots.serving.policy_arguments import registered_providers
 from strands_robots.serving.robot_verbs import served
 from strands_robots.state_files import state_dir
@@ -425,13 +425,27 @@ def test_a_provider_of_other_builds_validates(name: str) -> None:
     assert validate_command({"action": "start", "policy_provider": name})["policy_provider"] == name
 
 
-def test_a_provider_that_the_operator_lists_validates_and_an_unknown_one_does_not(
-    monkeypatch: pytest.MonkeyPatch,
+@pytest.mark.parametrize("action", ["start", "execute", "lead"])
+def test_a_robot_has_the_providers_that_its_operator_lists_and_its_sender_has_others(
+    monkeypatch: pytest.MonkeyPatch, action: str
 ) -> None:
+    def at_the_robot(provider: str) -> object:
+        return PEER_VERBS[action].checked({"policy_provider": provider})["policy_provider"]
+
     with pytest.raises(ValidationError) as refused:
-        validate_command({"action": "start", "policy_provider": "own"})
+        at_the_robot("own")
     assert refused.value.code == "POLICY_TYPE_NOT_ALLOWED"
+    assert validate_command({"action": action, "policy_provider": "own"})["policy_provider"] == "own"
+    with pytest.raises(ValidationError, match="policy_provider"):
+        validate_command({"action": action, "policy_provider": "../own"})
     monkeypatch.setenv("STRANDS_MESH_POLICY_TYPE_ALLOW", "own")
-    assert validate_command({"action": "start", "policy_provider": "own"})["policy_provider"] == "own"
+    assert at_the_robot("own") == "own"
     with pytest.raises(ValidationError):
-        validate_command({"action": "start", "policy_provider": "pi0"})
+        at_the_robot("pi0")
+
+
+@pytest.mark.parametrize("action", ["start", "execute"])
+def test_a_task_without_a_policy_is_refused_before_it_is_sent(action: str) -> None:
+    for given in ({}, {"policy_provider": ""}):
+        with pytest.raises(ValidationError, match="policy_provider"):
+            validate_command({"action": action, **given})

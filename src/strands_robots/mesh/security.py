@@ -7,13 +7,14 @@ the mesh, and holds the table of a command's fields. A machine reads ``Validatio
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from strands_robots import settings
 from strands_robots.mesh.former_actions import FORMER, checked_former
 from strands_robots.moved import of_module
 from strands_robots.serving.peer_verbs import PEER_VERBS
-from strands_robots.serving.verbs import Kind
+from strands_robots.serving.verbs import Kind, Verb
 from strands_robots.utils import ValidationError, identifier, mapping, number, peer_id, shown
 
 if not TYPE_CHECKING:
@@ -33,6 +34,7 @@ TELEOP_VALUE_OUT_OF_RANGE = "TELEOP_VALUE_OUT_OF_RANGE"
 INPUT_KEYS = 64
 INPUT_KEY_CHARACTERS = 64
 INPUT_VALUE_ABS = 720.0
+PROVIDER = "policy_provider"
 _INPUT_KEY = re.compile(rf"[A-Za-z0-9_.-]{{1,{INPUT_KEY_CHARACTERS}}}\Z")
 
 
@@ -50,6 +52,20 @@ def validate_peer_id(value: object) -> str:
     return peer_id("peer_id", value)
 
 
+def _as_sent(verb: Verb) -> Verb:
+    """Return a verb that takes the name of any policy, as its robot has others."""
+
+    def named(name: str, value: object) -> str:
+        return "" if value == "" == verb.by_name[name].default else identifier(name, value)
+
+    parameters = [replace(each, check=named) if each.name == PROVIDER else each for each in verb.parameters]
+    return replace(verb, parameters=tuple(parameters))
+
+
+_SENT = {name: _as_sent(verb) for name, verb in PEER_VERBS.items()}
+"""The verbs as their sender checks them."""
+
+
 def validate_command(command: object) -> dict[str, Any]:
     """Return the command with defaults filled in and what it does not read left out.
 
@@ -59,14 +75,15 @@ def validate_command(command: object) -> dict[str, Any]:
 
     A motion is refused for a field that it does not read, a read never. A stop is refused for none of its fields: what
     cannot be read is dropped, which stops more. A resume's assertion
-    is passed on unchanged: the check of its signature counts refusals.
+    is passed on unchanged: the check of its signature counts refusals. A policy is named by an identifier: which ones
+    there are is the robot's to say.
 
     Raises:
         ValidationError: naming the field, the value and its domain.
     """
     given = mapping("command", command)
     action = given.get("action")
-    verb = PEER_VERBS.get(action) if isinstance(action, str) else None
+    verb = _SENT.get(action) if isinstance(action, str) else None
     if isinstance(action, str) and action in FORMER:
         return checked_former(given)
     if verb is None:
