@@ -152,10 +152,12 @@ class LeadMixin:
             lead.take(LeaderCommand(seq, turn, leads, targets or {}, made, told, told_ago, age), received)
         session = self.tasks.by_leader.get(lead.leader)
         if not end and (session is None or session.voided or not session.running):
-            why = lead.why or (session.error if session is not None else "") or "it was stopped"
+            failed = lead.why or (session.error if session is not None else "")
             # A lead that has completed was not stopped, though its permit is void.
             halted = session is not None and (session.state == "stopped" or (session.running and session.voided))
-            facts = {**lead.facts(), "state": "over", "halted": halted}
+            completed = session is not None and session.state == "completed" and not failed
+            why = failed or ("its policy is done, or its time" if completed else "it was stopped")
+            facts = {**lead.facts(), "state": "over", "halted": halted, "completed": completed}
             return error(f"The lead of {lead.leader} is over: {why}.", **facts)
         return success(f"{lead.leader}: {lead.state}.", **lead.facts())
 

@@ -11,6 +11,7 @@ from fixtures.waiting import eventually
 
 from strands_robots.cli.far_hand import Hand, HandLeader, LeadableHere
 from strands_robots.cli.output import Screen
+from strands_robots.errors import RobotError
 from strands_robots.simulation import Simulation
 from strands_robots.teleoperators import LeaderFinished, RecordedLeader
 from strands_robots.utils import ValidationError
@@ -104,6 +105,15 @@ def test_stop_of_others_ends_it_as_one(world: Simulation) -> None:
     ((why, halted),) = desk.ends
     assert halted
     assert "The lead of hand is over" in why
+    desk.hand.close()
+
+
+def test_lead_that_completes_at_the_robot_is_no_failure(world: Simulation) -> None:
+    desk = Desk(world, duration=0.5, **POLICY)
+    eventually(lambda: desk.ends)
+    assert desk.ends == [("", False)]
+    with pytest.raises(RobotError, match="The lead of hand is over: its policy is done, or its time"):
+        eventually(lambda: desk.lead.send({}) is None)
     desk.hand.close()
 
 

@@ -169,6 +169,8 @@ class Hand:
             why = ""
         except RefusalError as exc:
             why, halted = said(exc), exc.envelope.get("halted") is True
+            if exc.envelope.get("completed") is True:
+                why = ""
         except LeaderSilentError as exc:
             why = str(exc)
         except Exception as exc:  # noqa: BLE001 - a leader may raise anything; the attempt ends with it
