@@ -12,6 +12,7 @@ from fixtures.toy_robots import ToyRobot
 from fixtures.waiting import eventually, free_port
 
 from strands_robots import connect
+from strands_robots.errors import NoSuchRobotError
 from strands_robots.fleet import Fleet
 from strands_robots.fleet.adapter import DEVICE_CONNECT, MESH
 from strands_robots.mesh import init_mesh
@@ -101,3 +102,13 @@ def test_robots_of_the_network_that_answers_are_found_and_called(
         assert fleet["arm-2"].status()["task_status"] == "running"
         assert fleet["arm-2"].halt().stopped is True
         assert list(fleet.absent) == [DEVICE_CONNECT]
+
+
+def test_a_stated_endpoint_that_does_not_answer_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    monkeypatch.setenv("STRANDS_MESH_CONNECT", endpoint)
+    with (
+        connect(port=free_port()) as fleet,
+        pytest.raises(NoSuchRobotError, match=f"mesh does not answer at {endpoint}"),
+    ):
+        fleet["arm-1"].status()

@@ -197,13 +197,18 @@ class MeshNetwork:
         self._keys = CachedKeys(enrolled_peers)
 
     def find(self, timeout: float | None = FIND_S, *, peers: bool = False) -> list[FoundRobot]:
-        """Return the robots in reach, once they had the time to announce themselves."""
+        """Return the robots in reach, once they had the time to announce themselves.
+
+        Raises:
+            UnreachableError: no stated endpoint answers.
+        """
         if timeout is None:
             discover(self.peer, since=self._fresh)
         elif peers:
             time.sleep(max(0.0, self._joined + timeout - time.monotonic()))
         else:
             discover(self.peer, since=self._joined, within=timeout)
+        _require_link(self.peer)
         if peers:
             return [_found(row) for row in _judged(self.peer)]
         self._discoveries += 1
@@ -587,6 +592,16 @@ def _linked() -> bool:
             return False
         time.sleep(LOOK_S)
     return True
+
+
+def _require_link(mesh: Mesh) -> None:
+    """Raise :class:`UnreachableError` where no stated endpoint answers."""
+    from strands_robots.mesh import session  # noqa: PLC0415 - the network is loaded when it is used
+    from strands_robots.mesh.transport.config import stated_endpoints  # noqa: PLC0415 - as above
+
+    connects, _ = stated_endpoints()
+    if connects and not in_reach(mesh) and session.cut_off():
+        raise UnreachableError(f"the mesh does not answer at {', '.join(connects)}")
 
 
 def _absent(mesh: Mesh, robot: str, verb: str) -> NoSuchRobotError:
