@@ -109,7 +109,7 @@ class FarRobot:
 
     Raises:
         ValidationError: the world has several robots, or none of that name, or there is no such camera.
-        RefusalError: it does not answer.
+        RefusalError: it does not answer, or both networks have a robot of its id.
     """
 
     def __init__(  # noqa: PLR0917 - one robot, and what is asked of it
@@ -124,6 +124,8 @@ class FarRobot:
     ) -> None:
         self.remote = one_robot(world, part, "--robot")
         self.networks, self._part, self._policy, self._task = networks, part, policy, task
+        # The one that motions go to: of one on both networks each step is told twice.
+        self._told_on = networks.of(self.name, "recording", moves=True)
         self._cameras = _cameras_of(world, part, cameras)
         self._hand = hand
         self._units: dict[str, str] = {}
@@ -290,7 +292,7 @@ class FarRobot:
         ]
         if self._hand is not None and not self._policy:
             recorder.take(self.name, LED_BY_PERSON if self._hand.person else LED_BY_RECORDING, {})
-        end = self.networks.subscribe(self.name, lambda event: self._take(recorder, event), Detail.ALL)
+        end = self._told_on.subscribe(self.name, lambda event: self._take(recorder, event), Detail.ALL)
         try:
             for thread in threads:
                 thread.start()
