@@ -269,6 +269,14 @@ def test_end_of_a_policy_that_only_the_status_tells_is_that_end(
     assert (task.error, task.voided, robot.stopped) == (error, False, False)
 
 
+def test_policy_that_is_not_seen_to_run_yet_has_not_ended(arm: ServedArm, robot: FarRobot) -> None:
+    looks: list[None] = []
+    arm.answers = lambda: (looks.append(None), {"task_status": "completed"})[1]
+    task = robot.begin(30)
+    eventually(lambda: len(looks) > 3, within=5, what="some looks at it")
+    assert task.running
+
+
 def test_halt_of_others_motion_that_only_the_status_tells_is_recorded_once(arm: ServedArm, recorder: Recorder) -> None:
     world: Any = arm
     robot = FarRobot(world, world, "", "", "wave", None)

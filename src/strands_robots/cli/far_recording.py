@@ -333,12 +333,16 @@ class FarRobot:
 
     def _untold(self, task: FarTask, status: Mapping[str, Any], *, ran: bool) -> None:
         """Note the end of a motion by the robot's status; the mesh tells no ends."""
-        if ended := outcome_of(status, self._part):
+        ended = outcome_of(status, self._part)
+        if not ran and ended.get("state") != "stopped":
+            # It may not have begun yet, and tell of the attempt before.
+            return
+        if ended:
             self._ended(task, ended)
             if ended["state"] == "stopped" and not task.halted.is_set():
                 # It is that of others, who go on.
                 self._note_halt()
-        elif self._policy and ran:
+        elif self._policy:
             # Nobody knows whether it is a good one.
             task.end(voided=True)
 
