@@ -263,10 +263,13 @@ def rests(at: tuple[str, ...]) -> None:
     seen: list[object] = []
 
     def still() -> bool:
-        seen.append(on("call", "arm-1", "getPose", *at)[1][-1]["joints"])
+        # A busy machine may not find it at once.
+        code, answers = on("call", "arm-1", "getPose", *at, code=None)
+        if code == 0:
+            seen.append(answers[-1]["joints"])
         return len(seen) > 1 and seen[-1] == pytest.approx(seen[-2], abs=0.05)
 
-    eventually(still, within=20)
+    eventually(still, within=40)
 
 
 def say(recorder: RemoteRobot, state: str, verb: str, **arguments: object) -> None:
