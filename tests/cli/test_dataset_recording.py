@@ -54,6 +54,30 @@ class Arm:
         self.at_hold()
 
 
+class Meanwhile(RecordingState):
+    """A recording to which something happens as it enters a stage, in this order."""
+
+    def __init__(self, *happens: tuple[Stage, Callable[[RecordingState], object]]) -> None:
+        super().__init__()
+        self._happens = happens
+
+    def enter(self, stage: Stage, progress: Any = None) -> None:
+        super().enter(stage, progress)
+        for at, happens in self._happens:
+            if at is stage:
+                happens(self)
+
+
+def says(*words: Said) -> Callable[[RecordingState], object]:
+    """Return what says words."""
+    return lambda state: [state.words.take(each) for each in words]
+
+
+def stops(reason: str) -> Callable[[RecordingState], object]:
+    """Return what stops a recording."""
+    return lambda state: state.halt(reason)
+
+
 @pytest.fixture
 def arm() -> Arm:
     return Arm()
@@ -188,14 +212,9 @@ def test_attempts_by_time_wait_for_nobody_and_take_a_word(tmp_path: Path, arm: A
 
 
 def test_begin_that_comes_as_the_pause_is_over_judges_no_attempt(tmp_path: Path, arm: Arm) -> None:
-    class Pressed(RecordingState):
-        def enter(self, stage: Stage, progress: Any = None) -> None:
-            super().enter(stage, progress)
-            if stage is Stage.STARTING:
-                self.words.take(Said.SUCCESS)
-
+    pressed = Meanwhile((Stage.STARTING, says(Said.SUCCESS)))
     task = SimpleNamespace(voided=False, running=False, error="")
-    attempts = Attempts(1, lambda: task, FPS, 600.0, 0.0, success=False, state=Pressed())
+    attempts = Attempts(1, lambda: task, FPS, 600.0, 0.0, success=False, state=pressed)
     with session(tmp_path) as recording:
         record_attempts(Screen(console=Console(file=io.StringIO())), arm, recording, attempts)
     assert not tables.read_frames(tmp_path / data_file(0))["next.success"].any()
@@ -216,14 +235,9 @@ def test_stop_of_the_recording_is_an_episode_without_success_and_its_end(tmp_pat
 
 
 def test_recording_that_is_stopped_as_it_starts_begins_nothing(tmp_path: Path, arm: Arm) -> None:
-    class Stopped(RecordingState):
-        def enter(self, stage: Stage, progress: Any = None) -> None:
-            super().enter(stage, progress)
-            if stage is Stage.STARTING:
-                self.halt("the recording was stopped: stop by desk")
-
+    stopped = Meanwhile((Stage.STARTING, stops("the recording was stopped: stop by desk")))
     began: list[Steady] = []
-    attempts = Attempts(9, lambda: began.append(Steady()), FPS, 600.0, 0.0, success=True, state=Stopped())
+    attempts = Attempts(9, lambda: began.append(Steady()), FPS, 600.0, 0.0, success=True, state=stopped)
     with (
         session(tmp_path) as recording,
         pytest.raises(CliError, match="Nothing began: the recording was stopped: stop by desk"),
@@ -294,28 +308,15 @@ def test_robot_that_is_locked_as_its_policy_loads_stays_on_its_network(tmp_path:
 
 @pytest.mark.parametrize("stage", [Stage.ENDING, Stage.SAVING])
 def test_stop_after_the_word_ends_the_recording_and_leaves_the_word(tmp_path: Path, arm: Arm, stage: Stage) -> None:
-    class Late(RecordingState):
-        def enter(self, entered: Stage, progress: Any = None) -> None:
-            super().enter(entered, progress)
-            if entered is Stage.RECORDING:
-                self.words.take(Said.SUCCESS)
-            if entered is stage:
-                self.halt(STOPPED)
-
+    late = Meanwhile((Stage.RECORDING, says(Said.SUCCESS)), (stage, stops(STOPPED)))
     began: list[Steady] = []
-    assert recorded(arm, tmp_path, attempts_of(Late(), began)) == f"Nothing more is recorded: {STOPPED}."
+    assert recorded(arm, tmp_path, attempts_of(late, began)) == f"Nothing more is recorded: {STOPPED}."
     assert (len(began), worth(tmp_path)) == (1, [(True, 0)])
 
 
 def test_stop_counts_before_a_word_of_the_same_moment(tmp_path: Path, arm: Arm) -> None:
-    class Both(RecordingState):
-        def enter(self, entered: Stage, progress: Any = None) -> None:
-            super().enter(entered, progress)
-            if entered is Stage.RECORDING:
-                self.words.take(Said.SUCCESS)
-                self.halt(STOPPED)
-
-    assert recorded(arm, tmp_path, attempts_of(Both(), [])) == f"The attempt failed: {STOPPED}"
+    both = Meanwhile((Stage.RECORDING, says(Said.SUCCESS)), (Stage.RECORDING, stops(STOPPED)))
+    assert recorded(arm, tmp_path, attempts_of(both, [])) == f"The attempt failed: {STOPPED}"
     assert worth(tmp_path) == [(False, 1)]
 
 
@@ -341,22 +342,18 @@ def test_recorder_that_is_locked_begins_nothing_until_it_is_resumed(tmp_path: Pa
 
 
 def test_end_that_comes_with_another_word_is_not_lost(tmp_path: Path, arm: Arm) -> None:
-    class Twice(RecordingState):
+    class Twice(Meanwhile):
         def wait_for_begin(self, begins_at: float | None) -> None:
             super().wait_for_begin(begins_at)
             for word in self.said_at_begin:
                 self.words.take(word)
 
-        def enter(self, entered: Stage, progress: Any = None) -> None:
-            super().enter(entered, progress)
-            for word in (Said.SUCCESS, Said.END) if entered is Stage.RECORDING else ():
-                self.words.take(word)
-
         said_at_begin: tuple[Said, ...] = (Said.SUCCESS, Said.END)
 
+    both = Stage.RECORDING, says(Said.SUCCESS, Said.END)
     began: list[Steady] = []
-    assert recorded(arm, tmp_path, attempts_of(Twice(), began, asked=True)) == ""
+    assert recorded(arm, tmp_path, attempts_of(Twice(both), began, asked=True)) == ""
     assert began == []
     Twice.said_at_begin = (Said.SUCCESS,)
-    assert recorded(arm, tmp_path, attempts_of(Twice(), began, asked=True)) == ""
+    assert recorded(arm, tmp_path, attempts_of(Twice(both), began, asked=True)) == ""
     assert (len(began), worth(tmp_path)) == (1, [(True, 0)]), "the first word judges, and the end ends"

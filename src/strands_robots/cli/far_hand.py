@@ -168,9 +168,8 @@ class Hand:
         except LeaderFinished:
             why = ""
         except RefusalError as exc:
-            why, halted = said(exc), exc.envelope.get("halted") is True
-            if exc.envelope.get("completed") is True:
-                why = ""
+            why = "" if exc.envelope.get("completed") is True else said(exc)
+            halted = exc.envelope.get("halted") is True
         except LeaderSilentError as exc:
             why = str(exc)
         except Exception as exc:  # noqa: BLE001 - a leader may raise anything; the attempt ends with it

@@ -125,7 +125,7 @@ class FarRobot:
         self.remote = one_robot(world, part, "--robot")
         self.networks, self._part, self._policy, self._task = networks, part, policy, task
         # The one that motions go to: of one on both networks each step is told twice.
-        self._told_on = networks.of(self.name, "recording", moves=True)
+        self._network = networks.of(self.name, "recording", moves=True)
         self._cameras = _cameras_of(world, part, cameras)
         self._hand = hand
         self._units: dict[str, str] = {}
@@ -146,12 +146,8 @@ class FarRobot:
 
     @property
     def on_mesh(self) -> bool:
-        """True where it is reached over the mesh.
-
-        Raises:
-            RefusalError: it is on no network.
-        """
-        return self.networks.of(self.name).name != DEVICE_CONNECT
+        """True where it is reached over the mesh."""
+        return self._network.name != DEVICE_CONNECT
 
     @property
     def kind(self) -> str:
@@ -231,9 +227,7 @@ class FarRobot:
             self._hand.begin(self.remote, self._policy, self._task, seconds, partial(self._hand_ended, task))
             return
         duration = min(seconds or DURATION_MAX_S, DURATION_MAX_S)
-        # By its name on the network that motions go to.
-        starts = self.networks.of(self.name, moves=True).starts
-        self.remote.call(starts, instruction=self._task, policy_provider=self._policy, duration=duration)
+        self.remote.call(self._network.starts, instruction=self._task, policy_provider=self._policy, duration=duration)
 
     @staticmethod
     def _hand_ended(task: FarTask, why: str, halted: bool) -> None:
@@ -292,7 +286,7 @@ class FarRobot:
         ]
         if self._hand is not None and not self._policy:
             recorder.take(self.name, LED_BY_PERSON if self._hand.person else LED_BY_RECORDING, {})
-        end = self._told_on.subscribe(self.name, lambda event: self._take(recorder, event), Detail.ALL)
+        end = self._network.subscribe(self.name, lambda event: self._take(recorder, event), Detail.ALL)
         try:
             for thread in threads:
                 thread.start()

@@ -38,6 +38,7 @@ from strands_robots.safety.stop_executor import stop_executor
 from strands_robots.safety.stop_link import ESTOP
 from strands_robots.safety.stopping import StopVerdict
 from strands_robots.serving.control import ControlChange
+from strands_robots.serving.control_leases import control_facts
 from strands_robots.serving.offered_verbs import Offers, own_verbs
 from strands_robots.serving.pipeline import Command, Pipeline, Result, busy
 from strands_robots.serving.policy_arguments import profile_list
@@ -242,9 +243,8 @@ class RobotDriver(CollectedOnce):
         if not isinstance(answer, dict):
             return answer
         lockouts = self.stops.facts(arguments.get("nonce", ""))
-        control = {} if self.pipeline.leases is None else {"control": self.pipeline.leases.facts()}
         running = self.robot.gate.under_way.name
-        return {**answer, **lockouts, **control, **({"verb": running} if running else {})}
+        return {**answer, **lockouts, **control_facts(self.pipeline.leases), **({"verb": running} if running else {})}
 
     # Stops.
 

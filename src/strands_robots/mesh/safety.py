@@ -35,7 +35,7 @@ from strands_robots.safety.scope import EVERY_ROBOT, Remembers, Scope, none_know
 from strands_robots.safety.statements import Proof, Purpose, enrolled_peers, proof_of, record_heads
 from strands_robots.safety.stop_link import ESTOP, StopEvent
 from strands_robots.safety.stopping import Outcome, StopVerdict
-from strands_robots.serving.control_leases import ControlLeases
+from strands_robots.serving.control_leases import ControlLeases, control_facts
 from strands_robots.serving.peer_verbs import PEER_VERBS, peer_stop_answer
 from strands_robots.serving.pipeline import Own
 from strands_robots.serving.verbs import Arguments
@@ -82,9 +82,7 @@ def status_of(
         answer = PEER_VERBS["status"].call(robot, arguments)()
         if not isinstance(answer, Mapping):
             return answer
-        held = leases()
-        control = {} if held is None else {"control": held.facts()}
-        return {**answer, **facts(arguments.get("nonce", "")), **control}
+        return {**answer, **facts(arguments.get("nonce", "")), **control_facts(leases())}
 
     return status
 

@@ -221,6 +221,11 @@ class _OneOf(ControlLeases):
         return self.of().facts()
 
 
+def control_facts(leases: ControlLeases | None) -> dict[str, Any]:
+    """Return who holds a robot, as its status has it; empty for one without leases."""
+    return {} if leases is None else {"control": leases.facts()}
+
+
 def _report(robot: str, halted: Future[StopVerdict]) -> None:
     """Log a robot that may still move."""
     verdict = halted.result()

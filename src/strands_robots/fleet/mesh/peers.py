@@ -265,13 +265,15 @@ def _recorded(robot: str, on_event: OnEvent) -> dict[str, tuple[str, OnMessage]]
 
 def _of_one_robot(message: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return a step of a robot of a world with its joints by their own names."""
-    prefix = f"{message.get('robot_name')}/"
+    if "robot_name" not in message:
+        return message
+    prefix = f"{message['robot_name']}/"
     own = {
         name: {key.removeprefix(prefix): value for key, value in message[name].items()}
         for name in ("observation", "action")
         if isinstance(message.get(name), Mapping)
     }
-    return {**message, **own} if "robot_name" in message else message
+    return {**message, **own}
 
 
 def _named(name: str, on_event: OnEvent) -> OnMessage:
